@@ -1,0 +1,345 @@
+"""The whole configuration as frozen dataclasses: what may be set, its unit, its range, its default.
+
+`load(mapping)` turns parsed YAML into a `Config` strictly: unknown keys raise, values are never cast (YAML reads `5e-5` as
+text; we say so instead of guessing), and every problem is listed with its path. This module imports nothing heavy, because
+the workflow reads it before any job exists.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+
+from neuspring.errors import InputError
+
+T = TypeVar("T")
+STRICT = ConfigDict(extra="forbid", strict=True)
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """Integration. See `neuspring.artifacts.Simulation`; up, ground and self-collision come with the scenario."""
+
+    __pydantic_config__ = STRICT
+    substeps: Count | Literal["auto"] = "auto"
+    """Integration steps per frame; `auto` takes the smallest count that the stability bound allows."""
+    safety: Annotated[float, Field(gt=0, le=1)] = 0.8
+    """Fraction of the stability bound that `auto` uses."""
+    max_substeps: Count = 2000
+    """`auto` never asks for more; a candidate that would need more is penalised by the search."""
+    gravity: float = 9.8
+    collision_capacity: Count = 500
+    controller_velocity: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Losses:
+    """Weights of the training losses (section 5.3 of the released method)."""
+
+    __pydantic_config__ = STRICT
+    chamfer: NonNegative = 1.0
+    track: NonNegative = 1.0
+    acceleration: NonNegative = 0.01
+    """Used by the search only, as in the released method."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchRanges:
+    """Bounds of the zero-order search; units as in `neuspring.artifacts.Material`, lengths in metres."""
+
+    __pydantic_config__ = STRICT
+    stiffness: Range = (0.0, 1e5)
+    object_radius: Range = (0.01, 0.05)
+    object_neighbours: Range = (10, 50)
+    controller_radius: Range = (0.01, 0.08)
+    controller_neighbours: Range = (10, 80)
+    ground_elasticity: Range = (0.0, 1.0)
+    ground_friction: Range = (0.0, 2.0)
+    contact_elasticity: Range = (0.0, 1.0)
+    contact_friction: Range = (0.0, 2.0)
+    contact_distance: Range = (0.01, 0.05)
+    drag: Range = (0.0, 20.0)
+    dashpot: Range = (0.0, 200.0)
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            low, high = getattr(self, f.name)
+            if not 0 <= low < high:
+                raise ValueError(f"{f.name}: 0 <= low < high is required, received [{low}, {high}]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchStart:
+    """Where the search starts; the released configuration's defaults."""
+
+    __pydantic_config__ = STRICT
+    stiffness: float = 3e4
+    object_radius: float = 0.02
+    object_neighbours: float = 30
+    controller_radius: float = 0.04
+    controller_neighbours: float = 50
+    ground_elasticity: float = 0.5
+    ground_friction: float = 0.3
+    contact_elasticity: float = 0.7
+    contact_friction: float = 0.3
+    contact_distance: float = 0.02
+    drag: float = 3.0
+    dashpot: float = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """Zero-order stage: CMA-ES over homogeneous material and topology."""
+
+    __pydantic_config__ = STRICT
+    rollouts: Count = 220
+    """Budget in candidate rollouts; every method compared gets the same."""
+    sigma: Positive = 1 / 6
+    """Initial step in normalised variables."""
+    ranges: SearchRanges = field(default_factory=SearchRanges)
+    start: SearchStart = field(default_factory=SearchStart)
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self.start):
+            low, high = getattr(self.ranges, f.name)
+            value = getattr(self.start, f.name)
+            if not low <= value <= high:
+                raise ValueError(f"start.{f.name} = {value} lies outside ranges.{f.name} = [{low}, {high}]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """First-order stage: Adam on log stiffness per spring and contact scalars, gradients through the simulation."""
+
+    __pydantic_config__ = STRICT
+    epochs: Count = 200
+    learning_rate: Positive = 1e-3
+    betas: tuple[float, float] = (0.9, 0.99)
+    horizon: Annotated[int, Field(ge=0)] = 1
+    """Frames per optimiser step, with the gradient through all of them; 0 means all training frames."""
+    clip_gradient_norm: NonNegative = 0.0
+    """0 disables clipping."""
+    stiffness_range: Range = (0.0, 1e5)
+    """Clamp of the stiffness inside the simulation."""
+    checkpoint_every: Count = 5
+    """Epochs between checkpoints from which a killed job continues."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleasedQuirks:
+    """Behaviours of the released PhysTwin code that differ from its description; all off by default.
+
+    Numbers refer to section 6 of the dataset facts (README, "Released quirks").
+    """
+
+    __pydantic_config__ = STRICT
+    integer_damping: bool = False
+    """Truncate drag and dashpot to integers after the search (quirk 3)."""
+    frozen_loss_denominators: bool = False
+    """Divide every frame's losses by the valid counts of frame 1 (quirk 4)."""
+    frame_time_667: bool = False
+    """A frame lasts 667 x 5e-5 s = 33.35 ms, whatever the frame rate, in 667 substeps (quirk 7)."""
+    sparse_checkpoints: bool = False
+    """Consider the best epoch only every 20 epochs and at the last (section 5.5)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toy:
+    """Analytic scenes simulated by the float64 reference, with known stiffness."""
+
+    __pydantic_config__ = STRICT
+    frames: Annotated[int, Field(ge=4)] = 60
+    frame_rate: Positive = 30.0
+    noise: NonNegative = 0.0005
+    """Standard deviation of the observation noise, m."""
+    occlusion: Annotated[float, Field(ge=0, lt=1)] = 0.2
+    """Fraction of point-frames hidden, in runs of several frames."""
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mocap:
+    """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
+
+    __pydantic_config__ = STRICT
+    stride: Count = 2
+    """Use every n-th sample of the 100 Hz record."""
+    frames: Annotated[int, Field(ge=4)] | None = None
+    """Keep only the first frames (after the stride); null keeps all."""
+    spacing: Positive = 0.012
+    """Distance of rings along the centreline, m."""
+    radius: Positive = 0.006
+    """Ring radius, m."""
+    ring: Annotated[int, Field(ge=3)] = 4
+    """Nodes per ring."""
+    train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracking:
+    """MLflow. Files are the record; this is their index."""
+
+    __pydantic_config__ = STRICT
+    enabled: bool = True
+    uri: str | None = None
+    """Tracking URI; null means SQLite at <results>/mlflow.db."""
+    experiment: Name = "neuspring"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """One benchmark: which scenarios, methods and seeds, and how."""
+
+    __pydantic_config__ = STRICT
+    scenarios: tuple[Name, ...]
+    methods: tuple[Name, ...]
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
+    results: str = "results"
+    data_root: str | None = None
+    """Folder that relative scenario paths start from."""
+    scenario_table: str = "config/scenarios.tsv"
+    method_table: str = "config/methods.yaml"
+    device: Annotated[str, StringConstraints(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
+    simulation: Simulation = field(default_factory=Simulation)
+    losses: Losses = field(default_factory=Losses)
+    search: Search = field(default_factory=Search)
+    fit: Fit = field(default_factory=Fit)
+    released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
+    toy: Toy = field(default_factory=Toy)
+    mocap: Mocap = field(default_factory=Mocap)
+    tracking: Tracking = field(default_factory=Tracking)
+
+    def __post_init__(self) -> None:
+        for name in ("scenarios", "methods", "seeds"):
+            values = getattr(self, name)
+            if not values:
+                raise ValueError(f"{name}: at least one entry is required")
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name}: entries must differ, received {list(values)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A row of the method table: which search it starts from and which first-order stage follows."""
+
+    __pydantic_config__ = STRICT
+    search: Literal["uniform"]
+    fit: Literal["springs"] | None
+    description: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """Settings of this method alone, with the keys of the configuration (for example `fit: {horizon: 0}`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioRow:
+    """A row of the scenario table."""
+
+    __pydantic_config__ = STRICT
+    scenario: Name
+    source: Literal["phystwin", "mocap", "toy"]
+    category: Name
+    path: str
+    """Folder or file under data_root; for toy scenes, the scene's name."""
+    self_collision: bool
+    ground: bool
+
+
+def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
+    """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
+    try:
+        return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+    except TypeError as error:
+        raise InputError(where, "values must be plain YAML", str(error)) from error
+    except ValidationError as error:
+        problems = [_describe(problem) for problem in error.errors()]
+        raise InputError(where, "\n  " + "\n  ".join(problems), remedy="\nSee config/README.md for every key.") from error
+
+
+def _describe(problem: Any) -> str:
+    path = ".".join(str(part) for part in problem["loc"] if not str(part).startswith("constrained")) or "(top level)"
+    value = problem["input"]
+    if problem["type"] == "unexpected_keyword_argument":
+        return f"{path}: unknown key"
+    if problem["type"] == "missing":
+        return f"{path}: required, but missing"
+    hint = ""
+    if isinstance(value, str) and problem["type"] in ("float_type", "int_type"):
+        hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)"
+    return f"{path}: {problem['msg'].lower()}, received {value!r}{hint}"
+
+
+def plain(settings: Any) -> dict[str, Any]:
+    """The settings as plain YAML/JSON values (lists, not tuples)."""
+    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
+    return result
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML mapping from a file. Raises InputError."""
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "this file must be readable", error.strerror) from error
+    except yaml.YAMLError as error:
+        raise InputError(path, "this file must be YAML", str(error).replace("\n", " ")) from error
+    if not isinstance(values, dict):
+        raise InputError(path, "this file must hold a YAML mapping", type(values).__name__)
+    return values
+
+
+def read_methods(path: Path) -> dict[str, Method]:
+    """The method table: name -> Method."""
+    return {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+
+
+def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
+    """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
+    try:
+        lines = [line.rstrip("\n") for line in Path(path).open(encoding="utf-8") if line.strip() and not line.startswith("#")]
+    except OSError as error:
+        raise InputError(path, "this file must be readable", error.strerror) from error
+    columns = [f.name for f in dataclasses.fields(ScenarioRow)]
+    if not lines or lines[0].split("\t") != columns:
+        raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
+    rows: dict[str, ScenarioRow] = {}
+    for line in lines[1:]:
+        cells = line.split("\t")
+        where = f"{path}, row {cells[0]!r}"
+        if len(cells) != len(columns):
+            raise InputError(where, f"{len(columns)} tab-separated cells are required", len(cells))
+        values: dict[str, Any] = dict(zip(columns, cells, strict=True))
+        for flag in ("self_collision", "ground"):
+            if values[flag] not in ("true", "false"):
+                raise InputError(f"{where}, {flag}", "must be true or false", values[flag])
+            values[flag] = values[flag] == "true"
+        if cells[0] in rows:
+            raise InputError(where, "scenario names must differ")
+        rows[cells[0]] = parse(ScenarioRow, values, where)
+    return rows
+
+
+def for_method(config: Config, method: Method, name: str) -> Config:
+    """The configuration with a method's overrides applied. Raises InputError for unknown keys."""
+    merged = plain(config)
+    _merge(merged, method.overrides)
+    return parse(Config, merged, f"method {name}, overrides")
+
+
+def _merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
+    for key, value in overlay.items():
+        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = value

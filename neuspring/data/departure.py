@@ -1,0 +1,78 @@
+"""What departs from the described layout of a data set, and the case under inspection that collects it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from neuspring.errors import InputError
+
+Level = Literal["error", "warning", "note"]
+
+
+@dataclass(frozen=True)
+class Departure:
+    """`error`: the reader refuses the file, or numbers would be wrong. `warning`: readable, but not as released. `note`: a
+    measurement, or a check that was skipped."""
+
+    file: Path
+    level: Level
+    message: str
+
+
+def broken(file: Path, key: str, rule: str, value: object = None) -> Departure:
+    """An error: `key` of `file` breaks `rule`; `value` was received."""
+    return _departure(file, "error", key, rule, value)
+
+
+def unusual(file: Path, key: str, rule: str, value: object = None) -> Departure:
+    """A warning: `key` of `file` departs from `rule`; `value` was received."""
+    return _departure(file, "warning", key, rule, value)
+
+
+def note(file: Path, message: str) -> Departure:
+    """A measurement or a skipped check."""
+    return Departure(file, "note", message)
+
+
+def _departure(file: Path, level: Level, key: str, rule: str, value: object) -> Departure:
+    received = "" if value is None else f"; received {value}"
+    return Departure(file, level, f"{key}: {rule}{received}" if key else f"{rule}{received}")
+
+
+def refuse(departures: list[Departure]) -> None:
+    """Raise the first error among `departures` as InputError, naming file and key; do nothing when there is none."""
+    errors = [d for d in departures if d.level == "error"]
+    if errors:
+        more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
+        raise InputError(errors[0].file, errors[0].message, remedy=f"{more}`neuspring check-data` lists every departure.")
+
+
+@dataclass
+class Case:
+    """One case under inspection and what was found so far."""
+
+    folder: Path
+    root: Path | None
+    """Folder that holds `data`, `experiments` and `experiments_optimization`, if known."""
+    found: list[Departure] = field(default_factory=list)
+    scores: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The folder's name, also where the folder is given as `.`."""
+        return self.folder.resolve().name
+
+    def load(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        """The content of `path`, or None (with a departure) where it is missing or damaged."""
+        try:
+            return reader(path)
+        except InputError as error:
+            self.found.append(Departure(path, "error", str(error).removeprefix(f"{path}: ")))
+            return None
+
+    def skip(self, path: Path, what: str) -> None:
+        """Note that `path` is missing and `what` (with its verb: "the check is") therefore skipped."""
+        self.found.append(note(path, f"not found: {what} skipped"))

@@ -1,0 +1,193 @@
+"""Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
+
+One pickle is one recording: positions [T, 3, n], float64, metres, 100 Hz, z up; released as nested lists, arrays are accepted
+too. Markers run along the cable. The two at either end are held by robots (controllers), the others are observed. There is no
+surface, so the body is sampled as rings around a smooth centreline through the markers of frame 0.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from neuspring.artifacts import Observations, Scenario
+from neuspring.config import Mocap, ScenarioRow
+from neuspring.data.departure import Departure, broken, refuse, unusual
+from neuspring.data.unpickle import load_pickle
+from neuspring.errors import InputError
+from neuspring.records import digest_file
+
+RECORD_RATE = 100.0
+"""Samples per second of a recording."""
+MIN_MARKERS = 6
+"""Two controllers at either end and at least two observed markers."""
+MIN_FRAMES = 4
+MIN_DISTANCE = 1e-4
+"""Nodes must be further apart, m: shorter springs are not made."""
+RELEASED_SAMPLES = 500
+MAX_STRETCH = 0.5
+"""Marker distances of the released cables stay within a third of their median; more suggests swapped or lost markers."""
+OVERSAMPLING = 64
+"""Evaluations of the spline per marker interval, for its arc length."""
+
+
+def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
+    """Read one recording; options in `settings` (config, `mocap`). Metres, float32, world with +z up.
+
+    Frame rate 100 Hz / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
+    """
+    file = Path(file)
+    raw = load_pickle(file)
+    refuse(recording_departures(file, raw))
+    samples = np.asarray(raw)[:: settings.stride].transpose(0, 2, 1)
+    markers = samples if settings.frames is None else samples[: settings.frames]
+    frames, count, _ = markers.shape
+    if frames < MIN_FRAMES:
+        rule = f"at least {MIN_FRAMES} frames must remain after mocap.stride = {settings.stride}"
+        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller stride.")
+    train_end = int(settings.train_fraction * frames)
+    if train_end < 2:
+        rule = f"mocap.train_fraction = {settings.train_fraction} must leave a frame after frame 0 for training"
+        raise InputError(file, rule, f"{train_end} of {frames} frames", "Choose a larger fraction.")
+
+    held = [0, 1, count - 2, count - 1]
+    observed = markers[:, 2:-2]
+    body = rings(markers[0], settings.spacing, settings.radius, settings.ring)
+    _require_distance(file, markers[0], body)
+    motion_valid = np.ones(observed.shape[:2], dtype=bool)
+    motion_valid[-1] = False
+    return Observations(
+        scenario=Scenario(
+            name=row.scenario,
+            source="mocap",
+            category=row.category,
+            frame_count=frames,
+            train_end=train_end,
+            frame_rate=RECORD_RATE / settings.stride,
+            up="+z",
+            self_collision=row.self_collision,
+            ground=row.ground,
+            provenance={file.name: f"sha256:{digest_file(file)}", "options": _options(settings)},
+        ),
+        object_points=observed,
+        object_visibility=np.ones(observed.shape[:2], dtype=bool),
+        object_motion_valid=motion_valid,
+        controller_points=markers[:, held],
+        surface_points=body,
+        interior_points=np.zeros((0, 3)),
+        tracks=observed,
+    )
+
+
+def _options(settings: Mocap) -> str:
+    return ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
+
+
+def _require_distance(file: Path, markers: np.ndarray, body: np.ndarray) -> None:
+    """Raise InputError where ring nodes lie on a marker or on each other."""
+    points = np.concatenate([markers, body])
+    distance = cKDTree(points).query(points, k=2)[0][:, 1]
+    if distance.min() < MIN_DISTANCE:
+        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart (mocap.spacing, mocap.radius)"
+        raise InputError(file, rule, f"{distance.min():.2g} m", "Choose a larger radius or spacing.")
+
+
+def rings(markers: np.ndarray, spacing: float, radius: float, count: int) -> np.ndarray:
+    """Nodes [R * count, 3], m, on R circles around the centreline through `markers` [n, 3], ring after ring.
+
+    The first and last ring lie at the first and last marker; between them rings are equally spaced along the arc, as near to
+    `spacing` as divides it evenly. Each circle lies in the plane normal to the tangent. Its first node follows a
+    parallel-transported frame, so node k of one ring is nearest to node k of the next.
+    """
+    centres, tangents = centreline(markers, spacing)
+    normals = _transported_normals(tangents)
+    binormals = np.cross(tangents, normals)
+    angle = 2 * np.pi * np.arange(count) / count
+    offsets = np.cos(angle)[:, None] * normals[:, None] + np.sin(angle)[:, None] * binormals[:, None]
+    nodes: np.ndarray = (centres[:, None] + radius * offsets).reshape(-1, 3)
+    return nodes
+
+
+def centreline(markers: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit tangents [R, 3] of a natural cubic spline through `markers`, equally spaced along its arc."""
+    chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
+    spline = CubicSpline(chords, markers, bc_type="natural")
+    dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(chords)]))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
+    number = max(round(arc[-1] / spacing), 1) + 1
+    at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
+    tangents = spline(at, 1)
+    return spline(at), tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+
+
+def _transported_normals(tangents: np.ndarray) -> np.ndarray:
+    """Unit normals [R, 3]: each is the previous one projected into the next normal plane (parallel transport for small turns)."""
+    helper = np.eye(3)[np.abs(tangents[0]).argmin()]
+    normals = np.empty_like(tangents)
+    previous = helper
+    for i, tangent in enumerate(tangents):
+        projected = previous - (previous @ tangent) * tangent
+        normals[i] = previous = projected / np.linalg.norm(projected)
+    return normals
+
+
+def recording_departures(file: Path, raw: Any) -> list[Departure]:
+    """Everything about one recording that the reader refuses (errors) or that is not as released (warnings)."""
+    if not isinstance(raw, (np.ndarray, list, tuple)):
+        return [broken(file, "", "positions [T, 3, n] are required", type(raw).__name__)]
+    try:
+        data = np.asarray(raw)
+    except ValueError:
+        return [broken(file, "", "positions [T, 3, n] are required", "nested lists of different lengths")]
+    if data.ndim != 3 or data.shape[1] != 3:
+        return [broken(file, "", "the shape must be [T, 3, n]", data.shape)]
+    if data.dtype.kind != "f":
+        return [broken(file, "", "the dtype must be floating point", data.dtype)]
+    found = []
+    if data.shape[2] < MIN_MARKERS:
+        found.append(broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are held)", data.shape[2]))
+    if len(data) < MIN_FRAMES:
+        found.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
+    bad = np.argwhere(~np.isfinite(data))
+    if len(bad):
+        frame, axis, marker = (int(i) for i in bad[0])
+        place = f"{data[frame, axis, marker]} at frame {frame}, marker {marker} ({len(bad)} in all)"
+        found.append(broken(file, "", "every coordinate must be finite", place))
+    return found or _marker_departures(file, data)
+
+
+def _marker_departures(file: Path, data: np.ndarray) -> list[Departure]:
+    found = []
+    if data.dtype != np.float64:
+        found.append(unusual(file, "", "the released dtype is float64", data.dtype))
+    if len(data) != RELEASED_SAMPLES:
+        found.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
+    length = np.linalg.norm(np.diff(data, axis=2), axis=1)
+    short = np.argwhere(length[0] < MIN_DISTANCE)
+    if len(short):
+        i = int(short[0, 0])
+        found.append(
+            broken(file, "", f"neighbouring markers must be {MIN_DISTANCE} m apart in frame 0", f"markers {i} and {i + 1}")
+        )
+        return found
+    stretch = np.abs(length / np.median(length, axis=0) - 1)
+    frame, segment = np.unravel_index(int(stretch.argmax()), stretch.shape)
+    if stretch[frame, segment] > MAX_STRETCH:
+        place = f"{length[frame, segment]:.3f} m between markers {segment} and {segment + 1} in frame {frame}"
+        rule = f"marker distances usually stay within {MAX_STRETCH:.0%} of their median {np.median(length[:, segment]):.3f} m"
+        found.append(unusual(file, "", rule, place))
+    return found
+
+
+def check_mocap(file: Path) -> list[Departure]:
+    """Every departure of one recording; nothing is raised for bad content."""
+    try:
+        raw = load_pickle(file)
+    except InputError as error:
+        return [Departure(Path(file), "error", str(error))]
+    return recording_departures(Path(file), raw)

@@ -1,0 +1,245 @@
+"""Processed PhysTwin cases (`data/different_types/{case}/`) -> Observations. Layout: dataset facts, sections 1.1 and 1.2.
+
+Each `*_departures` function lists everything in one file that the reader refuses (errors) or that departs from the released
+layout without harm (warnings); `read` raises the first error, `neuspring check-data` prints them all.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuspring.artifacts import Observations, Scenario
+from neuspring.config import ScenarioRow
+from neuspring.data.departure import Departure, broken, refuse, unusual
+from neuspring.data.unpickle import load_pickle
+from neuspring.errors import InputError
+from neuspring.records import digest_file
+
+FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
+RELEASED_FRAME_RATE = 30.0
+"""Frames per second of every released recording; used where metadata.json is absent."""
+MAX_FRAME_RATE = 1e6
+
+
+@dataclass(frozen=True)
+class ArrayRule:
+    """What one array of a pickle must be. Dimensions: letters agree within the file, digits are fixed."""
+
+    key: str
+    shape: tuple[str, ...]
+    kind: str
+    """NumPy's letter: f (finite floating point) or b (bool)."""
+    required: bool = True
+    """The reader uses it."""
+
+
+ARRAYS = (
+    ArrayRule("object_points", ("T", "No", "3"), "f"),
+    ArrayRule("object_visibilities", ("T", "No"), "b"),
+    ArrayRule("object_motions_valid", ("T", "No"), "b"),
+    ArrayRule("controller_points", ("T", "C", "3"), "f"),
+    ArrayRule("surface_points", ("Ns", "3"), "f"),
+    ArrayRule("interior_points", ("Ni", "3"), "f"),
+    ArrayRule("object_colors", ("T", "No", "3"), "f", required=False),
+)
+IGNORED = ("controller_mask",)
+"""Left-over key of the released processing: accepted, not read."""
+KIND_NAMES = {"f": "floating point", "b": "bool"}
+
+
+def read(row: ScenarioRow, folder: Path) -> Observations:
+    """Read one processed case from its `folder`.
+
+    Uses final_data.pkl and split.json; gt_track_3d.pkl (else no tracks) and metadata.json (else 30 frames per second) where
+    present. Metres, float32, world with -z up. Raises InputError naming file and key.
+    """
+    folder = Path(folder)
+    data_path, split_path = folder / FINAL_DATA, folder / SPLIT
+    data = load_pickle(data_path)
+    refuse(final_data_departures(data_path, data))
+    frames = len(data["object_points"])
+    split = load_json(split_path)
+    refuse(split_departures(split_path, split, frames))
+    used = [data_path, split_path]
+
+    tracks = np.zeros((frames, 0, 3))
+    if (folder / TRACKS).exists():
+        tracks = load_pickle(folder / TRACKS)
+        refuse(tracks_departures(folder / TRACKS, tracks, frames))
+        used.append(folder / TRACKS)
+    frame_rate = RELEASED_FRAME_RATE
+    if (folder / METADATA).exists():
+        metadata = load_json(folder / METADATA)
+        refuse(frame_rate_departures(folder / METADATA, metadata))
+        frame_rate = float(metadata.get("fps", RELEASED_FRAME_RATE))
+        used.append(folder / METADATA)
+
+    return Observations(
+        scenario=Scenario(
+            name=row.scenario,
+            source="phystwin",
+            category=row.category,
+            frame_count=frames,
+            train_end=split["train"][1],
+            frame_rate=frame_rate,
+            up="-z",
+            self_collision=row.self_collision,
+            ground=row.ground,
+            provenance={file.name: f"sha256:{digest_file(file)}" for file in used},
+        ),
+        object_points=data["object_points"],
+        object_visibility=data["object_visibilities"],
+        object_motion_valid=data["object_motions_valid"],
+        controller_points=data["controller_points"],
+        surface_points=data["surface_points"],
+        interior_points=data["interior_points"],
+        tracks=tracks,
+    )
+
+
+def load_json(path: Path) -> Any:
+    """Parse a JSON file of the data set. Raises InputError."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "this file must be readable", error.strerror) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "this file must be JSON", str(error)) from error
+
+
+def final_data_departures(path: Path, data: Any) -> list[Departure]:
+    """Keys, shapes, dtypes and finiteness of final_data.pkl, and the rules without which nothing can be simulated."""
+    if not isinstance(data, dict):
+        return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
+    found: list[Departure] = []
+    known = {rule.key for rule in ARRAYS} | set(IGNORED)
+    found += [unusual(path, str(key), "unknown key, not read") for key in data if key not in known]
+    sizes: dict[str, int] = {}
+    for rule in ARRAYS:
+        if rule.key in data:
+            found += array_departures(path, rule, data[rule.key], sizes)
+        else:
+            found.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
+    if not any(d.level == "error" for d in found):
+        found += _content_departures(path, data)
+    return found
+
+
+def array_departures(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Departure]:
+    """Type, dtype, shape and finiteness of one array. `sizes` collects the symbolic dimensions of the file."""
+    declared = f"[{', '.join(rule.shape)}]"
+    severity = broken if rule.required else unusual
+    if not isinstance(value, np.ndarray):
+        return [severity(path, rule.key, f"an array {declared} is required", type(value).__name__)]
+    if value.ndim != len(rule.shape):
+        return [severity(path, rule.key, f"the shape must be {declared}", value.shape)]
+    found = []
+    for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
+        wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
+        if size != wanted:
+            found.append(
+                severity(path, rule.key, f"the shape must be {declared} with {wanted} entries along axis {axis}", value.shape)
+            )
+    if value.dtype.kind != rule.kind:
+        found.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
+    elif rule.kind == "f":
+        if value.dtype != np.float64:
+            found.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
+        bad = np.argwhere(~np.isfinite(value))
+        if len(bad):
+            found.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
+    return found
+
+
+def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
+    """'nan at frame 3, point 17 (5 in all)' for rows `bad` of np.argwhere on a [T, K, 3] or [K, 3] array."""
+    first = tuple(int(i) for i in bad[0])
+    place = f"frame {first[0]}, point {first[1]}" if value.ndim == 3 else f"point {first[0]}"
+    return f"{value[first]} at {place} ({len(bad)} in all)"
+
+
+def _content_departures(path: Path, data: dict[str, Any]) -> list[Departure]:
+    found = []
+    frames, points = data["object_visibilities"].shape
+    if points == 0:
+        found.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
+    if data["controller_points"].shape[1] == 0:
+        found.append(broken(path, "controller_points", "at least one controller point is required", "none"))
+    if frames < 2:
+        found.append(broken(path, "object_points", "at least 2 frames are required", frames))
+    hidden = np.flatnonzero(~data["object_visibilities"][0]) if frames else np.zeros(0, int)
+    if len(hidden):
+        rule = "every tracked point must be visible in frame 0, which is the rest state"
+        found.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
+    return found
+
+
+def split_departures(path: Path, split: Any, frames: int) -> list[Departure]:
+    """split.json against the number of frames: half-open ranges [start, end) inside [0, frames]."""
+    if not isinstance(split, dict):
+        return [broken(path, "", "a JSON object with train and test is required", type(split).__name__)]
+    found = []
+    for key in ("train", "test"):
+        value = split.get(key)
+        if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)):
+            found.append(broken(path, key, "two whole numbers [start, end) are required", value if key in split else "nothing"))
+        elif not 0 <= value[0] <= value[1] <= frames:
+            found.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
+        elif key == "train" and value[1] < 2:
+            found.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
+    if not found:
+        found += _split_warnings(path, split, frames)
+    return found
+
+
+def _split_warnings(path: Path, split: dict[str, Any], frames: int) -> list[Departure]:
+    end = int(0.7 * frames)
+    found = []
+    for key, wanted in (("train", [0, end]), ("test", [end, frames])):
+        if split[key] != wanted:
+            meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
+            found.append(unusual(path, key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
+    if split.get("frame_len") != frames:
+        found.append(unusual(path, "frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
+    return found
+
+
+def tracks_departures(path: Path, tracks: Any, frames: int | None) -> list[Departure]:
+    """gt_track_3d.pkl: floating point [T, K, 3], NaN rows where not annotated. `frames` None skips the comparison of T."""
+    if not isinstance(tracks, np.ndarray):
+        return [broken(path, "", "an array [T, K, 3] is required", type(tracks).__name__)]
+    if tracks.ndim != 3 or tracks.shape[2] != 3:
+        return [broken(path, "", "the shape must be [T, K, 3]", tracks.shape)]
+    if tracks.dtype.kind != "f":
+        return [broken(path, "", "the dtype must be floating point", tracks.dtype)]
+    found = []
+    if frames is not None and len(tracks) != frames:
+        found.append(broken(path, "", f"{FINAL_DATA} has {frames} frames", tracks.shape))
+    if tracks.dtype != np.float64:
+        found.append(unusual(path, "", "the released dtype is float64", tracks.dtype))
+    infinite = np.argwhere(np.isinf(tracks))
+    if len(infinite):
+        found.append(broken(path, "", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite)))
+    missing = np.isnan(tracks)
+    partial = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
+    if len(partial):
+        place = f"frame {partial[0][0]}, point {partial[0][1]} ({len(partial)} in all)"
+        found.append(unusual(path, "", "a point is NaN in all three coordinates or in none", place))
+    return found
+
+
+def frame_rate_departures(path: Path, metadata: Any) -> list[Departure]:
+    """The only field of metadata.json that the reader uses: fps, a positive number; 30 where absent."""
+    if not isinstance(metadata, dict):
+        return [broken(path, "", "a JSON object is required", type(metadata).__name__)]
+    fps = metadata.get("fps", RELEASED_FRAME_RATE)
+    if type(fps) not in (int, float) or not 0 < fps < MAX_FRAME_RATE:
+        return [broken(path, "fps", "a positive number of frames per second is required", fps)]
+    if fps != RELEASED_FRAME_RATE:
+        return [unusual(path, "fps", f"released recordings have {RELEASED_FRAME_RATE:g} frames per second", fps)]
+    return []

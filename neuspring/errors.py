@@ -1,0 +1,24 @@
+"""The errors a caller can cause. Each message names the file or field, the rule, the value received and the next move."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input: `where` broke `rule`; we received `value`; do `remedy` next.
+
+    Exit status 2 on the command line: retrying cannot help, so the workflow does not retry it.
+    """
+
+    def __init__(self, where: object, rule: str, value: object = None, remedy: str = "") -> None:
+        parts = [f"{where}: {rule}"]
+        if value is not None:
+            parts.append(f"received {value}")
+        text = "; ".join(parts)
+        super().__init__(f"{text}. {remedy}".rstrip() if remedy else f"{text}.")
+
+
+class NumericalFailure(RuntimeError):
+    """A computation that ended outside its physical range (for example: every candidate of a search diverged).
+
+    This is a result, not a crash: stages record it as `status: failed` with this reason, and tables show it.
+    """

@@ -1,0 +1,98 @@
+"""What is reported: Chamfer distance and track error (dataset facts, section 4), per frame and per task, both averages.
+
+Chamfer: each visible observed point to its nearest surface node, single direction, in the L1 norm |dx| + |dy| + |dz|.
+Track: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from neuspring.artifacts import Observations, Scenario, Trajectory
+
+TASKS = ("reconstruction", "future")
+UNITS = {"chamfer": "m", "track_error": "m"}
+COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
+
+
+def chamfer_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
+    """Mean L1 distance per frame [T], m, from visible points to surface nodes. NaN where no point is visible."""
+    surface = observations.surface_count
+    result = np.full(len(positions), np.nan)
+    for frame, nodes in enumerate(positions):
+        seen = observations.object_points[frame][observations.object_visibility[frame]]
+        if len(seen):
+            result[frame] = cKDTree(nodes[:surface].astype(np.float64)).query(seen.astype(np.float64), p=1)[0].mean()
+    return result
+
+
+def track_error_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
+    """Mean Euclidean track error per frame [T], m. A frame without any annotated track scores 0, as published.
+
+    NaN everywhere when no track is annotated at frame 0 (nothing can be matched).
+    """
+    tracks = observations.tracks[: len(positions)].astype(np.float64)
+    annotated = ~np.isnan(tracks).any(axis=2)
+    matched = annotated[0]
+    if not matched.any():
+        return np.full(len(positions), np.nan)
+    index = cKDTree(positions[0].astype(np.float64)).query(tracks[0][matched])[1]
+    error = np.linalg.norm(positions[:, index].astype(np.float64) - tracks[:, matched], axis=2)
+    valid = annotated[:, matched]
+    count = valid.sum(axis=1)
+    total = np.where(valid, error, 0.0).sum(axis=1)
+    mean: np.ndarray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+    return mean
+
+
+def task_frames(scenario: Scenario, task: str) -> range:
+    """Frames that a task averages over: reconstruction 1..train_end-1, future train_end..T-1 (frame 0 is given)."""
+    return range(1, scenario.train_end) if task == "reconstruction" else range(scenario.train_end, scenario.frame_count)
+
+
+def score(trajectory: Trajectory, observations: Observations, method: str, seed: int) -> pd.DataFrame:
+    """Tidy scores, one row per task and metric. Rows that cannot be computed are left out, never NaN:
+
+    a task without frames, a metric without annotation, a task that the rollout diverged in.
+    """
+    scenario = observations.scenario
+    rows = []
+    per_frame = {
+        "chamfer": chamfer_per_frame(trajectory.positions, observations),
+        "track_error": track_error_per_frame(trajectory.positions, observations),
+    }
+    for task in TASKS:
+        frames = task_frames(scenario, task)
+        if not len(frames) or frames[-1] >= len(trajectory.positions):
+            continue
+        for metric, values in per_frame.items():
+            usable = values[frames.start : frames.stop]
+            usable = usable[~np.isnan(usable)]
+            if len(usable):
+                identity = (scenario.name, scenario.category, method, seed, task, metric)
+                rows.append((*identity, float(usable.mean()), UNITS[metric], len(usable)))
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:
+    """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
+
+    The paper mixes the two (equal for Chamfer and track, frame-weighted for images), so both are kept. Seeds are averaged
+    within each scenario first; `seed_std` is the standard deviation over seeds of the equal average (0 for one seed).
+    """
+    keys = list(by)
+    weighted = scores.assign(weighted=scores["value"] * scores["frames"])
+    groups = weighted.groupby([*keys, "scenario"], sort=False)
+    per_scenario = groups.agg(value=("value", "mean"), weighted=("weighted", "sum"), frames=("frames", "sum")).reset_index()
+    total = per_scenario.groupby(keys, sort=False)
+    result = total.agg(
+        equal=("value", "mean"), weighted=("weighted", "sum"), all_frames=("frames", "sum"), scenarios=("scenario", "count")
+    )
+    result["frames"] = result.pop("weighted") / result.pop("all_frames")
+    per_seed = scores.groupby([*keys, "seed"], sort=False)["value"].mean().groupby(level=list(range(len(keys)))).std(ddof=1)
+    result["seed_std"] = per_seed.reindex(result.index).fillna(0.0)
+    return result.reset_index()

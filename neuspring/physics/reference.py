@@ -1,0 +1,155 @@
+"""The specification: a slow, readable float64 NumPy simulation (dataset facts, section 5.2). The Warp solver must agree.
+
+Everything is written one equation a line, unit masses, forward only; gradients are checked against its central differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from neuspring.artifacts import Simulation, Twin
+from neuspring.physics.contact import APPROACH, MIN_TANGENT
+from neuspring.physics.springs import MIN_LENGTH
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The numbers of a twin in float64, without the rounding of the stored float32 arrays unless they come from there."""
+
+    nodes: int
+    springs: np.ndarray
+    rest_lengths: np.ndarray
+    stiffness: np.ndarray
+    dashpot: np.ndarray
+    drag: float
+    ground: tuple[float, float]
+    contact: tuple[float, float]
+    contact_distance: float
+    simulation: Simulation
+
+    @classmethod
+    def of(cls, twin: Twin) -> Scene:
+        """A twin's numbers."""
+        t, m = twin.topology, twin.material
+        return cls(
+            nodes=len(t.nodes),
+            springs=t.springs,
+            rest_lengths=t.rest_lengths.astype(np.float64),
+            stiffness=m.stiffness.astype(np.float64),
+            dashpot=m.dashpot.astype(np.float64),
+            drag=m.drag,
+            ground=(m.ground_elasticity, m.ground_friction),
+            contact=(m.contact_elasticity, m.contact_friction),
+            contact_distance=m.contact_distance,
+            simulation=twin.simulation,
+        )
+
+
+def rollout(scene: Scene, x: np.ndarray, v: np.ndarray, controllers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3]."""
+    xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
+    for begin, end in zip(controllers[:-1].astype(np.float64), controllers[1:].astype(np.float64), strict=True):
+        x, v = frame(scene, xs[-1], vs[-1], begin, end)
+        xs.append(x)
+        vs.append(v)
+    return np.stack(xs), np.stack(vs)
+
+
+def frame(scene: Scene, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One frame: `substeps` substeps with controllers moving linearly from begin to end [C, 3]."""
+    sim = scene.simulation
+    spread = incidence(scene)
+    hands_velocity = (end - begin) / sim.frame_time if sim.controller_velocity else np.zeros_like(begin)
+    pairs = candidates(x, scene.contact_distance) if sim.self_collision else None
+    for step in range(sim.substeps):
+        hands = begin + (end - begin) * ((step + 1) / sim.substeps)
+        x, v = substep(scene, x, v, hands, hands_velocity, spread, pairs)
+    return x, v
+
+
+def incidence(scene: Scene) -> csr_matrix:
+    """[N, S]: +1 where a node is the first end of a spring, -1 where it is the second; controllers are left out."""
+    count = len(scene.springs)
+    total = int(max(scene.nodes, scene.springs.max(initial=0) + 1))
+    values = np.concatenate([np.ones(count), -np.ones(count)])
+    index = (np.concatenate([scene.springs[:, 0], scene.springs[:, 1]]), np.tile(np.arange(count), 2))
+    return csr_matrix((values, index), shape=(total, count))[: scene.nodes]
+
+
+def substep(
+    scene: Scene,
+    x: np.ndarray,
+    v: np.ndarray,
+    hands: np.ndarray,
+    hands_velocity: np.ndarray,
+    spread: csr_matrix,
+    pairs: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Symplectic Euler: forces at (x, v), velocity, self-collision, ground, position."""
+    sim = scene.simulation
+    dt = sim.substep
+    force = spread @ spring_forces(scene, np.concatenate([x, hands]), np.concatenate([v, hands_velocity]))
+    gravity = np.array([0.0, 0.0, -sim.gravity * sim.up_sign])
+    v = (v + dt * (force + gravity)) * np.exp(-dt * scene.drag)
+    if pairs is not None:
+        v = collide(x, v, pairs, scene.contact_distance, *scene.contact)
+    if sim.ground:
+        return bounce(x, v, dt, sim.up_sign, *scene.ground)
+    return x + dt * v, v
+
+
+def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d."""
+    i, j = scene.springs[:, 0], scene.springs[:, 1]
+    offset = x[j] - x[i]
+    length = np.linalg.norm(offset, axis=1)
+    d = offset / np.maximum(length, MIN_LENGTH)[:, None]
+    closing = np.einsum("ek,ek->e", v[j] - v[i], d)
+    magnitude = scene.stiffness * (length / scene.rest_lengths - 1.0) + scene.dashpot * closing
+    forces: np.ndarray = magnitude[:, None] * d
+    return forces
+
+
+def response(normal_speed: np.ndarray, tangent_speed: np.ndarray, e: float, mu: float) -> np.ndarray:
+    """a = max(0, 1 - mu (1 + e) |u_n| / |u_t|), the factor left on the tangential velocity."""
+    factor: np.ndarray = np.maximum(0.0, 1.0 - mu * (1.0 + e) * np.abs(normal_speed) / np.maximum(tangent_speed, MIN_TANGENT))
+    return factor
+
+
+def candidates(x: np.ndarray, distance: float) -> np.ndarray:
+    """All ordered pairs [P, 2] of different nodes closer than `distance`, found once per frame."""
+    gap = np.linalg.norm(x[:, None] - x[None], axis=2)
+    np.fill_diagonal(gap, np.inf)
+    return np.argwhere(gap < distance)
+
+
+def collide(x: np.ndarray, v: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
+    """Jacobi impulses: each node takes the mean over its partners that are near and approach; unit masses."""
+    i, j = pairs[:, 0], pairs[:, 1]
+    dx, u = x[j] - x[i], v[j] - v[i]
+    length = np.linalg.norm(dx, axis=1)
+    hit = (length < distance) & (np.einsum("pk,pk->p", dx, u) < -APPROACH)
+    i, dx, u, length = i[hit], dx[hit], u[hit], length[hit]
+    n = dx / np.maximum(length, MIN_TANGENT)[:, None]
+    speed = np.einsum("pk,pk->p", u, n)
+    un = speed[:, None] * n
+    ut = u - un
+    a = response(speed, np.linalg.norm(ut, axis=1), e, mu)
+    impulse = 0.5 * (-(1.0 + e) * un + (a - 1.0)[:, None] * ut)
+    total = np.zeros_like(v)
+    np.add.at(total, i, impulse)
+    hits = np.bincount(i, minlength=len(v))
+    return v - total / np.maximum(hits, 1)[:, None]
+
+
+def bounce(x: np.ndarray, v: np.ndarray, dt: float, up: float, e: float, mu: float) -> tuple[np.ndarray, np.ndarray]:
+    """Ground plane z = 0: nodes that would pass it downwards are reflected at their time of impact."""
+    falling = ((x[:, 2] + v[:, 2] * dt) * up < 0) & (v[:, 2] * up < -APPROACH)
+    a = response(v[:, 2], np.linalg.norm(v[:, :2], axis=1), e, mu)
+    bounced = np.concatenate([a[:, None] * v[:, :2], -e * v[:, 2:]], axis=1)
+    impact = -x[:, 2] / np.where(falling, v[:, 2], 1.0)
+    after = x + v * impact[:, None] + bounced * (dt - impact)[:, None]
+    return np.where(falling[:, None], after, x + v * dt), np.where(falling[:, None], bounced, v)

@@ -1,0 +1,85 @@
+"""Spring and dashpot forces, and their adjoint.
+
+With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing speed w = (v_j - v_i) . d, spring e = (i, j) adds
+
+    f_e = (Y s + gamma w) d        to node i, and -f_e to node j.
+
+Per-spring parameters are packed as (Y [N], 1 / l0 [1/m], gamma [N s/m]) so that one load serves a spring; the adjoint
+accumulates (dL/dY, (1/Y) dL/d(1/l0), dL/dgamma) the same way.
+"""
+# mypy: disable-error-code="valid-type,name-defined"
+
+# No postponed annotations here: Warp reads the evaluated types of the closures below.
+
+import functools
+from typing import Any
+
+import warp as wp
+
+MIN_LENGTH = 1e-6
+"""Lengths are floored here when a direction is formed, m."""
+
+
+@functools.cache
+def kernels(real: Any) -> tuple[Any, Any]:
+    """(force, adjoint) kernels for the scalar type `real`, wp.float32 or wp.float64."""
+    vec3 = wp.types.vector(3, real)
+    floor = wp.constant(real(MIN_LENGTH))
+    one = wp.constant(real(1.0))
+
+    def spring_force(
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        slot: int,
+        springs: wp.array(dtype=wp.vec2i),
+        parameters: wp.array(dtype=vec3),
+        force: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        i = springs[e][0]
+        j = springs[e][1]
+        p = parameters[e]
+        offset = x[slot, j] - x[slot, i]
+        length = wp.length(offset)
+        d = offset / wp.max(length, floor)
+        magnitude = p[0] * (length * p[1] - one) + p[2] * wp.dot(v[slot, j] - v[slot, i], d)
+        f = d * magnitude
+        wp.atomic_add(force, i, f)
+        wp.atomic_sub(force, j, f)
+
+    def spring_force_adjoint(
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        slot: int,
+        springs: wp.array(dtype=wp.vec2i),
+        parameters: wp.array(dtype=vec3),
+        adj_force: wp.array(dtype=vec3),
+        adj_x: wp.array(dtype=vec3),
+        adj_v: wp.array(dtype=vec3),
+        adj_parameters: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        i = springs[e][0]
+        j = springs[e][1]
+        p = parameters[e]
+        offset = x[slot, j] - x[slot, i]
+        length = wp.length(offset)
+        inverse = one / wp.max(length, floor)
+        d = offset * inverse
+        relative = v[slot, j] - v[slot, i]
+        c = adj_force[i] - adj_force[j]
+        cd = wp.dot(c, d)
+        wd = wp.dot(relative, d)
+        strain = length * p[1] - one
+        magnitude = p[0] * strain + p[2] * wd
+        # d(f.c)/d(offset): the direction turns (projected parts), the length stretches the spring.
+        g = (c - d * cd) * (magnitude * inverse) + d * (cd * p[0] * p[1]) + (relative - d * wd) * (cd * p[2] * inverse)
+        h = d * (cd * p[2])
+        wp.atomic_add(adj_x, j, g)
+        wp.atomic_sub(adj_x, i, g)
+        wp.atomic_add(adj_v, j, h)
+        wp.atomic_sub(adj_v, i, h)
+        adj_parameters[e] = adj_parameters[e] + vec3(cd * strain, cd * length, cd * wd)
+
+    unique = wp.kernel(module="unique", enable_backward=False)
+    return unique(spring_force), unique(spring_force_adjoint)

@@ -1,0 +1,125 @@
+"""Is the substep small enough? A bound for symplectic Euler with dashpots, per node and as a spectrum.
+
+For unit masses and a mode with stiffness eigenvalue lambda and damping eigenvalue c, the update is stable if
+dt^2 lambda + 2 dt c < 4 (Jury's criterion on z^2 - (2 - c dt - lambda dt^2) z + 1 - c dt). Since lambda and c are Rayleigh
+quotients of the same vector, it suffices that the largest eigenvalue of M(dt) = dt^2 K + 2 dt C is below 4, with
+K = sum_e (Y / l0) d d^T and C = sum_e gamma d d^T over the springs' direction blocks. Drag only helps and is ignored.
+
+Two estimates, cheap first: Gershgorin's bound per node, valid for any directions; then the eigenvalue itself in the rest
+configuration (Lanczos). Deformation turns directions but hardly raises the eigenvalue; `safety` covers that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+from neuspring.artifacts import Twin
+from neuspring.errors import InputError
+
+LIMIT = 4.0
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Largest eigenvalues of K [1/s^2] and C [1/s], and the node that moves most in the stiffest mode."""
+
+    stiffness: float
+    damping: float
+    node: int
+
+    def load(self, substep: float) -> float:
+        """dt^2 lambda + 2 dt c: stable below 4. An upper bound, since both maxima need not share a mode."""
+        return substep**2 * self.stiffness + 2 * substep * self.damping
+
+    def largest_substep(self, safety: float) -> float:
+        """The largest dt [s] with load(dt) <= 4 * safety."""
+        a, b = self.stiffness, 2 * self.damping
+        if a <= 0:
+            return np.inf if b <= 0 else LIMIT * safety / b
+        return float((-b + np.sqrt(b * b + 4 * a * LIMIT * safety)) / (2 * a))
+
+
+def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray) -> Spectrum:
+    """Per-node bound: twice the sum over springs to nodes, once over springs to controllers. stiffness is Y / l0 [S]."""
+    inner = (springs < nodes).all(axis=1)
+    weight = np.where(inner, 2.0, 1.0)
+    total = int(max(nodes, springs.max(initial=0) + 1))
+
+    def rows(values: np.ndarray) -> np.ndarray:
+        ends = np.concatenate([springs[:, 0], springs[:, 1]])
+        return np.bincount(ends, np.tile(weight * values, 2), total)[:nodes]
+
+    k, c = rows(stiffness), rows(damping)
+    node = int(np.argmax(k / max(k.max(initial=0), 1e-30) + c / max(c.max(initial=0), 1e-30)))
+    return Spectrum(float(k.max(initial=0)), float(c.max(initial=0)), node)
+
+
+def rest_spectrum(
+    springs: np.ndarray, nodes: np.ndarray, controllers: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
+) -> Spectrum:
+    """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S]."""
+    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
+    offset = ends[:, 1] - ends[:, 0]
+    direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
+    count = len(nodes)
+    # Row e of the incidence matrix maps node velocities to the rate of change of spring e's length; K = B^T diag(k) B.
+    columns, values, rows = [], [], []
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        inside = springs[:, end] < count
+        e = np.flatnonzero(inside)
+        rows.append(np.repeat(e, 3))
+        columns.append((springs[e, end, None] * 3 + np.arange(3)).ravel())
+        values.append(sign * direction[e].ravel())
+    shape = (len(springs), 3 * count)
+    incidence = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
+    transpose = incidence.T.tocsr()
+
+    def largest(weights: np.ndarray) -> tuple[float, int]:
+        if not weights.any():
+            return 0.0, 0
+        operator = LinearOperator((3 * count, 3 * count), matvec=lambda u: transpose @ (weights * (incidence @ u)))  # type: ignore[call-arg]
+        start = np.random.default_rng(0).standard_normal(3 * count)
+        try:
+            value, vector = eigsh(operator, k=1, which="LA", tol=1e-3, v0=start, maxiter=2000)
+        except ArpackNoConvergence:
+            bound = gershgorin(springs, count, weights, weights)
+            return bound.stiffness, bound.node
+        return float(value[0]), int(np.argmax(np.linalg.norm(vector[:, 0].reshape(-1, 3), axis=1)))
+
+    (k, node), (c, _) = largest(stiffness), largest(damping)
+    return Spectrum(k, c, node)
+
+
+def twin_spectrum(twin: Twin) -> Spectrum:
+    """The spectrum of a twin at rest."""
+    topology, material = twin.topology, twin.material
+    k = material.stiffness.astype(np.float64) / topology.rest_lengths
+    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, k, material.dashpot.astype(np.float64))
+
+
+def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
+    """The smallest number of substeps per frame whose load is at most 4 * safety."""
+    return max(1, int(np.ceil(frame_time / spectrum.largest_substep(safety))))
+
+
+def check(twin: Twin) -> None:
+    """Raise InputError, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
+    topology, material, simulation = twin.topology, twin.material, twin.simulation
+    k = material.stiffness.astype(np.float64) / topology.rest_lengths
+    c = material.dashpot.astype(np.float64)
+    if gershgorin(topology.springs, len(topology.nodes), k, c).load(simulation.substep) < LIMIT:
+        return
+    spectrum = twin_spectrum(twin)
+    if spectrum.load(simulation.substep) >= LIMIT:
+        largest = spectrum.largest_substep(1.0)
+        needed = smallest_safe_substeps(spectrum, simulation.frame_time, 1.0)
+        raise InputError(
+            f"simulation.substeps, node {spectrum.node}",
+            f"the substep must stay below {largest:.3g} s, the stability bound of this node (the stiffest, most damped)",
+            f"{simulation.substep:.3g} s ({simulation.substeps} substeps per frame)",
+            f"Use at least {needed} substeps, or substeps: auto.",
+        )

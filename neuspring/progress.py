@@ -1,0 +1,33 @@
+"""Progress of long work: one updating line on a terminal, a line now and then in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+
+class Progress:
+    """Reports `label done/total` with the elapsed and remaining time, at most every `every` seconds."""
+
+    def __init__(self, label: str, total: int, every: float | None = None) -> None:
+        self._label, self._total = label, total
+        self._terminal = sys.stderr.isatty()
+        self._every = every if every is not None else (0.2 if self._terminal else 10.0)
+        self._start = time.monotonic()
+        self._last = 0.0
+        self._first: int | None = None
+
+    def update(self, done: int, note: str = "") -> None:
+        """`done` of `total` steps are finished."""
+        moment = time.monotonic()
+        if self._first is None:
+            self._first = done - 1
+        final = done >= self._total
+        if moment - self._last < self._every and not final:
+            return
+        self._last = moment
+        elapsed = moment - self._start
+        left = elapsed / max(done - self._first, 1) * (self._total - done)
+        text = f"{self._label} {done}/{self._total} [{elapsed:.0f} s, {left:.0f} s left] {note}".rstrip()
+        end = "\n" if final or not self._terminal else ""
+        print(f"\r\x1b[K{text}" if self._terminal else text, end=end, file=sys.stderr, flush=True)

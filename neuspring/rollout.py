@@ -1,0 +1,75 @@
+"""Roll a twin out under recorded controller motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from neuspring.artifacts import Trajectory, Twin
+from neuspring.physics import stability
+from neuspring.physics.autograd import pack, twin_tensors
+from neuspring.physics.solver import FrameSolver
+
+FAR = 1e3
+"""A node this far from the origin has left any plausible scene, m."""
+
+
+class Diverged(Exception):
+    """A rollout left every plausible range; carries the frame and what happened."""
+
+    def __init__(self, frame: int, reason: str) -> None:
+        super().__init__(reason)
+        self.frame, self.reason = frame, reason
+
+
+def frames(twin: Twin, solver: FrameSolver, hands: torch.Tensor) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
+    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3], from rest. Raises Diverged."""
+    x = torch.tensor(twin.topology.nodes, dtype=solver.dtype, device=solver.device)
+    v = torch.zeros_like(x)
+    for frame in range(1, len(hands)):
+        x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
+        # NaN compares false, so this catches it together with infinity and absurd distances.
+        near = (x.abs() < FAR).all(dim=1)
+        if not bool(near.all()):
+            raise Diverged(frame, f"node {int((~near).nonzero()[0])} left the scene in frame {frame}")
+        yield frame, x, v
+
+
+def solver_for(twin: Twin, device: str) -> FrameSolver:
+    """A forward-only solver with the twin's parameters."""
+    topology = twin.topology
+    solver = FrameSolver(
+        topology.springs, len(topology.nodes), len(topology.controllers), twin.simulation, device=device, differentiable=False
+    )
+    solver.set_parameters(pack(**twin_tensors(twin, device), substep=twin.simulation.substep))
+    return solver
+
+
+def roll_out(
+    twin: Twin, controller_points: np.ndarray, device: str = "cpu", progress: Callable[[int], None] | None = None
+) -> Trajectory:
+    """Simulate from rest over controller_points [T, C, 3], m. Divergence ends the rollout as a named result.
+
+    Raises InputError if the substep is beyond the stability bound.
+    """
+    stability.check(twin)
+    solver = solver_for(twin, device)
+    hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
+    positions = [torch.tensor(twin.topology.nodes)]
+    diverged, reason = None, ""
+    try:
+        for frame, x, _ in frames(twin, solver, hands):
+            positions.append(x.cpu())
+            if progress is not None:
+                progress(frame)
+    except Diverged as end:
+        diverged, reason = end.frame, end.reason
+    return Trajectory(
+        positions=torch.stack(positions).numpy(),
+        frame_count=len(hands),
+        diverged_frame=diverged,
+        reason=reason,
+        collision_overflow=solver.collision_overflow,
+    )

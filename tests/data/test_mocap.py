@@ -1,0 +1,176 @@
+"""The cable reader: ring geometry against its definition, refusals, and the released recordings where they are present."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from neuspring.config import Mocap, ScenarioRow
+from neuspring.data import mocap
+from neuspring.data.check import check
+from neuspring.errors import InputError
+
+ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
+REAL = Path(__file__).parents[2].parent / "shared" / "data" / "mocap_dlo"
+EDGE = 1e-9
+"""Rounding of float64 geometry of size 1."""
+SPLINE = 1e-3
+"""Relative error of the spacing: the arc is measured by 63 chords per marker interval, and rings are chords of the curve."""
+
+
+def helix(count: int = 12) -> np.ndarray:
+    """Markers [n, 3] along 0.8 turns of a helix of radius 0.2 m that climbs 0.3 m."""
+    angle = np.linspace(0, 1.6 * np.pi, count)
+    return np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.3 + 0.3 * angle / angle[-1]], axis=1)
+
+
+def recording(samples: int = 40, count: int = 12) -> np.ndarray:
+    """[T, 3, n] as released: the helix swinging rigidly along x."""
+    swing = 0.05 * np.sin(np.linspace(0, 3, samples))[:, None, None] * np.array([1.0, 0.0, 0.0])
+    return (helix(count) + swing).transpose(0, 2, 1)
+
+
+def write(tmp_path: Path, value: Any) -> Path:
+    path = tmp_path / "7.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=4))
+    return path
+
+
+@pytest.mark.parametrize("as_lists", [True, False], ids=["lists, as released", "array"])
+def test_markers_and_time(tmp_path: Path, as_lists: bool) -> None:
+    data = recording()
+    path = write(tmp_path, data.tolist() if as_lists else data)
+    seen = mocap.read(ROW, path, Mocap(stride=2))
+    scenario = seen.scenario
+    assert (scenario.frame_count, scenario.train_end, scenario.frame_rate, scenario.up) == (20, 14, 50.0, "+z")
+    assert not scenario.ground
+    np.testing.assert_array_equal(seen.object_points, data[::2, :, 2:-2].transpose(0, 2, 1).astype(np.float32))
+    np.testing.assert_array_equal(seen.controller_points, data[::2][:, :, [0, 1, -2, -1]].transpose(0, 2, 1).astype(np.float32))
+    np.testing.assert_array_equal(seen.tracks, seen.object_points)
+    assert seen.object_visibility.all()
+    assert seen.object_motion_valid[:-1].all()
+    assert not seen.object_motion_valid[-1].any()
+    assert len(seen.interior_points) == 0
+    assert scenario.provenance["7.pkl"].startswith("sha256:")
+    assert "stride=2" in scenario.provenance["options"]
+
+
+def test_frames_are_cut_after_the_stride(tmp_path: Path) -> None:
+    seen = mocap.read(ROW, write(tmp_path, recording()), Mocap(stride=3, frames=10))
+    assert seen.scenario.frame_count == 10
+    np.testing.assert_array_equal(seen.object_points[9], recording()[27, :, 2:-2].T.astype(np.float32))
+
+
+@pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
+def test_ring_geometry(spacing: float, radius: float, ring: int) -> None:
+    centres, tangents = mocap.centreline(helix(), spacing)
+    nodes = mocap.rings(helix(), spacing, radius, ring).reshape(-1, ring, 3)
+    offsets = nodes - centres[:, None]
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), radius, rtol=0, atol=EDGE)
+    np.testing.assert_allclose(np.einsum("rki,ri->rk", offsets, tangents), 0, atol=EDGE)
+    np.testing.assert_allclose(nodes.mean(axis=1), centres, atol=EDGE)
+    neighbour = np.linalg.norm(offsets - np.roll(offsets, 1, axis=1), axis=2)
+    np.testing.assert_allclose(neighbour, 2 * radius * np.sin(np.pi / ring), atol=EDGE)
+    np.testing.assert_allclose(centres[[0, -1]], helix()[[0, -1]], atol=EDGE)
+    step = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    np.testing.assert_allclose(step, step.mean(), rtol=SPLINE)
+    # Dividing the arc evenly moves the spacing by at most half a step over all rings.
+    assert abs(step.mean() - spacing) <= spacing / (2 * len(step)) + SPLINE * spacing
+
+
+def test_markers_lie_on_the_centreline() -> None:
+    centres, _ = mocap.centreline(helix(), 0.0005)
+    assert cKDTree(centres).query(helix())[0].max() <= 0.00026  # half the spacing
+
+
+def assert_no_twist(nodes: np.ndarray, ring: int) -> None:
+    rings = nodes.reshape(-1, ring, 3)
+    for one, other in pairwise(rings):
+        assert (cKDTree(other).query(one)[1] == np.arange(ring)).all()
+
+
+def test_rings_do_not_twist() -> None:
+    assert_no_twist(mocap.rings(helix(), 0.012, 0.006, 4), 4)
+    vertical = np.array([[0.0, 0.0, 1.0 - 0.1 * i] for i in range(8)])  # a tangent along a coordinate axis
+    assert_no_twist(mocap.rings(vertical, 0.012, 0.006, 4), 4)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (recording()[:, :2], r"shape must be \[T, 3, n\].*\(40, 2, 12\)"),
+        (recording()[0], r"shape must be \[T, 3, n\]"),
+        (recording().transpose(0, 2, 1), r"shape must be"),
+        (recording(count=5), r"at least 6 markers.*5"),
+        ((recording() * 1000).astype(int), r"dtype must be floating point.*int"),
+        (recording()[:3], r"at least 4 frames.*3"),
+        (np.where(np.arange(12) == 3, np.nan, recording()), r"finite.*nan at frame 0, marker 3 \(120 in all\)"),
+        ([[1.0, 2.0], [3.0]], r"different lengths"),
+        ({"positions": 1}, r"required; received dict"),
+        (recording()[:, :, [0, 1, 2, 2, 4, 5, 6, 7]], r"markers 2 and 3"),
+    ],
+)
+def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) -> None:
+    path = write(tmp_path, value)
+    with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
+        mocap.read(ROW, path, Mocap())
+    assert [d.level for d in mocap.check_mocap(path) if d.level == "error"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (Mocap(stride=20), "stride = 20"),
+        (Mocap(train_fraction=0.05), "train_fraction"),
+        (Mocap(radius=1e-5), "mocap.radius"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, message: str) -> None:
+    with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
+        mocap.read(ROW, write(tmp_path, recording()), settings)
+
+
+def test_a_hostile_recording_does_not_run(tmp_path: Path) -> None:
+    class Hostile:
+        def __reduce__(self) -> Any:
+            return os.mkdir, (str(tmp_path / "ran"),)
+
+    path = write(tmp_path, Hostile())
+    with pytest.raises(InputError, match="mkdir"):
+        mocap.read(ROW, path, Mocap())
+    assert "mkdir" in mocap.check_mocap(path)[0].message
+    assert not (tmp_path / "ran").exists()
+
+
+def test_check_of_files_and_folders(tmp_path: Path) -> None:
+    data = recording(samples=500)
+    data[30, :, [4, 5]] = data[30, :, [5, 4]]
+    path = write(tmp_path, data.tolist())
+    for target in (path, tmp_path):
+        found = check(target)
+        assert [d.level for d in found] == ["warning"]
+        assert "in frame 30" in found[0].message
+    assert [d.message for d in mocap.check_mocap(write(tmp_path, recording(samples=400)))] == [
+        "released recordings have 500 samples; received 400"
+    ]
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
+def test_released_recordings() -> None:
+    assert [d for d in check(REAL) if d.level != "note"] == []
+    settings = Mocap()
+    for cable in ("DLO1", "DLO2", "DLO4"):
+        file = next((REAL / cable / "train").glob("*.pkl"))
+        seen = mocap.read(dataclasses.replace(ROW, scenario=cable), file, settings)
+        assert seen.scenario.frame_count == 250
+        assert seen.object_points.shape[1] == (9 if cable == "DLO1" else 8)
+        assert 300 < len(seen.nodes) < 380
+        assert_no_twist(seen.surface_points, settings.ring)

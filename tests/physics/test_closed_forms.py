@@ -1,0 +1,258 @@
+"""The integrator against closed forms, conservation laws and its order of convergence.
+
+Symplectic Euler has exact discrete solutions for free fall and for a linear oscillator, so most comparisons are to rounding;
+agreement with the continuous solution is then a matter of order: halving the substep halves the error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from neuspring.physics.contact import APPROACH
+
+from .scenes import ENGINES, Engine, no_hands, scene
+
+# Rounding of float64 accumulated over up to 10^4 substeps at metres and metres per second.
+ROUNDING = 1e-10
+# Error ratio when the substep halves: 2 for first order; the next order contributes about dt / T, 2 % here.
+HALVING = (1.95, 2.05)
+G = 9.8
+
+pytestmark = pytest.mark.parametrize("engine", ENGINES)
+SIDES = pytest.mark.parametrize("up", ["+z", "-z"])
+
+
+def sign(up: str) -> float:
+    return 1.0 if up == "+z" else -1.0
+
+
+# Free fall ------------------------------------------------------------------------------------------------------------
+
+
+def fall(engine: Engine, substeps: int, drag: float, up: str = "+z", frames: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    made = scene(1, drag=drag, gravity=G, up=up, substeps=substeps, frame_time=0.1)
+    return engine(made, np.array([[0.1, 0.0, 3.0]]), np.array([[0.7, 0.0, 2.0]]), no_hands(frames))
+
+
+@SIDES
+@pytest.mark.parametrize("drag", [0.0, 3.0])
+def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: str) -> None:
+    """v_n = delta^n v_0 - s g dt,  x_n = x_0 + dt (s v_0 - g dt sum of partial sums),  s = delta + ... + delta^n."""
+    substeps = 50
+    x, v = fall(engine, substeps, drag, up)
+    dt = 0.1 / substeps
+    delta = np.exp(-dt * drag)
+    powers = delta ** np.arange(1, 4 * substeps + 1)
+    partial = np.cumsum(powers)
+    for frame in range(1, 5):
+        n = frame * substeps
+        gravity = -sign(up) * G * dt
+        np.testing.assert_allclose(v[frame, 0], [0.7 * powers[n - 1], 0, 2.0 * powers[n - 1] + gravity * partial[n - 1]], atol=ROUNDING)
+        travelled = dt * np.array([0.7 * partial[n - 1], 0, 2.0 * partial[n - 1] + gravity * partial[:n].sum()])
+        np.testing.assert_allclose(x[frame, 0], [0.1, 0, 3.0] + travelled, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("drag", [0.0, 3.0])
+def test_free_fall_converges_at_first_order(engine: Engine, drag: float) -> None:
+    """Exactly: v = (v_0 + g/c) exp(-c t) - g/c."""
+    t = 0.4
+    exact = 3.0 + 2.0 * t - G * t**2 / 2
+    if drag:
+        exact = 3.0 + (2.0 + G / drag) * (1 - np.exp(-drag * t)) / drag - G * t / drag
+    errors = [abs(fall(engine, substeps, drag)[0][-1, 0, 2] - exact) for substeps in (50, 100)]
+    assert HALVING[0] < errors[0] / errors[1] < HALVING[1]
+
+
+# A linear oscillator: two nodes and a spring --------------------------------------------------------------------------
+
+LENGTH, STIFFNESS, AMPLITUDE = 0.2, 50.0, 0.02
+OMEGA_SQUARED = 2 * STIFFNESS / LENGTH
+"""Of the distance between two unit masses: q'' = -2 (Y / l0) q."""
+PERIOD = 2 * np.pi / np.sqrt(OMEGA_SQUARED)
+
+
+def oscillate(engine: Engine, substep: float, steps: int, per_frame: int = 1, dashpot: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Extension q [F] and its rate, at frame ends, along a tilted axis, starting at AMPLITUDE with rate 0."""
+    made = scene(
+        2, [(0, 1)], [LENGTH], stiffness=STIFFNESS, dashpot=dashpot, substeps=per_frame, frame_time=substep * per_frame
+    )
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    x = np.stack([np.zeros(3), axis * (LENGTH + AMPLITUDE)])
+    x, v = engine(made, x, np.zeros((2, 3)), no_hands(steps // per_frame))
+    return (x[:, 1] - x[:, 0]) @ axis - LENGTH, (v[:, 1] - v[:, 0]) @ axis
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.8])
+def test_oscillator_is_the_discrete_closed_form(engine: Engine, damping: float) -> None:
+    """q_{n+1} - (2 - c dt - w^2 dt^2) q_n + (1 - c dt) q_{n-1} = 0, so q_n = r^n (A cos n theta + B sin n theta)."""
+    dt, c = PERIOD / 40, 2 * damping
+    q, _ = oscillate(engine, dt, 400, dashpot=damping)
+    r = np.sqrt(1 - c * dt)
+    theta = np.arccos((2 - c * dt - OMEGA_SQUARED * dt**2) / (2 * r))
+    first = AMPLITUDE * (1 - OMEGA_SQUARED * dt**2)
+    sine = (first / r - AMPLITUDE * np.cos(theta)) / np.sin(theta)
+    n = np.arange(401)
+    np.testing.assert_allclose(q, r**n * (AMPLITUDE * np.cos(n * theta) + sine * np.sin(n * theta)), atol=ROUNDING)
+
+
+def test_oscillator_frequency_is_the_springs(engine: Engine) -> None:
+    """cos(theta) = (q_{n+1} + q_{n-1}) / 2 q_n; the discrete frequency theta / dt exceeds w by (w dt)^2 / 24."""
+    dt = PERIOD / 100
+    q, _ = oscillate(engine, dt, 60)
+    strong = np.flatnonzero(np.abs(q[1:-1]) > AMPLITUDE / 2) + 1
+    frequency = np.arccos((q[strong + 1] + q[strong - 1]) / (2 * q[strong])) / dt
+    expected = np.sqrt(OMEGA_SQUARED) * (1 + OMEGA_SQUARED * dt**2 / 24)
+    # The next term of the expansion is 3 (w dt)^4 / 640.
+    np.testing.assert_allclose(frequency, expected, rtol=(OMEGA_SQUARED * dt**2) ** 2 / 200)
+
+
+def test_oscillator_converges_at_first_order(engine: Engine) -> None:
+    """Compared with A cos(w t) at 5.2 periods, where sin(w t), the leading error's factor, is not small."""
+    steps, t = 1300, 5.2 * PERIOD
+    exact = AMPLITUDE * np.cos(np.sqrt(OMEGA_SQUARED) * t)
+    errors = [abs(oscillate(engine, t / n, n, n)[0][-1] - exact) for n in (steps, 2 * steps)]
+    assert HALVING[0] < errors[0] / errors[1] < HALVING[1]
+
+
+def test_energy_is_bounded_without_damping(engine: Engine) -> None:
+    """Symplectic: q'^2 + w^2 q^2 - dt w^2 q q' is conserved exactly, so the energy stays within w dt / 2 of its start."""
+    dt = PERIOD / 60
+    q, rate = oscillate(engine, dt, 60 * 100, per_frame=7)
+    shadow = rate**2 + OMEGA_SQUARED * q**2 - dt * OMEGA_SQUARED * q * rate
+    np.testing.assert_allclose(shadow, shadow[0], rtol=1e-9)
+    energy = (rate**2 + OMEGA_SQUARED * q**2) / (OMEGA_SQUARED * AMPLITUDE**2)
+    half = np.sqrt(OMEGA_SQUARED) * dt / 2
+    assert energy.max() < 1 / (1 - half) + ROUNDING
+    assert energy.min() > 1 / (1 + half) - ROUNDING
+    # No drift: the second half of 100 periods reaches the same extremes as the first.
+    middle = len(energy) // 2
+    assert energy[middle:].max() == pytest.approx(energy[:middle].max(), rel=1e-3)
+
+
+def test_energy_decays_with_a_dashpot(engine: Engine) -> None:
+    """Per period: monotone, at the rate of the discrete envelope, r^2 = 1 - c dt per substep."""
+    gamma, per_frame = 0.3, 60
+    dt = PERIOD / per_frame
+    q, rate = oscillate(engine, dt, per_frame * 12, per_frame, gamma)
+    energy = rate**2 + OMEGA_SQUARED * q**2
+    assert (np.diff(energy) < 0).all()
+    # A frame is a period of the undamped motion; the phase slips a little, which moves the energy within the band above.
+    band = np.sqrt(OMEGA_SQUARED) * dt
+    assert energy[-1] / energy[0] == pytest.approx((1 - 2 * gamma * dt) ** (12 * per_frame), rel=band)
+
+
+# Conservation in a net ------------------------------------------------------------------------------------------------
+
+
+def net(dashpot: float, frames: int = 20) -> tuple:
+    rng = np.random.default_rng(5)
+    x, v = rng.uniform(-0.1, 0.1, (12, 3)), rng.uniform(-1, 1, (12, 3))
+    springs = [(i, j) for i in range(12) for j in range(i + 1, 12) if rng.random() < 0.5]
+    lengths = [np.linalg.norm(x[i] - x[j]) * rng.uniform(0.8, 1.2) for i, j in springs]
+    made = scene(12, springs, lengths, stiffness=rng.uniform(5, 100, len(springs)), dashpot=dashpot, substeps=20, frame_time=0.02)
+    return made, x, v, no_hands(frames)
+
+
+@pytest.mark.parametrize("dashpot", [0.0, 2.0])
+def test_momentum_and_angular_momentum(engine: Engine, dashpot: float) -> None:
+    """Springs and dashpots act along the line between their ends. Momentum is conserved, and so is angular momentum:
+
+    x_{n+1} x v_{n+1} = (x_n + dt v_{n+1}) x v_{n+1} = x_n x (v_n + dt f_n), and central forces have no total moment.
+    """
+    x, v = engine(*net(dashpot))
+    np.testing.assert_allclose(v.sum(axis=1), np.tile(v[0].sum(axis=0), (len(v), 1)), atol=ROUNDING)
+    spin = np.cross(x, v).sum(axis=1)
+    np.testing.assert_allclose(spin, np.tile(spin[0], (len(spin), 1)), atol=ROUNDING)
+
+
+def test_a_damped_net_comes_to_rest_in_its_frame(engine: Engine) -> None:
+    """Kinetic energy about the centre of mass and spring energy decay from frame to frame."""
+    made, x0, v0, hands = net(3.0, 40)
+    x, v = engine(made, x0, v0, hands)
+    i, j = made.springs.T
+    strain = np.linalg.norm(x[:, j] - x[:, i], axis=2) / made.rest_lengths - 1
+    energy = 0.5 * (v**2).sum(axis=(1, 2)) + 0.5 * (made.stiffness * made.rest_lengths * strain**2).sum(axis=1)
+    assert (np.diff(energy) < 0).all()
+
+
+@pytest.mark.parametrize(("e", "mu"), [(1.0, 0.0), (0.7, 0.3), (0.0, 2.0)])
+def test_a_colliding_pair(engine: Engine, e: float, mu: float) -> None:
+    """Momentum is conserved, the normal speed is reversed times e, the tangential one shrinks by a."""
+    made = scene(2, self_collision=True, contact=(e, mu), contact_distance=0.02, substeps=1, frame_time=1e-3)
+    x = np.array([[0.0, 0, 0], [0.015, 0, 0]])
+    v = np.array([[0.4, 0.1, 0], [-0.2, -0.5, 0.3]])
+    _, after = engine(made, x, v, no_hands(1))
+    np.testing.assert_allclose(after[1].sum(axis=0), v.sum(axis=0), atol=1e-15)
+    before, relative = v[1] - v[0], after[1, 1] - after[1, 0]
+    tangent = np.linalg.norm(before[1:])
+    a = max(0.0, 1 - mu * (1 + e) * abs(before[0]) / tangent)
+    np.testing.assert_allclose(relative, [-e * before[0], *(a * before[1:])], atol=1e-15)
+    if (e, mu) == (1.0, 0.0):
+        assert (after[1] ** 2).sum() == pytest.approx((v**2).sum(), rel=1e-14)
+
+
+def test_receding_or_distant_pairs_do_not_collide(engine: Engine) -> None:
+    made = scene(2, self_collision=True, contact_distance=0.02)
+    v = np.array([[-0.1, 0, 0], [0.1, 0, 0]])
+    near, far = np.array([[0.0, 0, 0], [0.015, 0, 0]]), np.array([[0.0, 0, 0], [0.02, 0, 0]])
+    for x, speed in ((near, v), (near, 0 * v), (far, -v)):
+        np.testing.assert_array_equal(engine(made, x, speed, no_hands(1))[1][1], speed)
+
+
+# Ground ---------------------------------------------------------------------------------------------------------------
+
+
+@SIDES
+@pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
+def test_restitution_is_exact_in_speed(engine: Engine, e: float, up: str) -> None:
+    """One substep: reflected at the time of impact, then v' for the rest of the substep."""
+    s, dt = sign(up), 1e-3
+    made = scene(1, on_ground=True, ground=(e, 0.0), up=up)
+    x, v = engine(made, np.array([[0, 0, s * 2e-4]]), np.array([[0.3, 0, -s * 0.8]]), no_hands(1))
+    impact = 2e-4 / 0.8
+    np.testing.assert_allclose(v[1, 0], [0.3, 0, s * e * 0.8], atol=1e-15)
+    np.testing.assert_allclose(x[1, 0], [0.3 * dt, 0, s * e * 0.8 * (dt - impact)], atol=1e-15)
+
+
+@SIDES
+def test_bounce_height_is_e_squared(engine: Engine, up: str) -> None:
+    """Height of the n-th bounce: e^(2n) h, up to the distance fallen in a substep at full speed."""
+    s, dt, height, e = sign(up), 2e-4, 0.1, 0.6
+    made = scene(1, on_ground=True, ground=(e, 0.0), gravity=G, up=up, frame_time=dt)
+    z = s * engine(made, np.array([[0, 0, s * height]]), np.zeros((1, 3)), no_hands(3000))[0][:, 0, 2]
+    tops = z[1:-1][(z[1:-1] > z[:-2]) & (z[1:-1] >= z[2:])]
+    step = dt * np.sqrt(2 * G * height)
+    assert len(tops) >= 2
+    np.testing.assert_allclose(tops[:2], [e**2 * height, e**4 * height], atol=step)
+
+
+@SIDES
+def test_sliding_and_sticking(engine: Engine, up: str) -> None:
+    """a = max(0, 1 - mu (1 + e) |v_n| / |v_t|): partly braked, or stopped when mu is large."""
+    s, e, w = sign(up), 0.4, np.array([0.6, -0.8, -0.5 * sign(up)])
+    for mu, a in ((0.0, 1.0), (0.3, 1 - 0.3 * 1.4 * 0.5), (2.0, 0.0)):
+        made = scene(1, on_ground=True, ground=(e, mu), up=up)
+        _, v = engine(made, np.array([[0, 0, s * 1e-4]]), w[None], no_hands(1))
+        np.testing.assert_allclose(v[1, 0], [a * w[0], a * w[1], -e * w[2]], atol=1e-15)
+
+
+@SIDES
+@pytest.mark.parametrize("e", [0.0, 0.3, 1.0])
+def test_the_ground_holds(engine: Engine, e: float, up: str) -> None:
+    """From above nothing goes deeper than a node slower than APPROACH can travel in the substep in which it is let pass."""
+    rng, s, dt = np.random.default_rng(2), sign(up), 1e-3
+    made = scene(40, on_ground=True, ground=(e, 0.2), gravity=G, up=up, frame_time=dt)
+    x, v = rng.uniform(0, 0.02, (40, 3)), rng.uniform(-1, 1, (40, 3))
+    x[:, 2] *= s
+    z = s * engine(made, x, v, no_hands(400))[0][:, :, 2]
+    assert (z < 1e-3).any()
+    assert z.min() >= -APPROACH * dt - 1e-15
+
+
+def test_resting_weight_is_carried(engine: Engine) -> None:
+    """A node lying on the ground with e = 0 stays there."""
+    made = scene(1, on_ground=True, ground=(0.0, 0.5), gravity=G)
+    x, v = engine(made, np.zeros((1, 3)), np.zeros((1, 3)), no_hands(50))
+    np.testing.assert_allclose(x, 0, atol=1e-15)
+    np.testing.assert_allclose(v, 0, atol=1e-15)
