@@ -8,6 +8,7 @@ the workflow reads it before any job exists.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -203,8 +204,8 @@ class Config:
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     __pydantic_config__ = STRICT
-    scenarios: tuple[Name, ...]
-    methods: tuple[Name, ...]
+    scenarios: tuple[Name, ...] = ()
+    methods: tuple[Name, ...] = ()
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
     results: str = "results"
     data_root: str | None = None
@@ -224,8 +225,6 @@ class Config:
     def __post_init__(self) -> None:
         for name in ("scenarios", "methods", "seeds"):
             values = getattr(self, name)
-            if not values:
-                raise ValueError(f"{name}: at least one entry is required")
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: entries must differ, received {list(values)}")
 
@@ -238,8 +237,8 @@ class Method:
     search: Literal["uniform"]
     fit: Literal["springs"] | None
     description: str
-    overrides: dict[str, Any] = field(default_factory=dict)
-    """Settings of this method alone, with the keys of the configuration (for example `fit: {horizon: 0}`)."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Fit settings of this method alone (keys of `fit`, for example `horizon: 0`). The search is shared by all methods."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,16 +329,66 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     return rows
 
 
-def for_method(config: Config, method: Method, name: str) -> Config:
-    """The configuration with a method's overrides applied. Raises InputError for unknown keys."""
-    merged = plain(config)
-    _merge(merged, method.overrides)
-    return parse(Config, merged, f"method {name}, overrides")
+def fit_of(config: Config, method: Method, name: str) -> Fit:
+    """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
+    return parse(Fit, plain(config.fit) | dict(method.settings), f"method {name}, settings")
 
 
-def _merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
+@dataclass(frozen=True)
+class Benchmark:
+    """A validated configuration with the rows it names."""
+
+    config: Config
+    scenarios: dict[str, ScenarioRow]
+    methods: dict[str, Method]
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
+        """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
+        config = parse(Config, values, "configuration")
+        for name in ("scenarios", "methods", "seeds"):
+            if not getattr(config, name):
+                raise InputError(f"configuration, {name}", "at least one entry is required")
+        scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
+        _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
+        _require_known("methods", config.methods, methods, config.method_table)
+        chosen = cls(config, {n: scenarios[n] for n in config.scenarios}, {n: methods[n] for n in config.methods})
+        for name, method in chosen.methods.items():
+            fit_of(config, method, name)
+        chosen._require_data()
+        return chosen
+
+    def data_path(self, name: str) -> Path | None:
+        """Where a scenario's data lie; None for toy scenes, which need none."""
+        row = self.scenarios[name]
+        return None if row.source == "toy" else Path(self.config.data_root or ".") / row.path
+
+    def _require_data(self) -> None:
+        for name, row in self.scenarios.items():
+            path = self.data_path(name)
+            if path is None:
+                continue
+            if self.config.data_root is None:
+                raise InputError(
+                    f"scenario {name}", f"{row.source} scenarios need data_root", "null", "Give it: --config data_root=/path/to/data."
+                )
+            if not path.exists():
+                raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+
+
+def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        close = {name: difflib.get_close_matches(name, known, n=1) for name in unknown}
+        hints = [f"{name!r}" + (f" (did you mean {match[0]!r}?)" if match else "") for name, match in close.items()]
+        raise InputError(f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}")
+
+
+def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
+    """Put `overlay` on top of `base`, in place: mappings merge, everything else replaces."""
     for key, value in overlay.items():
-        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
-            _merge(base[key], value)
+        below = base.get(key)
+        if isinstance(value, Mapping) and isinstance(below, dict):
+            merge(below, value)
         else:
             base[key] = value

@@ -55,10 +55,10 @@ class StageRecord:
     settings: dict[str, Any] = field(default_factory=dict)
     started: str = ""
     seconds: float = 0.0
-    """Wall time of the stage, summed over continued attempts."""
+    """Wall time of this attempt."""
     peak_memory_mb: float = 0.0
     attempts: int = 1
-    """1, plus one for every time the stage continued from a checkpoint."""
+    """1 if the stage ran in one go, 2 if it continued from a checkpoint of a killed attempt."""
     device: str = "cpu"
     machine: str = ""
 
@@ -98,17 +98,16 @@ def read_json(path: Path, version: int) -> dict[str, Any]:
 
 
 class Stopwatch:
-    """Wall time and peak memory of a stage. `carried` is the time of earlier attempts that this one continues."""
+    """Wall time and peak memory of a stage."""
 
-    def __init__(self, carried: float = 0.0) -> None:
+    def __init__(self) -> None:
         self.started = now()
-        self._carried = carried
         self._start = time.perf_counter()
 
     @property
     def seconds(self) -> float:
-        """Seconds so far, earlier attempts included."""
-        return self._carried + time.perf_counter() - self._start
+        """Seconds so far."""
+        return time.perf_counter() - self._start
 
     def stage(self, stage: str, status: Status, files: Mapping[str, Path] | None = None, **values: Any) -> StageRecord:
         """A record of this stage with its time, memory, machine and the digests of its files."""

@@ -59,7 +59,7 @@ def cloth() -> Shape:
     seen = np.add.outer(np.arange(15), np.arange(15)).ravel() % 2 == 0
     offsets = np.array([[0.0, 0.005, 0.004], [0.0, -0.005, 0.004], [0.004, 0.0, 0.006]])
     hands = np.concatenate([np.array([x, 0.0, 0.4]) + offsets for x in (-0.14, 0.14)])
-    return Shape(nodes[seen], nodes[~seen], np.zeros((0, 3)), hands, 0.045, 14, 4e3, np.array([0.0, 0.0, 1.0]))
+    return Shape(nodes[seen], nodes[~seen], np.zeros((0, 3)), hands, 0.045, 14, 2e3, np.array([0.0, 0.0, 1.0]))
 
 
 def blob() -> Shape:
@@ -75,7 +75,7 @@ def blob() -> Shape:
     facing = shell[:, 1] <= 0.01
     top = np.array([0.0, 0.0, lifted[:, 2].max() + 0.012])
     hands = top + np.array([[0.012, 0.0, 0.0], [-0.012, 0.0, 0.0], [0.0, 0.012, 0.0], [0.0, -0.012, 0.0]])
-    return Shape(shell[facing], shell[~facing], interior, hands, 0.046, 18, 4e3, np.array([1.0, 0.0, 0.0]))
+    return Shape(shell[facing], shell[~facing], interior, hands, 0.046, 18, 1.5e3, np.array([1.0, 0.0, 0.0]))
 
 
 SHAPES = {"rope": rope, "cloth": cloth, "blob": blob}

@@ -102,8 +102,8 @@ def twin_spectrum(twin: Twin) -> Spectrum:
 
 
 def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
-    """The smallest number of substeps per frame whose load is at most 4 * safety."""
-    return max(1, int(np.ceil(frame_time / spectrum.largest_substep(safety))))
+    """The smallest number of substeps per frame whose load is below 4 * safety."""
+    return int(frame_time / spectrum.largest_substep(safety)) + 1
 
 
 def check(twin: Twin) -> None:

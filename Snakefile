@@ -1,0 +1,30 @@
+# The benchmark: captures -> observations -> search -> fit -> rollout -> scores -> tables, every run in MLflow.
+from snakemake.utils import min_version
+
+min_version("9.20")
+
+
+configfile: "config/config.yaml"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/observe.smk"
+include: "workflow/rules/twin.smk"
+include: "workflow/rules/score.smk"
+include: "workflow/rules/tables.smk"
+include: "workflow/rules/tracking.smk"
+
+
+rule all:
+    input:
+        tables=TABLES,
+        tracked=tracked_runs(),
+    default_target: True
+
+
+onsuccess:
+    report_end(failed=False)
+
+
+onerror:
+    report_end(failed=True)

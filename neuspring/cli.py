@@ -1,0 +1,222 @@
+"""The `neuspring` command: every workflow step by hand, and the tools around it.
+
+Exit status: 0 done (a numerical failure is a recorded result), 2 bad input (retrying cannot help), 1 anything else.
+Heavy imports happen inside the commands, after the number of threads is set.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuspring import __version__
+from neuspring.errors import InputError
+
+if TYPE_CHECKING:
+    from neuspring.config import Config
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    parsed = _parser().parse_args(arguments)
+    threads = str(getattr(parsed, "threads", 1))
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, threads)
+    try:
+        status: int = parsed.run(parsed)
+    except InputError as error:
+        print(f"neuspring: error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        return 1
+    return status
+
+
+def _settings(text: str) -> Config:
+    """Settings from JSON text, or from YAML files separated by commas (later ones override)."""
+    from neuspring import config
+
+    if text.lstrip().startswith("{"):
+        try:
+            return config.parse(config.Config, json.loads(text), "--settings")
+        except json.JSONDecodeError as error:
+            raise InputError("--settings", "must be JSON or YAML files", str(error)) from error
+    values: dict[str, object] = {}
+    for name in text.split(","):
+        config.merge(values, config.read_yaml(Path(name)))
+    return config.parse(config.Config, values, f"--settings {text}")
+
+
+def _observe(a: argparse.Namespace) -> int:
+    from neuspring import config, stages
+
+    settings = _settings(a.settings)
+    rows = config.read_scenarios(Path(settings.scenario_table))
+    if a.scenario not in rows:
+        raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
+    stages.observe(rows[a.scenario], settings, a.output)
+    return 0
+
+
+def _search(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    stages.search(a.observations, _settings(a.settings), a.seed, a.device, a.output)
+    return 0
+
+
+def _fit(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    stages.fit(a.observations, a.search, _settings(a.settings), a.device, a.output)
+    return 0
+
+
+def _rollout(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    stages.rollout(a.observations, a.twin, a.device, a.output)
+    return 0
+
+
+def _score(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    records = {"search": a.search} | ({"fit": a.fit} if a.fit else {}) | {"rollout": a.rollout}
+    stages.score(a.observations, records, a.method, json.loads(a.variant), a.seed, a.output)
+    return 0
+
+
+def _tables(a: argparse.Namespace) -> int:
+    from neuspring import tables
+
+    collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds)
+    print(tables.write(collected, a.baseline or a.methods[0], a.output))
+    print(f"Tables: {a.output / 'summary.md'}")
+    return 0
+
+
+def _track_init(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+    from neuspring.artifacts import write_text
+
+    outcome = tracking.init(a.results, _settings(a.settings).tracking)
+    write_text(a.output, json.dumps(outcome, indent=1, sort_keys=True) + "\n")
+    print(f"MLflow: {outcome['outcome']}")
+    return 0
+
+
+def _log(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+    from neuspring.artifacts import write_text
+
+    outcome = tracking.log_run(a.record, a.results, _settings(a.settings).tracking)
+    write_text(a.output, outcome + "\n")
+    print(f"MLflow: {a.record}: {outcome}")
+    return 0
+
+
+def _sync(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+
+    settings = _settings(a.settings).tracking
+    tracking.init(a.results, settings)
+    outcomes = tracking.sync(a.results, settings, progress=print)
+    for outcome, names in outcomes.items():
+        print(f"{outcome}: {len(names)}")
+    return 1 if any(outcome.startswith("unreachable") for outcome in outcomes) else 0
+
+
+def _ui(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+
+    uri = _settings(a.settings).tracking.uri or tracking.default_uri(a.results)
+    if uri.startswith("http"):
+        print(f"The tracking server is at {uri}")
+        return 0
+    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
+    environment.setdefault("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
+    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", a.host, "--port", str(a.port)]
+    print(f"MLflow UI: http://{a.host}:{a.port} (stop with Ctrl-C)", flush=True)
+    os.execve(sys.executable, command, environment)
+
+
+def _check_data(a: argparse.Namespace) -> int:
+    from neuspring.data import check
+
+    departures = check.check(a.folder)
+    print(check.render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="neuspring", description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(required=True, metavar="command")
+    add = _Adder(commands)
+
+    observe = add("observe", _observe, "capture -> observations.npz", "settings", "output")
+    observe.add_argument("--scenario", required=True, help="a row of the scenario table")
+
+    search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
+    search.add_argument("--seed", type=int, default=0)
+
+    fit = add("fit", _fit, "coarse twin -> fitted twin, by gradients", "observations", "settings", "compute", "output")
+    fit.add_argument("--search", type=Path, required=True, help="search.json to start from")
+
+    rollout = add("rollout", _rollout, "twin -> trajectory over all frames", "observations", "compute", "output")
+    rollout.add_argument("--twin", type=Path, required=True, help="search.json or fit.json that names the twin")
+
+    score = add("score", _score, "trajectory -> scores, plots and run.json", "observations", "output")
+    score.add_argument("--search", type=Path, required=True, help="search.json")
+    score.add_argument("--fit", type=Path, help="fit.json, if the method has that stage")
+    score.add_argument("--rollout", type=Path, required=True, help="rollout.json")
+    score.add_argument("--method", required=True)
+    score.add_argument("--variant", default="{}", help="JSON: the method's switches")
+    score.add_argument("--seed", type=int, default=0)
+
+    table = add("tables", _tables, "run records -> tables", "results", "output")
+    table.add_argument("--scenarios", nargs="+", required=True)
+    table.add_argument("--methods", nargs="+", required=True)
+    table.add_argument("--seeds", nargs="+", type=int, required=True)
+    table.add_argument("--baseline", help="method that others are compared with (default: the first)")
+
+    add("track-init", _track_init, "prepare the MLflow store, once before any run is logged", "results", "settings", "output")
+    log = add("log", _log, "log one run.json to MLflow", "results", "settings", "output")
+    log.add_argument("--record", type=Path, required=True, help="run.json")
+    add("sync", _sync, "send to MLflow what is missing there, and close runs that were killed", "results", "settings")
+    ui = add("ui", _ui, "open the MLflow UI of a results folder", "results", "settings")
+    ui.add_argument("--host", default="127.0.0.1")
+    ui.add_argument("--port", type=int, default=5000)
+
+    check = add("check-data", _check_data, "report how a data folder departs from the expected layout")
+    check.add_argument("folder", type=Path)
+    return parser
+
+
+class _Adder:
+    """Adds commands with the options they share."""
+
+    def __init__(self, commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+        self._commands = commands
+
+    def __call__(self, name: str, run: object, text: str, *shared: str) -> argparse.ArgumentParser:
+        parser = self._commands.add_parser(name, help=text, description=text)
+        parser.set_defaults(run=run)
+        if "observations" in shared:
+            parser.add_argument("--observations", type=Path, required=True, help="observations.npz")
+        if "settings" in shared:
+            parser.add_argument("--settings", default="{}", help="JSON, or YAML files separated by commas; defaults otherwise")
+        if "results" in shared:
+            parser.add_argument("--results", type=Path, default=Path("results"), help="results folder")
+        if "compute" in shared:
+            parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N")
+            parser.add_argument("--threads", type=int, default=1)
+        if "output" in shared:
+            parser.add_argument("--output", type=Path, required=True, help="file (tables: folder) to write")
+        return parser

@@ -1,0 +1,100 @@
+"""What code made a result: a digest of the package modules a stage uses, and the commit.
+
+Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
+syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
+`fit.py` re-runs fits; editing a docstring, or `tables.py`, re-runs nothing that costs time.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import subprocess
+from pathlib import Path
+
+PACKAGE = "neuspring"
+ROOT = Path(__file__).parent
+NOT_NUMERICS = frozenset({f"{PACKAGE}.config", f"{PACKAGE}.progress", f"{PACKAGE}.records"})
+"""Declarations and reporting: configured values reach a rule as parameters of their own."""
+
+
+@functools.cache
+def _source(module: str) -> Path | None:
+    parts = module.split(".")[1:]
+    path = ROOT.joinpath(*parts)
+    for file in (path.with_suffix(".py"), path / "__init__.py"):
+        if file.is_file():
+            return file
+    return None
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module:
+    path = _source(module)
+    assert path is not None, module
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imported_modules(module: str) -> frozenset[str]:
+    """Package modules that `module` imports directly, anywhere in its text."""
+    found = set()
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            # `from package import name` may name a module or something in one.
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        found |= {name for name in names if name.split(".")[0] == PACKAGE and name != PACKAGE and _source(name) is not None}
+    return frozenset(found)
+
+
+def used_modules(module: str) -> list[str]:
+    """`module` and every package module it reaches, sorted."""
+    seen: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            waiting.extend(imported_modules(name))
+    return sorted(seen)
+
+
+def _without_docstrings(tree: ast.Module) -> str:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            # Any bare string is documentation: docstrings, and the notes under fields and constants.
+            node.body = [item for item in node.body if not _is_text(item)] or [ast.Pass()]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+@functools.cache
+def code_digest(*modules: str) -> str:
+    """A short SHA-256 over the code that the given package modules use."""
+    digest = hashlib.sha256()
+    used = {name for module in modules for name in used_modules(module)} - NOT_NUMERICS
+    for name in sorted(used):
+        path = _source(name)
+        assert path is not None, name
+        digest.update(name.encode())
+        digest.update(_without_docstrings(ast.parse(path.read_text(encoding="utf-8"))).encode())
+    return digest.hexdigest()[:16]
+
+
+def commit() -> str:
+    """The commit of the working copy this package runs from, with `-dirty` if it has changes; empty if unknown."""
+    try:
+        run = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, timeout=10, check=True)
+        name = run(["git", "rev-parse", "HEAD"]).stdout.strip()
+        changed = run(["git", "status", "--porcelain", "--untracked-files=no", "--", "."]).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return f"{name}-dirty" if changed else name

@@ -1,0 +1,251 @@
+"""The steps of the workflow: read records and artefacts, compute, write artefacts, then the record.
+
+Each function is one rule and one `neuspring` command. The record is written last. A numerical failure is recorded and passed
+on; anything else raises.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from neuspring import config, figures, metrics, provenance
+from neuspring.artifacts import Observations, Trajectory, Twin, write_atomically, write_text
+from neuspring.config import Config, ScenarioRow
+from neuspring.errors import NumericalFailure
+from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
+
+
+def write_table(table: pd.DataFrame, path: Path) -> Path:
+    """Write a Parquet file atomically; returns its path."""
+    write_atomically(path, lambda temporary: table.to_parquet(temporary, index=False))
+    return path
+
+
+def observe(row: ScenarioRow, settings: Config, output: Path) -> None:
+    """Capture -> observations.npz; for toy scenes also truth.npz beside it (never read by a method)."""
+    location = Path(settings.data_root or ".") / row.path
+    if row.source == "toy":
+        from neuspring.data import toy
+
+        scene = toy.make(row, settings.toy)
+        scene.truth.save(output.with_name("truth.npz"))
+        observations = scene.observations
+    elif row.source == "mocap":
+        from neuspring.data import mocap
+
+        observations = mocap.read(row, location, settings.mocap)
+    else:
+        from neuspring.data import phystwin
+
+        observations = phystwin.read(row, location)
+    observations.save(output)
+
+
+def search(observations_path: Path, settings: Config, seed: int, device: str, output: Path) -> None:
+    """Observations -> coarse twin (twin.npz), the trace of candidates (trace.parquet), search.json."""
+    from neuspring.physics.solver import resolve_device
+    from neuspring.search import SearchProblem
+    from neuspring.search import search as run
+
+    clock = Stopwatch()
+    observations = Observations.load(observations_path)
+    device = resolve_device(device)
+    problem = SearchProblem(
+        observations, settings.search, settings.simulation, settings.losses, settings.released_quirks, device
+    )
+    chosen = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
+    common: dict[str, Any] = {"inputs": {"observations": digest_file(observations_path)}, "settings": chosen | {"seed": seed}, "device": device}
+    key = _key(common["inputs"], common["settings"], device, "neuspring.search")
+    partial = output.with_name("search.partial.parquet")
+    try:
+        result = run(problem, seed, partial=partial, key=key)
+    except NumericalFailure as failure:
+        clock.stage("search", "failed", reason=str(failure), **common).save(output)
+        return
+    folder = output.parent
+    result.twin.save(folder / "twin.npz")
+    write_table(result.trace, folder / "trace.parquet")
+    costs = result.trace["cost"]
+    write_table(_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}), folder / "history.parquet")
+    files = {"twin": folder / "twin.npz", "trace": folder / "trace.parquet", "history": folder / "history.parquet"}
+    facts = {
+        **result.values,
+        "cost": result.cost,
+        "rollouts": len(result.trace),
+        "failed_rollouts": int((result.trace["reason"] != "").sum()),
+        **_twin_facts(result.twin),
+    }
+    clock.stage("search", "ok", files, facts=facts, attempts=1 + result.continued, **common).save(output)
+    partial.unlink(missing_ok=True)
+
+
+def fit(observations_path: Path, search_record: Path, settings: Config, device: str, output: Path) -> None:
+    """Observations + coarse twin -> fitted twin (twin.npz), losses per epoch (history.parquet), fit.json."""
+    from neuspring.fit import FitProblem
+    from neuspring.fit import fit as run
+    from neuspring.physics.solver import resolve_device
+
+    clock = Stopwatch()
+    observations, before = Observations.load(observations_path), StageRecord.load(search_record)
+    device = resolve_device(device)
+    chosen = {name: config.plain(getattr(settings, name)) for name in ("fit", "simulation", "losses", "released_quirks")}
+    inputs = {"observations": digest_file(observations_path), "search": digest_file(search_record)}
+    common: dict[str, Any] = {"inputs": inputs, "settings": chosen, "device": device}
+    if before.status == "failed":
+        clock.stage("fit", "failed", reason=f"search: {before.reason}", **common).save(output)
+        return
+    coarse = Twin.load(before.file("twin", search_record))
+    problem = FitProblem(
+        observations, coarse, settings.fit, settings.simulation, settings.losses, settings.released_quirks, device
+    )
+    key = _key({"observations": inputs["observations"], "twin": before.files["twin"][1]}, chosen, device, "neuspring.fit")
+    partial = output.with_name("fit.partial.npz")
+    try:
+        result = run(problem, partial=partial, key=key)
+    except NumericalFailure as failure:
+        clock.stage("fit", "failed", reason=str(failure), **common).save(output)
+        return
+    folder = output.parent
+    result.twin.save(folder / "twin.npz")
+    columns = {name: result.history[name] for name in ("loss", "gradient_norm", "learning_rate")}
+    write_table(_history(result.history["epoch"], columns), folder / "history.parquet")
+    facts = {
+        "best_epoch": result.best_epoch,
+        "best_loss": float(result.history.loc[result.history["epoch"] == result.best_epoch, "loss"].iloc[0]),
+        "rollbacks": result.rollbacks,
+        **_twin_facts(result.twin),
+    }
+    files = {"twin": folder / "twin.npz", "history": folder / "history.parquet"}
+    clock.stage("fit", "ok", files, facts=facts, attempts=1 + result.continued, **common).save(output)
+    partial.unlink(missing_ok=True)
+
+
+def rollout(observations_path: Path, twin_record: Path, device: str, output: Path) -> None:
+    """Twin + controllers of all frames -> trajectory.npz, rollout.json. Divergence is recorded as a failure."""
+    from neuspring.physics.solver import resolve_device
+    from neuspring.rollout import roll_out
+
+    clock = Stopwatch()
+    observations, before = Observations.load(observations_path), StageRecord.load(twin_record)
+    device = resolve_device(device)
+    common: dict[str, Any] = {
+        "inputs": {"observations": digest_file(observations_path), before.stage: digest_file(twin_record)},
+        "device": device,
+    }
+    if before.status == "failed":
+        clock.stage("rollout", "failed", reason=f"{before.stage}: {before.reason}", **common).save(output)
+        return
+    trajectory = roll_out(Twin.load(before.file("twin", twin_record)), observations.controller_points, device)
+    path = output.with_name("trajectory.npz")
+    trajectory.save(path)
+    if trajectory.collision_overflow:
+        print(f"warning: {trajectory.collision_overflow} collision candidates did not fit; raise simulation.collision_capacity")
+    failed = trajectory.diverged_frame is not None
+    facts = {"collision_overflow": trajectory.collision_overflow, "frames": len(trajectory.positions)}
+    reason = f"rollout: {trajectory.reason}" if failed else ""
+    clock.stage("rollout", "failed" if failed else "ok", {"trajectory": path}, reason=reason, facts=facts, **common).save(output)
+
+
+def score(observations_path: Path, records: Mapping[str, Path], method: str, variant: Mapping[str, Any], seed: int, output: Path) -> None:
+    """Trajectory -> scores.parquet, plots, and run.json: the record of the whole run, which MLflow indexes.
+
+    `records` maps search, fit (if any) and rollout to their records.
+    """
+    clock = Stopwatch()
+    observations = Observations.load(observations_path)
+    stages = {name: StageRecord.load(path) for name, path in records.items()}
+    last, folder = stages["rollout"], output.parent
+    trajectory = Trajectory.load(last.file("trajectory", records["rollout"])) if "trajectory" in last.files else None
+    table = pd.DataFrame(columns=list(metrics.COLUMNS))
+    if trajectory is not None:
+        table = metrics.score(trajectory, observations, method, seed)
+    write_table(table, folder / "scores.parquet")
+    histories = {name: records[name].parent / "history.parquet" for name in ("search", "fit") if "history" in _files(stages, name)}
+    plots = figures.run_figures(observations, trajectory, {n: pd.read_parquet(p) for n, p in histories.items()}, method, folder / "plots")
+    twin_stage = "fit" if "fit" in stages else "search"
+    artefacts = {"plots": plots, "records": list(records.values())}
+    if "twin" in stages[twin_stage].files:
+        artefacts["twin"] = [stages[twin_stage].file("twin", records[twin_stage])]
+    content = {
+        "scenario": observations.scenario.name,
+        "method": method,
+        "variant": dict(variant),
+        "seed": seed,
+        "status": last.status,
+        "reason": last.reason,
+        "data_digest": digest_file(observations_path),
+    }
+    made = {name: record.files for name, record in stages.items()} | {"scores": digest_file(folder / "scores.parquet")}
+    run = content | {
+        "format": RECORD_FORMAT,
+        "run_key": hashlib.sha256(canonical([content, made]).encode()).hexdigest(),
+        "source": observations.scenario.source,
+        "category": observations.scenario.category,
+        "attempt": max(record.attempts for record in stages.values()),
+        "commit": provenance.commit(),
+        "device": stages[twin_stage].device,
+        "started": min(record.started for record in stages.values()),
+        "ended": now(),
+        "params": _parameters(stages, variant),
+        "timings": {name: record.seconds for name, record in stages.items()} | {"score": round(clock.seconds, 3)},
+        "peak_memory_mb": {name: record.peak_memory_mb for name, record in stages.items()},
+        "machine": last.machine,
+        "scores_file": "scores.parquet",
+        "histories": {name: _relative(path, folder) for name, path in histories.items()},
+        "artifacts": {name: [_relative(path, folder) for path in paths] for name, paths in artefacts.items()},
+    }
+    write_text(output, json.dumps(run, indent=1, sort_keys=True, allow_nan=False) + "\n")
+
+
+def _files(stages: Mapping[str, StageRecord], name: str) -> dict[str, list[str]]:
+    return stages[name].files if name in stages else {}
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def _key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, module: str) -> str:
+    """What a checkpoint must match to be continued from: inputs, settings, device kind and code."""
+    values = [dict(inputs), dict(settings), device.partition(":")[0], provenance.code_digest(module)]
+    return hashlib.sha256(canonical(values).encode()).hexdigest()
+
+
+def _history(steps: Any, columns: Mapping[str, pd.Series]) -> pd.DataFrame:
+    """Long form for MLflow: step, metric, value; missing values are left out."""
+    parts = [pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": values.to_numpy(float)}) for name, values in columns.items()]
+    return pd.concat(parts).dropna().reset_index(drop=True)
+
+
+def _twin_facts(twin: Twin) -> dict[str, Any]:
+    return {
+        "nodes": len(twin.topology.nodes),
+        "springs": len(twin.topology.springs),
+        "object_springs": twin.topology.object_spring_count,
+        "substeps": twin.simulation.substeps,
+    }
+
+
+def _parameters(stages: Mapping[str, StageRecord], variant: Mapping[str, Any]) -> dict[str, Any]:
+    """Flat parameters for MLflow: settings and facts of each stage."""
+    flat: dict[str, Any] = {f"method.{name}": value for name, value in variant.items()}
+
+    def add(prefix: str, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                add(f"{prefix}.{name}", value)
+            else:
+                flat[f"{prefix}.{name}"] = value
+
+    for name, record in stages.items():
+        add(name, record.settings)
+        add(f"{name}.result", record.facts)
+    return flat

@@ -1,0 +1,198 @@
+"""Tables from run records: every score, averages per method, paired comparisons, and what failed.
+
+Only files are read (run.json and scores.parquet beside it), never MLflow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from neuspring.artifacts import write_atomically, write_text
+from neuspring.metrics import COLUMNS, averages
+from neuspring.records import RECORD_FORMAT, read_json
+
+RESAMPLES = 10_000
+MM = 1e3
+HEADINGS = {
+    ("reconstruction", "chamfer"): "Recon. CD",
+    ("reconstruction", "track_error"): "Recon. TE",
+    ("future", "chamfer"): "Future CD",
+    ("future", "track_error"): "Future TE",
+}
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Scores of all runs that have them, and one row per run with its status (ok, failed or missing)."""
+
+    scores: pd.DataFrame
+    runs: pd.DataFrame
+
+
+def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
+    """Read the records of every (scenario, method, seed); a run without a record is listed as missing."""
+    methods, seeds = list(methods), list(seeds)
+    tables, rows = [], []
+    for scenario in scenarios:
+        for method in methods:
+            for seed in seeds:
+                path = Path(results) / scenario / method / str(seed) / "run.json"
+                identity: dict[str, Any] = {"scenario": scenario, "method": method, "seed": seed}
+                if not path.is_file():
+                    rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished"})
+                    continue
+                record = read_json(path, RECORD_FORMAT)
+                timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
+                memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
+                rows.append(identity | {"status": record["status"], "reason": record["reason"], **timings, **memory})
+                tables.append(pd.read_parquet(path.parent / record["scores_file"]))
+    filled = [table for table in tables if len(table)]
+    scores = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
+    return Collected(scores, pd.DataFrame(rows))
+
+
+def comparable(collected: Collected) -> pd.DataFrame:
+    """Scores of the (scenario, seed) pairs that every method finished, so that averages compare like with like."""
+    good = collected.runs[collected.runs["status"] == "ok"]
+    methods = collected.runs["method"].nunique()
+    complete = good.groupby(["scenario", "seed"])["method"].nunique()
+    pairs = complete[complete == methods].index
+    keep = pd.MultiIndex.from_frame(collected.scores[["scenario", "seed"]]).isin(pairs)
+    return collected.scores[keep]
+
+
+def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """Method minus baseline on the same scenario and seed: mean, and a 95 % bootstrap interval.
+
+    Seeds are averaged within a scenario and scenarios are resampled, since runs of one scenario are not independent.
+    """
+    rows = []
+    rng = np.random.default_rng(0)
+    for (task, metric), part in scores.groupby(["task", "metric"], sort=False):
+        wide = part.pivot_table(index=["scenario", "seed"], columns="method", values="value")
+        for method in wide.columns.drop(baseline, errors="ignore"):
+            if baseline not in wide:
+                continue
+            delta = (wide[method] - wide[baseline]).dropna().groupby("scenario").mean().to_numpy()
+            if not len(delta):
+                continue
+            draws = rng.choice(delta, (RESAMPLES, len(delta))).mean(axis=1)
+            low, high = np.quantile(draws, [0.025, 0.975]) if len(delta) > 1 else (np.nan, np.nan)
+            base = wide[baseline].mean()
+            row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": delta.mean()}
+            rows.append(row | {"low": low, "high": high, "relative": delta.mean() / base, "scenarios": len(delta)})
+    return pd.DataFrame(rows)
+
+
+def summary_text(collected: Collected, baseline: str) -> str:
+    """The tables in Markdown, in millimetres: both averages, the paired comparison, failures."""
+    methods = list(dict.fromkeys(collected.runs["method"]))
+    scores = comparable(collected)
+    counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
+    runs = f"{collected.runs['scenario'].nunique()} scenarios, {collected.runs['seed'].nunique()} seeds"
+    lines = [f"Errors in mm, lower is better ({runs}; CD: single-directional L1 Chamfer; TE: track error).", ""]
+    lines += ["Mean over scenarios, ± standard deviation over seeds; in brackets the frame-weighted mean.", ""]
+    lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts)
+    differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
+    if len(differences):
+        lines += ["", f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios], same scenario and seed:", ""]
+        lines += _difference_table(differences)
+    bad = collected.runs[collected.runs["status"] != "ok"]
+    if len(bad):
+        lines += ["", "Not in the averages:", ""]
+        lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in bad.itertuples()]
+    return "\n".join(lines) + "\n"
+
+
+def _method_table(methods: list[str], means: pd.DataFrame, counts: pd.DataFrame) -> list[str]:
+    rows = []
+    for method in methods:
+        cells = [method]
+        for task, metric in HEADINGS:
+            found = means[(means["method"] == method) & (means["task"] == task) & (means["metric"] == metric)] if len(means) else means
+            if not len(found):
+                cells.append("–")
+                continue
+            row = found.iloc[0]
+            cells.append(f"{MM * row['equal']:.2f} ± {MM * row['seed_std']:.2f} ({MM * row['frames']:.2f})")
+        status = counts.loc[method]
+        total, good = int(status.sum()), int(status.get("ok", 0))
+        cells.append(f"{good}/{total}" + (f" ({int(status['failed'])} failed)" if status.get("failed", 0) else ""))
+        rows.append(cells)
+    return _markdown(["Method", *HEADINGS.values(), "Runs"], rows)
+
+
+def _difference_table(differences: pd.DataFrame) -> list[str]:
+    rows = []
+    for method, part in differences.groupby("method", sort=False):
+        cells = [str(method)]
+        for task, metric in HEADINGS:
+            found = part[(part["task"] == task) & (part["metric"] == metric)]
+            cells.append("–" if not len(found) else _interval(found.iloc[0].to_dict()))
+        rows.append(cells)
+    return _markdown(["Method", *HEADINGS.values()], rows)
+
+
+def _interval(row: Mapping[str, Any]) -> str:
+    text = f"{MM * row['difference']:+.2f}"
+    if np.isfinite(row["low"]):
+        text += f" [{MM * row['low']:+.2f}, {MM * row['high']:+.2f}]"
+    return f"{text} ({100 * row['relative']:+.1f} %)"
+
+
+def per_scenario_text(scores: pd.DataFrame) -> str:
+    """One line per scenario and method, seeds averaged, in Markdown, mm."""
+    rows = []
+    for (scenario, method), part in scores.groupby(["scenario", "method"], sort=False):
+        means = part.groupby(["task", "metric"])["value"].mean()
+        rows.append([scenario, method, *(f"{MM * means[key]:.2f}" if key in means else "–" for key in HEADINGS)])
+    return "\n".join(_markdown(["Scenario", "Method", *HEADINGS.values()], rows)) + "\n"
+
+
+def timing_text(runs: pd.DataFrame) -> str:
+    """Median wall time [s] and peak memory [MB] of each stage per method, in Markdown."""
+    stages = [name.removeprefix("seconds_") for name in runs.columns if name.startswith("seconds_")]
+    rows = []
+    for method, part in runs.groupby("method", sort=False):
+        cells = [str(method)]
+        for stage in stages:
+            seconds = part[f"seconds_{stage}"].dropna() if f"seconds_{stage}" in part else pd.Series(dtype=float)
+            memory = part[f"memory_mb_{stage}"].dropna() if f"memory_mb_{stage}" in part else pd.Series(dtype=float)
+            text = f"{seconds.median():.1f} s" if len(seconds) else "–"
+            cells.append(text + (f", {memory.median():.0f} MB" if len(memory) else ""))
+        rows.append(cells)
+    return "\n".join(_markdown(["Method", *stages], rows)) + "\n"
+
+
+def _markdown(header: list[str], rows: list[list[str]]) -> list[str]:
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+
+    def line(cells: list[str]) -> str:
+        return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+
+    return [line(header), "|" + "|".join("-" * (width + 2) for width in widths) + "|", *map(line, rows)]
+
+
+def write(collected: Collected, baseline: str, folder: Path) -> str:
+    """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv and summary.md; returns the summary."""
+    scores = collected.scores
+    usable = comparable(collected)
+    frames = {"scores": scores, "runs": collected.runs}
+    if len(usable):
+        frames |= {"averages": averages(usable), "differences": paired_differences(usable, baseline)}
+    for name, table in frames.items():
+        text = table.to_csv(index=False)
+        write_text(folder / f"{name}.csv", text)
+    write_atomically(folder / "scores.parquet", lambda temporary: scores.to_parquet(temporary, index=False))
+    summary = summary_text(collected, baseline)
+    details = per_scenario_text(scores) if len(scores) else "No run has scores.\n"
+    timings = timing_text(collected.runs)
+    text = f"# Scores\n\n{summary}\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
+    write_text(folder / "summary.md", text)
+    return summary

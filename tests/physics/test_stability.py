@@ -1,0 +1,147 @@
+"""The stability bound: sharp for one oscillator, valid for nets, and reported with node, bound and remedy."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.artifacts import Twin
+from neuspring.errors import InputError
+from neuspring.physics import reference, stability
+from neuspring.physics.reference import Scene
+from neuspring.physics.stability import LIMIT, Spectrum
+
+from .scenes import random_scene, scene, twin_of
+
+MARGIN = 0.01
+"""Relative distance of dt from the bound on either side."""
+GROWTH = 100.0
+"""What separates bounded from diverging after 400 substeps. 1 % beyond the bound amplifies by exp(0.28) each without dashpot
+and by 1.02 with dashpot alone; 1 % below it a bounded motion swells by up to 1 / sin(theta) = 5 at first."""
+LANCZOS = 2e-3
+"""Relative, of an eigenvalue from `eigsh` with tol=1e-3, which approaches it from below."""
+LENGTH = 0.5
+
+
+def held_node(substep: float, stiffness: float, dashpot: float) -> Scene:
+    """One node on a spring to a controller: lambda = Y / l0, c = gamma."""
+    return scene(1, [(1, 0)], [LENGTH], stiffness=stiffness, dashpot=dashpot, frame_time=substep)
+
+
+@pytest.mark.parametrize(("stiffness", "dashpot"), [(80.0, 0.0), (80.0, 20.0), (1e-6, 20.0)])
+def test_the_bound_is_sharp_for_an_oscillator(stiffness: float, dashpot: float) -> None:
+    """Just below dt^2 lambda + 2 dt c = 4 a small extension stays small, just above it diverges."""
+    largest = Spectrum(stiffness / LENGTH, dashpot, 0).largest_substep(1.0)
+    start = 1e-9
+    reached = []
+    for factor in (1 - MARGIN, 1 + MARGIN):
+        made = held_node(factor * largest, stiffness, dashpot)
+        hands = np.tile([[[LENGTH, 0.0, 0.0]]], (401, 1, 1))
+        x, _ = reference.rollout(made, np.array([[start, 0.0, 0.0]]), np.array([[start / largest, 0.0, 0.0]]), hands)
+        reached.append(np.abs(x[:, 0, 0]).max() / start)
+    assert reached[0] < GROWTH
+    assert reached[1] > GROWTH
+
+
+def test_load_and_largest_substep_agree() -> None:
+    for spectrum in (Spectrum(1e6, 40.0, 0), Spectrum(0.0, 40.0, 0), Spectrum(1e6, 0.0, 0)):
+        for safety in (1.0, 0.8):
+            assert spectrum.load(spectrum.largest_substep(safety)) == pytest.approx(LIMIT * safety)
+    assert Spectrum(0.0, 0.0, 0).largest_substep(1.0) == np.inf
+
+
+def matrices(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """Dense K and C at rest, assembled spring by spring."""
+    t, m = twin.topology, twin.material
+    ends = np.concatenate([t.nodes, t.controllers]).astype(np.float64)
+    result = np.zeros((2, 3 * len(t.nodes), 3 * len(t.nodes)))
+    for (i, j), k, c in zip(t.springs, m.stiffness.astype(np.float64) / t.rest_lengths, m.dashpot, strict=True):
+        d = (ends[j] - ends[i]) / np.linalg.norm(ends[j] - ends[i])
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            if a < len(t.nodes) and b < len(t.nodes):
+                block = sign * np.outer(d, d)
+                result[:, 3 * a : 3 * a + 3, 3 * b : 3 * b + 3] += np.array([k, c])[:, None, None] * block
+    return result[0], result[1]
+
+
+def random_twin(seed: int, **simulation: object) -> Twin:
+    made, x, _, hands = random_scene(seed, nodes=15, **simulation)
+    return twin_of(made, x, hands[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_spectrum_of_a_net(seed: int) -> None:
+    """Lanczos finds the eigenvalues of the dense matrices, from below; Gershgorin bounds them from above."""
+    twin = random_twin(seed)
+    k, c = (np.linalg.eigvalsh(matrix)[-1] for matrix in matrices(twin))
+    found, t = stability.twin_spectrum(twin), twin.topology
+    stiffness = twin.material.stiffness / t.rest_lengths
+    bound = stability.gershgorin(t.springs, len(t.nodes), stiffness, twin.material.dashpot)
+    for value, exact, above in ((found.stiffness, k, bound.stiffness), (found.damping, c, bound.damping)):
+        assert exact * (1 - LANCZOS) <= value <= exact * (1 + 1e-9)
+        assert above >= exact
+
+
+def test_gershgorin_names_the_loaded_node() -> None:
+    """A star: node 2 holds all springs."""
+    springs = np.array([[2, 0], [2, 1], [2, 3], [4, 2]])
+    found = stability.gershgorin(springs, 4, np.full(4, 10.0), np.full(4, 1.0))
+    assert (found.stiffness, found.damping, found.node) == (2 * 3 * 10.0 + 10.0, 7.0, 2)
+
+
+def test_no_springs_are_always_stable() -> None:
+    twin = twin_of(scene(2), np.zeros((2, 3)), np.zeros((0, 3)))
+    assert stability.twin_spectrum(twin) == Spectrum(0.0, 0.0, 0)
+    stability.check(twin)
+
+
+def refused(twin: Twin) -> str:
+    with pytest.raises(InputError) as caught:
+        stability.check(twin)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_check_names_node_bound_and_remedy(seed: int) -> None:
+    twin = random_twin(seed, frame_time=0.5, substeps=2)
+    spectrum, message = stability.twin_spectrum(twin), refused(twin)
+    assert f"node {spectrum.node}" in message
+    assert f"below {spectrum.largest_substep(1.0):.3g} s" in message
+    assert "received 0.25 s (2 substeps per frame)" in message
+    assert "substeps: auto" in message
+    # The remedy works, and it is the smallest that does.
+    found = re.search(r"at least (\d+) substeps", message)
+    assert found
+    needed = int(found[1])
+    stability.check(with_substeps(twin, needed))
+    refused(with_substeps(twin, needed - 1))
+
+
+def test_the_remedy_works_on_the_bound() -> None:
+    """dt = 1 s is exactly on the bound of lambda = 4 / s^2; the check refuses it, so the remedy must ask for more."""
+    twin = twin_of(held_node(1.0, 4.0 * LENGTH, 0.0), np.zeros((1, 3)), np.array([[LENGTH, 0.0, 0.0]]))
+    found = re.search(r"at least (\d+) substeps", refused(twin))
+    assert found
+    stability.check(with_substeps(twin, int(found[1])))
+
+
+def with_substeps(twin: Twin, count: int) -> Twin:
+    return Twin(topology=twin.topology, material=twin.material, simulation=replace(twin.simulation, substeps=count))
+
+
+@pytest.mark.parametrize("safety", [1.0, 0.8, 0.3])
+def test_smallest_safe_substeps_is_smallest(safety: float) -> None:
+    spectrum, frame_time = Spectrum(3.7e5, 130.0, 0), 1 / 30
+    count = stability.smallest_safe_substeps(spectrum, frame_time, safety)
+    assert spectrum.load(frame_time / count) < LIMIT * safety <= spectrum.load(frame_time / (count - 1))
+    assert stability.smallest_safe_substeps(Spectrum(1.0, 0.0, 0), 1e-3, safety) == 1
+
+
+def test_gershgorin_alone_accepts_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cheap bound decides first; the eigenvalue is not computed when it is far from the limit."""
+    twin = random_twin(0, substeps=200)
+    monkeypatch.setattr(stability, "twin_spectrum", lambda _: pytest.fail("not needed"))
+    stability.check(twin)

@@ -1,0 +1,154 @@
+# Validates the configuration before any job, and holds the helpers that rules use.
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+from neuspring import config as settings
+from neuspring.errors import InputError
+from neuspring.provenance import code_digest
+
+# Jobs call `python -m neuspring`; take the interpreter that runs Snakemake unless a software deployment provides one.
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+ROOT = Path(workflow.basedir)
+
+
+def checked_benchmark():
+    """The validated configuration; a clear message and no traceback if it is wrong or the results folder is not writable."""
+    try:
+        benchmark = settings.Benchmark.of(config, ROOT)
+        results = Path(benchmark.config.results)
+        try:
+            results.mkdir(parents=True, exist_ok=True)
+            probe = results / ".writable"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise InputError(
+                f"configuration, results ({results})",
+                "this folder must be writable",
+                error.strerror,
+                "Choose another: --config results=...",
+            ) from error
+        return benchmark
+    except InputError as error:
+        raise WorkflowError(str(error)) from None
+
+
+BENCHMARK = checked_benchmark()
+CONFIG = BENCHMARK.config
+RESULTS = CONFIG.results
+DEVICE = CONFIG.device
+TABLES = f"{RESULTS}/tables/summary.md"
+
+
+# Only for `--software-deployment-method conda`; without it the running environment is used.
+ENVIRONMENT = str(ROOT / "workflow" / "envs" / "neuspring.yaml")
+
+
+wildcard_constraints:
+    scenario="|".join(map(re.escape, CONFIG.scenarios)),
+    method="|".join(map(re.escape, CONFIG.methods)),
+    search="|".join(sorted({method.search for method in BENCHMARK.methods.values()})),
+    seed="|".join(map(str, CONFIG.seeds)),
+
+
+def section(*names):
+    """Sections of the configuration as the JSON text that a command takes."""
+    return json.dumps({name: settings.plain(CONFIG)[name] for name in names}, sort_keys=True)
+
+
+def observe_settings(wildcards):
+    names = {"toy": ["toy"], "mocap": ["mocap"], "phystwin": []}[BENCHMARK.scenarios[wildcards.scenario].source]
+    return section("data_root", "scenario_table", *names)
+
+
+def scenario_row(wildcards):
+    return json.dumps(settings.plain(BENCHMARK.scenarios[wildcards.scenario]), sort_keys=True)
+
+
+def reader_digest(wildcards):
+    return code_digest(f"neuspring.data.{BENCHMARK.scenarios[wildcards.scenario].source}")
+
+
+def scenario_files(wildcards):
+    """The capture's files, so that changed data are read again."""
+    path = BENCHMARK.data_path(wildcards.scenario)
+    if path is None:
+        return []
+    if path.is_file():
+        return [str(path)]
+    return [str(path / name) for name in ("final_data.pkl", "split.json") if (path / name).exists()]
+
+
+def fit_settings(wildcards):
+    """The fit's sections, with the method's own settings on top."""
+    values = settings.plain(CONFIG)
+    chosen = {name: values[name] for name in ("simulation", "losses", "released_quirks")}
+    chosen["fit"] = settings.plain(settings.fit_of(CONFIG, BENCHMARK.methods[wildcards.method], wildcards.method))
+    return json.dumps(chosen, sort_keys=True)
+
+
+def search_folder(wildcards):
+    return f"{RESULTS}/{wildcards.scenario}/search-{BENCHMARK.methods[wildcards.method].search}/{wildcards.seed}"
+
+
+def search_record(wildcards):
+    return f"{search_folder(wildcards)}/search.json"
+
+
+def fit_records(wildcards):
+    """The fit's record if the method has that stage, else nothing."""
+    has_fit = BENCHMARK.methods[wildcards.method].fit is not None
+    return [f"{RESULTS}/{wildcards.scenario}/{wildcards.method}/{wildcards.seed}/fit.json"] if has_fit else []
+
+
+def twin_record(wildcards):
+    """The record that names the method's final twin: a stage left out is a shorter path, not a branch in code."""
+    return (fit_records(wildcards) or [search_record(wildcards)])[0]
+
+
+def fit_option(wildcards, input):
+    return f"--fit {shlex.quote(str(input.fit))}" if input.get("fit") else ""
+
+
+def variant(wildcards):
+    row = settings.plain(BENCHMARK.methods[wildcards.method])
+    return json.dumps({"search": row["search"], "fit": row["fit"] or "none", **row["settings"]}, sort_keys=True)
+
+
+def run_records():
+    return expand(
+        "{results}/{scenario}/{method}/{seed}/run.json",
+        results=RESULTS,
+        scenario=CONFIG.scenarios,
+        method=CONFIG.methods,
+        seed=CONFIG.seeds,
+    )
+
+
+def tracked_runs():
+    return [path.replace("run.json", "mlflow.txt") for path in run_records()] if CONFIG.tracking.enabled else []
+
+
+def table_arguments():
+    return [
+        *("--results", RESULTS, "--output", f"{RESULTS}/tables", "--scenarios", *CONFIG.scenarios),
+        *("--methods", *CONFIG.methods, "--seeds", *map(str, CONFIG.seeds)),
+    ]
+
+
+def report_end(failed):
+    """Print the table of what is finished and what to do next, also after an interruption."""
+    command = [sys.executable, "-m", "neuspring", "tables", *table_arguments()]
+    if failed:
+        print("\nThe run did not finish. What is done so far:", flush=True)
+        subprocess.run(command, check=False)
+        print("Logs are named above. The same command continues where this one stopped.", flush=True)
+    else:
+        print(f"\n{Path(TABLES).read_text()}")
+        print(f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/")
+        print(f"Look at the runs in MLflow:  {Path(sys.executable).parent}/neuspring ui --results {RESULTS}", flush=True)

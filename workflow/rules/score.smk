@@ -1,0 +1,27 @@
+rule score:
+    input:
+        observations=rules.observe.output,
+        search=search_record,
+        fit=fit_records,
+        rollout=rules.rollout.output,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/run.json",
+    log:
+        f"{RESULTS}/logs/score/{{scenario}}-{{method}}-{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/score/{{scenario}}-{{method}}-{{seed}}.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        fit=fit_option,
+        variant=variant,
+        code=code_digest("neuspring.metrics"),
+    retries: 1
+    threads: 1
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    shell:
+        "python -m neuspring score --observations {input.observations} --search {input.search} {params.fit}"
+        " --rollout {input.rollout} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
+        " --output {output} 2>&1 | tee {log}"

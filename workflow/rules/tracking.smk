@@ -1,0 +1,45 @@
+# MLflow is an index of the records: these rules never fail a run, and nothing numerical depends on them.
+rule track_init:
+    output:
+        f"{RESULTS}/mlflow.json",
+    log:
+        f"{RESULTS}/logs/track_init.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/track_init.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        settings=section("tracking"),
+        results=RESULTS,
+    retries: 1
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    shell:
+        "python -m neuspring track-init --results {params.results:q} --settings {params.settings:q} --output {output} 2>&1 | tee {log}"
+
+
+rule log_run:
+    input:
+        store=rules.track_init.output,
+        record=rules.score.output,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/mlflow.txt",
+    log:
+        f"{RESULTS}/logs/log_run/{{scenario}}-{{method}}-{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/log_run/{{scenario}}-{{method}}-{{seed}}.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        settings=section("tracking"),
+        results=RESULTS,
+    retries: 1
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    shell:
+        "python -m neuspring log --record {input.record} --results {params.results:q} --settings {params.settings:q}"
+        " --output {output} 2>&1 | tee {log}"

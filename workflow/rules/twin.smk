@@ -1,0 +1,74 @@
+rule search:
+    input:
+        observations=rules.observe.output,
+    output:
+        f"{RESULTS}/{{scenario}}/search-{{search}}/{{seed}}/search.json",
+    log:
+        f"{RESULTS}/logs/search/{{scenario}}-{{search}}-{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/search/{{scenario}}-{{search}}-{{seed}}.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        settings=section("search", "simulation", "losses", "released_quirks"),
+        code=code_digest("neuspring.search"),
+    retries: 1
+    threads: 1
+    resources:
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=8000,
+        runtime=240,
+    shell:
+        "python -m neuspring search --observations {input.observations} --settings {params.settings:q} --seed {wildcards.seed}"
+        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
+
+
+rule fit:
+    input:
+        observations=rules.observe.output,
+        search=search_record,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/fit.json",
+    log:
+        f"{RESULTS}/logs/fit/{{scenario}}-{{method}}-{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit/{{scenario}}-{{method}}-{{seed}}.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        settings=fit_settings,
+        code=code_digest("neuspring.fit"),
+    retries: 1
+    threads: 1
+    resources:
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=8000,
+        runtime=480,
+    shell:
+        "python -m neuspring fit --observations {input.observations} --search {input.search} --settings {params.settings:q}"
+        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
+
+
+rule rollout:
+    input:
+        observations=rules.observe.output,
+        twin=twin_record,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
+    log:
+        f"{RESULTS}/logs/rollout/{{scenario}}-{{method}}-{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/rollout/{{scenario}}-{{method}}-{{seed}}.tsv"
+    conda:
+        ENVIRONMENT
+    params:
+        code=code_digest("neuspring.rollout"),
+    retries: 1
+    threads: 1
+    resources:
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=4000,
+        runtime=60,
+    shell:
+        "python -m neuspring rollout --observations {input.observations} --twin {input.twin}"
+        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
