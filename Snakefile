@@ -16,10 +16,10 @@ include: "workflow/rules/tracking.smk"
 
 
 rule all:
+    default_target: True
     input:
         tables=TABLES,
         tracked=tracked_runs(),
-    default_target: True
 
 
 onsuccess:

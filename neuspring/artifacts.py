@@ -35,7 +35,7 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False) ->
     return field(metadata={"shape": tuple(shape.split(",")), "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan})
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Call `write(temporary path)` beside `path`, flush it to disk, then rename it over `path`.
 
     Raises InputError if the folder cannot be written.
@@ -61,7 +61,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
-    write_atomically(path, lambda p: p.write_text(text, encoding="utf-8") and None)
+    write_atomically(path, lambda p: p.write_text(text, encoding="utf-8"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +94,8 @@ class Artifact:
         same_family = np.can_cast(value.dtype, dtype, casting="same_kind")
         if not same_family or (dtype.kind == "b") != (value.dtype.kind == "b"):
             raise InputError(where, f"the dtype must be {dtype.name}", value.dtype)
+        if dtype.kind == "i" and value.size and not (value.min() >= np.iinfo(dtype).min and value.max() <= np.iinfo(dtype).max):
+            raise InputError(where, f"every entry must fit {dtype.name}", f"[{value.min()}, {value.max()}]")
         value = np.array(value, dtype=dtype, order="C", copy=True)
         if dtype.kind == "f" and not spec.metadata["nan"] and not np.isfinite(value).all():
             first = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
@@ -101,7 +103,7 @@ class Artifact:
         return value
 
     def check(self) -> None:
-        """Rules that relate several fields. Raises InputError."""
+        """Raise InputError if fields contradict each other."""
 
     def save(self, path: Path) -> None:
         """Write this artefact to `path` (.npz) atomically."""
@@ -141,18 +143,28 @@ class Artifact:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             meta = json.loads(arrays.pop("meta").tobytes().decode())
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError) as error:
+            if not isinstance(meta, dict):
+                raise ValueError("`meta` holds no mapping")
+        # zipfile raises RuntimeError for damaged flags, and np.load returns a bare array (TypeError) for an .npy file.
+        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise InputError(
-                path, f"this file must be a readable {cls.kind}", f"{type(error).__name__}: {error}", "Delete it and re-run its step."
+                path,
+                f"this file must be a readable {cls.kind}",
+                f"{type(error).__name__}: {error}",
+                "Delete it and re-run its step.",
             ) from error
         if meta.get("kind") != cls.kind:
             raise InputError(path, f"this file must hold a {cls.kind}", meta.get("kind"))
         if meta.get("format") != FORMAT_VERSION:
-            raise InputError(path, f"this version reads format {FORMAT_VERSION}", meta.get("format"), "Re-run the step that made it.")
+            raise InputError(
+                path, f"this version reads format {FORMAT_VERSION}", meta.get("format"), "Re-run the step that made it."
+            )
         try:
             return cls._build(arrays, meta["fields"], "")
         except (KeyError, TypeError) as error:
-            raise InputError(path, f"this file must hold every field of a {cls.kind}", f"{type(error).__name__}: {error}") from error
+            raise InputError(
+                path, f"this file must hold every field of a {cls.kind}", f"{type(error).__name__}: {error}"
+            ) from error
 
     @classmethod
     def _build(cls, arrays: dict[str, np.ndarray], plain: dict[str, Any], prefix: str) -> Self:
@@ -179,7 +191,10 @@ def _tuples(value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Artifact):
-    """Where a capture comes from and how it is split. Training frames are [0, train_end), future frames [train_end, frame_count)."""
+    """Where a capture comes from and how it is split.
+
+    Training frames are [0, train_end), future frames [train_end, frame_count).
+    """
 
     kind: ClassVar[str] = "scenario"
     name: str
@@ -208,7 +223,9 @@ class Scenario(Artifact):
                 "Correct the split; at least one frame after frame 0 must be for training.",
             )
         if not (np.isfinite(self.frame_rate) and self.frame_rate > 0):
-            raise InputError(f"scenario {self.name}, frame_rate", "a positive number of frames per second is required", self.frame_rate)
+            raise InputError(
+                f"scenario {self.name}, frame_rate", "a positive number of frames per second is required", self.frame_rate
+            )
         if self.up not in ("+z", "-z"):
             raise InputError(f"scenario {self.name}, up", "must be '+z' or '-z'", repr(self.up))
 
@@ -253,7 +270,7 @@ class Observations(Artifact):
     @property
     def surface_count(self) -> int:
         """How many of the first nodes count as surface: No + Ns."""
-        return self.object_points.shape[1] + self.surface_points.shape[0]
+        return len(self.object_points[0]) + len(self.surface_points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +287,9 @@ class Topology(Artifact):
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
         if len(self.springs) and (self.springs.min() < 0 or self.springs.max() >= total):
-            raise InputError("topology.springs", f"indices must lie in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]")
+            raise InputError(
+                "topology.springs", f"indices must lie in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]"
+            )
         of_controller = (self.springs >= nodes).any(axis=1)
         if (np.diff(of_controller.astype(np.int8)) < 0).any():
             raise InputError("topology.springs", "object springs must come before controller springs")
@@ -288,7 +307,7 @@ class Topology(Artifact):
     @property
     def object_spring_count(self) -> int:
         """How many springs join two object nodes; they come first."""
-        return int((self.springs < len(self.nodes)).all(axis=1).sum())
+        return int(np.count_nonzero((self.springs < len(self.nodes)).all(axis=1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,8 +360,11 @@ class Simulation:
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
 
     def __post_init__(self) -> None:
-        if not (self.frame_time > 0 and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
-            raise InputError("simulation", "frame_time > 0, substeps >= 1, collision_capacity >= 1, finite gravity are required", self)
+        if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
+            rule = "finite frame_time > 0, substeps >= 1, collision_capacity >= 1, finite gravity are required"
+            raise InputError("simulation", rule, self)
+        if self.up not in ("+z", "-z"):
+            raise InputError("simulation.up", "must be '+z' or '-z'", repr(self.up))
 
     @property
     def substep(self) -> float:

@@ -26,7 +26,9 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
-Range = tuple[float, float]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+Beta = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,7 @@ class Simulation:
     """Fraction of the stability bound that `auto` uses."""
     max_substeps: Count = 2000
     """`auto` never asks for more; a candidate that would need more is penalised by the search."""
-    gravity: float = 9.8
+    gravity: Finite = 9.8
     collision_capacity: Count = 500
     controller_velocity: bool = False
 
@@ -127,7 +129,7 @@ class Fit:
     __pydantic_config__ = STRICT
     epochs: Count = 200
     learning_rate: Positive = 1e-3
-    betas: tuple[float, float] = (0.9, 0.99)
+    betas: tuple[Beta, Beta] = (0.9, 0.99)
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimiser step, with the gradient through all of them; 0 means all training frames."""
     clip_gradient_norm: NonNegative = 0.0
@@ -136,6 +138,11 @@ class Fit:
     """Clamp of the stiffness inside the simulation."""
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
+
+    def __post_init__(self) -> None:
+        low, high = self.stiffness_range
+        if not 0 <= low < high:
+            raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,12 +292,17 @@ def plain(settings: Any) -> dict[str, Any]:
     return result
 
 
+def _read_text(path: Path) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "this file must be readable UTF-8 text", error) from error
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """A YAML mapping from a file. Raises InputError."""
     try:
-        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "this file must be readable", error.strerror) from error
+        values = yaml.safe_load(_read_text(path))
     except yaml.YAMLError as error:
         raise InputError(path, "this file must be YAML", str(error).replace("\n", " ")) from error
     if not isinstance(values, dict):
@@ -305,10 +317,7 @@ def read_methods(path: Path) -> dict[str, Method]:
 
 def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
-    try:
-        lines = [line.rstrip("\n") for line in Path(path).open(encoding="utf-8") if line.strip() and not line.startswith("#")]
-    except OSError as error:
-        raise InputError(path, "this file must be readable", error.strerror) from error
+    lines = [line for line in _read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     columns = [f.name for f in dataclasses.fields(ScenarioRow)]
     if not lines or lines[0].split("\t") != columns:
         raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
@@ -370,7 +379,10 @@ class Benchmark:
                 continue
             if self.config.data_root is None:
                 raise InputError(
-                    f"scenario {name}", f"{row.source} scenarios need data_root", "null", "Give it: --config data_root=/path/to/data."
+                    f"scenario {name}",
+                    f"{row.source} scenarios need data_root",
+                    "null",
+                    "Give it: --config data_root=/path/to/data.",
                 )
             if not path.exists():
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
@@ -381,7 +393,9 @@ def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], t
     if unknown:
         close = {name: difflib.get_close_matches(name, known, n=1) for name in unknown}
         hints = [f"{name!r}" + (f" (did you mean {match[0]!r}?)" if match else "") for name, match in close.items()]
-        raise InputError(f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}")
+        raise InputError(
+            f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
+        )
 
 
 def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:

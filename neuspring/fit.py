@@ -160,9 +160,7 @@ class SpringFit:
         hands = torch.tensor(observations.controller_points[: observations.scenario.train_end], device=problem.device)
         self.hands = hands
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
-        self.optimiser = torch.optim.Adam(
-            self.parameters.tensors.values(), lr=problem.fit.learning_rate, betas=problem.fit.betas
-        )
+        self.optimiser = torch.optim.Adam(self.parameters.tensors.values(), lr=problem.fit.learning_rate, betas=problem.fit.betas)
         self.twin = problem.twin
         self._solver: FrameSolver | None = None
 
@@ -190,7 +188,7 @@ class SpringFit:
         low, high = self.problem.fit.stiffness_range
         stiffness = np.clip(np.exp(values["log_stiffness"].astype(np.float64)), low, high)
         limits = {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}
-        scalars = {n: float(np.clip(values[n], *limits[n.rpartition("_")[2]])) for n in TRAINED_SCALARS}
+        scalars: dict[str, Any] = {n: float(np.clip(values[n], *limits[n.rpartition("_")[2]])) for n in TRAINED_SCALARS}
         return replace(self.twin, material=replace(self.twin.material, stiffness=stiffness, **scalars))
 
     def epoch(self) -> tuple[float, float]:

@@ -71,7 +71,13 @@ class FrameLoss:
 
     @classmethod
     def of(
-        cls, observations: Observations, weights: Losses, device: str, dtype: torch.dtype = torch.float32, *, frozen_counts: bool = False
+        cls,
+        observations: Observations,
+        weights: Losses,
+        device: str,
+        dtype: torch.dtype = torch.float32,
+        *,
+        frozen_counts: bool = False,
     ) -> FrameLoss:
         """Keep training frames only: losses never see the future."""
         end = observations.scenario.train_end

@@ -19,27 +19,31 @@ UNITS = {"chamfer": "m", "track_error": "m"}
 COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 
 
+def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarray, surface: int) -> float:
+    """Mean L1 distance, m, from the visible points [P, 3] to the first `surface` nodes [N, 3]. NaN where no point is visible."""
+    seen = points[visible].astype(np.float64)
+    if not len(seen):
+        return float("nan")
+    return float(cKDTree(nodes[:surface].astype(np.float64)).query(seen, p=1)[0].mean())
+
+
 def chamfer_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
     """Mean L1 distance per frame [T], m, from visible points to surface nodes. NaN where no point is visible."""
-    surface = observations.surface_count
-    result = np.full(len(positions), np.nan)
-    for frame, nodes in enumerate(positions):
-        seen = observations.object_points[frame][observations.object_visibility[frame]]
-        if len(seen):
-            result[frame] = cKDTree(nodes[:surface].astype(np.float64)).query(seen.astype(np.float64), p=1)[0].mean()
-    return result
+    surface, points, visible = observations.surface_count, observations.object_points, observations.object_visibility
+    return np.array([visible_to_surface(nodes, points[t], visible[t], surface) for t, nodes in enumerate(positions)])
 
 
-def track_error_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
-    """Mean Euclidean track error per frame [T], m. A frame without any annotated track scores 0, as published.
+def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
+    """Mean Euclidean error per frame [F], m, of positions [F, N, 3] against annotated tracks [F, K, 3]; NaN: not annotated.
 
-    NaN everywhere when no track is annotated at frame 0 (nothing can be matched).
+    Tracks annotated at frame 0 are matched once, to the nearest of all nodes. A frame without any of them scores 0, as
+    published. NaN everywhere when no track is annotated at frame 0.
     """
-    tracks = observations.tracks[: len(positions)].astype(np.float64)
     annotated = ~np.isnan(tracks).any(axis=2)
     matched = annotated[0]
     if not matched.any():
         return np.full(len(positions), np.nan)
+    tracks = tracks.astype(np.float64)
     index = cKDTree(positions[0].astype(np.float64)).query(tracks[0][matched])[1]
     error = np.linalg.norm(positions[:, index].astype(np.float64) - tracks[:, matched], axis=2)
     valid = annotated[:, matched]
@@ -47,6 +51,14 @@ def track_error_per_frame(positions: np.ndarray, observations: Observations) -> 
     total = np.where(valid, error, 0.0).sum(axis=1)
     mean: np.ndarray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
     return mean
+
+
+def track_error_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
+    """Mean Euclidean track error per frame [T], m. A frame without any annotated track scores 0, as published.
+
+    NaN everywhere when no track is annotated at frame 0 (nothing can be matched).
+    """
+    return track_errors(positions, observations.tracks[: len(positions)])
 
 
 def task_frames(scenario: Scenario, task: str) -> range:

@@ -64,7 +64,9 @@ class StageRecord:
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
-        write_text(Path(path), json.dumps({"format": RECORD_FORMAT, **self.__dict__}, indent=1, sort_keys=True, allow_nan=False) + "\n")
+        write_text(
+            Path(path), json.dumps({"format": RECORD_FORMAT, **self.__dict__}, indent=1, sort_keys=True, allow_nan=False) + "\n"
+        )
 
     @classmethod
     def load(cls, path: Path) -> StageRecord:
@@ -80,7 +82,9 @@ class StageRecord:
         if not path.is_file():
             raise InputError(path, f"named by {record_path}", "no such file", f"Delete {record_path} and run again.")
         if digest_file(path) != digest:
-            raise InputError(path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and run again.")
+            raise InputError(
+                path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and run again."
+            )
         return path
 
 

@@ -168,7 +168,7 @@ def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, ke
         if partial is not None:
             _save_partial(partial, key, trace)
     table = pd.DataFrame(trace)
-    best = table.loc[table["cost"].idxmin()]
+    best = table.iloc[int(table["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
     values = {name: float(best[name]) for name in VARIABLES}
@@ -179,7 +179,15 @@ def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, ke
 
 def _strategy(settings: config.Search, seed: int) -> cma.CMAEvolutionStrategy:
     # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
-    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, "maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
+    options = {
+        "bounds": [0, 1],
+        "seed": seed + 1,
+        "verbose": -9,
+        "maxiter": np.inf,
+        "tolfun": 0,
+        "tolx": 0,
+        "tolstagnation": np.inf,
+    }
     return cma.CMAEvolutionStrategy(encode(settings.start, settings.ranges), settings.sigma, options)
 
 
@@ -223,8 +231,9 @@ def _resume(strategy: cma.CMAEvolutionStrategy, path: Path | None, key: str) -> 
         rows = table.iloc[start : start + strategy.popsize]
         population = strategy.ask()
         if len(rows) != strategy.popsize or not np.array_equal(np.asarray(population), rows[columns].to_numpy()):
-            raise InputError(path, "the recorded candidates must replay exactly", "a different sequence", "Delete this file and run again.")
+            raise InputError(
+                path, "the recorded candidates must replay exactly", "a different sequence", "Delete this file and run again."
+            )
         strategy.tell(population, rows["cost"].tolist())
     print(f"continuing the search after {len(table)} rollouts")
-    records: list[dict[str, Any]] = table.to_dict("records")
-    return records
+    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]

@@ -22,6 +22,9 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.errors import NumericalFailure
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
+RESULT_ROLES = ("twin", "trajectory")
+"""Files of a stage that are its result, as opposed to how it got there."""
+
 
 def write_table(table: pd.DataFrame, path: Path) -> Path:
     """Write a Parquet file atomically; returns its path."""
@@ -58,11 +61,13 @@ def search(observations_path: Path, settings: Config, seed: int, device: str, ou
     clock = Stopwatch()
     observations = Observations.load(observations_path)
     device = resolve_device(device)
-    problem = SearchProblem(
-        observations, settings.search, settings.simulation, settings.losses, settings.released_quirks, device
-    )
+    problem = SearchProblem(observations, settings.search, settings.simulation, settings.losses, settings.released_quirks, device)
     chosen = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
-    common: dict[str, Any] = {"inputs": {"observations": digest_file(observations_path)}, "settings": chosen | {"seed": seed}, "device": device}
+    common: dict[str, Any] = {
+        "inputs": {"observations": digest_file(observations_path)},
+        "settings": chosen | {"seed": seed},
+        "device": device,
+    }
     key = _key(common["inputs"], common["settings"], device, "neuspring.search")
     partial = output.with_name("search.partial.parquet")
     try:
@@ -103,9 +108,7 @@ def fit(observations_path: Path, search_record: Path, settings: Config, device: 
         clock.stage("fit", "failed", reason=f"search: {before.reason}", **common).save(output)
         return
     coarse = Twin.load(before.file("twin", search_record))
-    problem = FitProblem(
-        observations, coarse, settings.fit, settings.simulation, settings.losses, settings.released_quirks, device
-    )
+    problem = FitProblem(observations, coarse, settings.fit, settings.simulation, settings.losses, settings.released_quirks, device)
     key = _key({"observations": inputs["observations"], "twin": before.files["twin"][1]}, chosen, device, "neuspring.fit")
     partial = output.with_name("fit.partial.npz")
     try:
@@ -154,7 +157,9 @@ def rollout(observations_path: Path, twin_record: Path, device: str, output: Pat
     clock.stage("rollout", "failed" if failed else "ok", {"trajectory": path}, reason=reason, facts=facts, **common).save(output)
 
 
-def score(observations_path: Path, records: Mapping[str, Path], method: str, variant: Mapping[str, Any], seed: int, output: Path) -> None:
+def score(
+    observations_path: Path, records: Mapping[str, Path], method: str, variant: Mapping[str, Any], seed: int, output: Path
+) -> None:
     """Trajectory -> scores.parquet, plots, and run.json: the record of the whole run, which MLflow indexes.
 
     `records` maps search, fit (if any) and rollout to their records.
@@ -169,7 +174,9 @@ def score(observations_path: Path, records: Mapping[str, Path], method: str, var
         table = metrics.score(trajectory, observations, method, seed)
     write_table(table, folder / "scores.parquet")
     histories = {name: records[name].parent / "history.parquet" for name in ("search", "fit") if "history" in _files(stages, name)}
-    plots = figures.run_figures(observations, trajectory, {n: pd.read_parquet(p) for n, p in histories.items()}, method, folder / "plots")
+    plots = figures.run_figures(
+        observations, trajectory, {n: pd.read_parquet(p) for n, p in histories.items()}, method, folder / "plots"
+    )
     twin_stage = "fit" if "fit" in stages else "search"
     artefacts = {"plots": plots, "records": list(records.values())}
     if "twin" in stages[twin_stage].files:
@@ -183,7 +190,9 @@ def score(observations_path: Path, records: Mapping[str, Path], method: str, var
         "reason": last.reason,
         "data_digest": digest_file(observations_path),
     }
-    made = {name: record.files for name, record in stages.items()} | {"scores": digest_file(folder / "scores.parquet")}
+    # The content of a run, without its timings: the same results have the same key, however often they are made.
+    made = {name: record.files[role][1] for name, record in stages.items() for role in RESULT_ROLES if role in record.files}
+    made["scores"] = digest_file(folder / "scores.parquet")
     run = content | {
         "format": RECORD_FORMAT,
         "run_key": hashlib.sha256(canonical([content, made]).encode()).hexdigest(),
@@ -221,7 +230,10 @@ def _key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, mo
 
 def _history(steps: Any, columns: Mapping[str, pd.Series]) -> pd.DataFrame:
     """Long form for MLflow: step, metric, value; missing values are left out."""
-    parts = [pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": values.to_numpy(float)}) for name, values in columns.items()]
+    parts = [
+        pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": values.to_numpy(float)})
+        for name, values in columns.items()
+    ]
     return pd.concat(parts).dropna().reset_index(drop=True)
 
 

@@ -5,7 +5,7 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,10 +95,12 @@ def summary_text(collected: Collected, baseline: str) -> str:
     methods = list(dict.fromkeys(collected.runs["method"]))
     scores = comparable(collected)
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
-    runs = f"{collected.runs['scenario'].nunique()} scenarios, {collected.runs['seed'].nunique()} seeds"
-    lines = [f"Errors in mm, lower is better ({runs}; CD: single-directional L1 Chamfer; TE: track error).", ""]
-    lines += ["Mean over scenarios, ± standard deviation over seeds; in brackets the frame-weighted mean.", ""]
-    lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts)
+    scenarios, seeds = collected.runs["scenario"].nunique(), collected.runs["seed"].nunique()
+    size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
+    spread = ", ± standard deviation over seeds" if seeds > 1 else ""
+    lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
+    lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
+    lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, seeds)
     differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
         lines += ["", f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios], same scenario and seed:", ""]
@@ -110,20 +112,23 @@ def summary_text(collected: Collected, baseline: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _method_table(methods: list[str], means: pd.DataFrame, counts: pd.DataFrame) -> list[str]:
+def _method_table(methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int) -> list[str]:
     rows = []
     for method in methods:
         cells = [method]
         for task, metric in HEADINGS:
-            found = means[(means["method"] == method) & (means["task"] == task) & (means["metric"] == metric)] if len(means) else means
+            found = (
+                means[(means["method"] == method) & (means["task"] == task) & (means["metric"] == metric)] if len(means) else means
+            )
             if not len(found):
                 cells.append("–")
                 continue
             row = found.iloc[0]
-            cells.append(f"{MM * row['equal']:.2f} ± {MM * row['seed_std']:.2f} ({MM * row['frames']:.2f})")
-        status = counts.loc[method]
-        total, good = int(status.sum()), int(status.get("ok", 0))
-        cells.append(f"{good}/{total}" + (f" ({int(status['failed'])} failed)" if status.get("failed", 0) else ""))
+            spread = f" ± {MM * row['seed_std']:.2f}" if seeds > 1 else ""
+            cells.append(f"{MM * row['equal']:.2f}{spread} ({MM * row['frames']:.2f})")
+        status = {str(name): int(value) for name, value in counts.loc[method].to_dict().items()}
+        failed = f" ({status['failed']} failed)" if status.get("failed") else ""
+        cells.append(f"{status.get('ok', 0)}/{sum(status.values())}{failed}")
         rows.append(cells)
     return _markdown(["Method", *HEADINGS.values(), "Runs"], rows)
 
@@ -134,12 +139,12 @@ def _difference_table(differences: pd.DataFrame) -> list[str]:
         cells = [str(method)]
         for task, metric in HEADINGS:
             found = part[(part["task"] == task) & (part["metric"] == metric)]
-            cells.append("–" if not len(found) else _interval(found.iloc[0].to_dict()))
+            cells.append("–" if not len(found) else _interval(found.iloc[0]))
         rows.append(cells)
     return _markdown(["Method", *HEADINGS.values()], rows)
 
 
-def _interval(row: Mapping[str, Any]) -> str:
+def _interval(row: Any) -> str:
     text = f"{MM * row['difference']:+.2f}"
     if np.isfinite(row["low"]):
         text += f" [{MM * row['low']:+.2f}, {MM * row['high']:+.2f}]"
@@ -151,7 +156,7 @@ def per_scenario_text(scores: pd.DataFrame) -> str:
     rows = []
     for (scenario, method), part in scores.groupby(["scenario", "method"], sort=False):
         means = part.groupby(["task", "metric"])["value"].mean()
-        rows.append([scenario, method, *(f"{MM * means[key]:.2f}" if key in means else "–" for key in HEADINGS)])
+        rows.append([str(scenario), str(method), *(f"{MM * means[key]:.2f}" if key in means else "–" for key in HEADINGS)])
     return "\n".join(_markdown(["Scenario", "Method", *HEADINGS.values()], rows)) + "\n"
 
 

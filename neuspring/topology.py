@@ -57,7 +57,10 @@ def build(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, label
     if (lengths <= 0).any():
         pair = springs[int(np.argmin(lengths))].tolist()
         raise InputError(
-            "topology", "a controller may not coincide with an object node", f"zero-length spring {pair}", "Move or drop that point."
+            "topology",
+            "a controller may not coincide with an object node",
+            f"zero-length spring {pair}",
+            "Move or drop that point.",
         )
     return Topology(
         nodes=nodes,

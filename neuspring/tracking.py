@@ -115,7 +115,7 @@ def init(results: Path, settings: Tracking) -> dict[str, str]:
         return {"outcome": "disabled", **facts}
     try:
         _, experiment = _prepare(Path(results), settings)
-    except Exception as error:  # noqa: BLE001 - MLflow lets errors of many libraries through; none of them may stop a run
+    except Exception as error:
         return {"outcome": _unreachable(error, "no run will be logged until `init` succeeds"), **facts}
     return {"outcome": "ready", **facts, "experiment_id": experiment}
 
@@ -137,7 +137,7 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
             return _log(client, experiment, record, run_json)
     except InputError:
         raise
-    except Exception as error:  # noqa: BLE001 - as in `init`
+    except Exception as error:
         return _unreachable(error, f"{record.name} is not logged; its files are complete, `sync` will log it")
 
 
@@ -507,7 +507,7 @@ def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str
             ours = "run_key" in run.data.tags and (settings.uri is None or path.exists())
             if ours and _close_if_free(client, run, path):
                 note(run.info.run_name or run.info.run_id, "closed")
-    except Exception as error:  # noqa: BLE001 - as in `init`
+    except Exception as error:
         return _unreachable(error, "the runs not yet logged are left for the next `sync`")
     return None
 

@@ -70,7 +70,7 @@ def blob() -> Shape:
     level = np.linalg.norm(grid / half, axis=1)
     body, level = grid[level <= 1.0], level[level <= 1.0]
     outer = level > 0.7
-    lifted = body + [0.0, 0.0, -body[:, 2].min() + 0.002]
+    lifted = body + np.array([0.0, 0.0, 0.002 - body[:, 2].min()])
     shell, interior = lifted[outer], lifted[~outer]
     facing = shell[:, 1] <= 0.01
     top = np.array([0.0, 0.0, lifted[:, 2].max() + 0.012])
@@ -119,7 +119,10 @@ class ToyScene:
 
 
 def make(row: ScenarioRow, settings: Toy) -> ToyScene:
-    """Simulate and observe a scene; deterministic in `settings.seed` and the scenario's name. Raises InputError for unknown names."""
+    """Simulate and observe a scene; deterministic in `settings.seed` and the scenario's name.
+
+    Raises InputError for unknown names.
+    """
     parts = row.path.split("/")
     if len(parts) != 3 or parts[0] not in SHAPES or parts[1] not in MOTIONS or parts[2] not in FIELDS:
         rule = f"must be shape/motion/field with {sorted(SHAPES)} / {list(MOTIONS)} / {list(FIELDS)}"
@@ -173,7 +176,12 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
         up="+z",
         ground=row.ground,
         self_collision=row.self_collision,
-        provenance={"scene": row.path, "seed": str(settings.seed), "noise": f"{settings.noise} m", "occlusion": str(settings.occlusion)},
+        provenance={
+            "scene": row.path,
+            "seed": str(settings.seed),
+            "noise": f"{settings.noise} m",
+            "occlusion": str(settings.occlusion),
+        },
     )
     annotated = np.linspace(0, tracked - 1, min(ANNOTATED, tracked)).astype(int)
     return Observations(

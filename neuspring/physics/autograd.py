@@ -21,7 +21,13 @@ FRICTION_RANGE = (0.0, 2.0)
 class _Frame(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, solver: FrameSolver, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
+        ctx: Any,
+        solver: FrameSolver,
+        begin: torch.Tensor,
+        end: torch.Tensor,
+        x: torch.Tensor,
+        v: torch.Tensor,
+        *packed: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         solver.set_parameters(Parameters(*packed))
         result = solver.forward(x, v, begin, end)

@@ -8,8 +8,6 @@ Ground (plane z = 0): a node that would be below at the end of the substep and m
 toi = -z / v_z:  x' = x + v toi + v' (dt - toi). Self-collision (Jacobi): node i takes the mean impulse over its listed
 partners that are closer than the contact distance and approach. `response` holds (e, mu).
 """
-# mypy: disable-error-code="valid-type,name-defined"
-
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
@@ -34,7 +32,7 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def kernels(real: Any) -> Kernels:  # noqa: C901 - kernels must share the closure of one scalar type
+def kernels(real: Any) -> Kernels:
     """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
     vec3 = wp.types.vector(3, real)
     zero, half, one = wp.constant(real(0.0)), wp.constant(real(0.5)), wp.constant(real(1.0))
@@ -50,12 +48,14 @@ def kernels(real: Any) -> Kernels:  # noqa: C901 - kernels must share the closur
         overflow: wp.array(dtype=int),
     ):
         i = wp.tid()
-        found = int(0)
+        # wp.int32(0), not 0: Warp takes a bare literal for a constant, which a loop may not change.
+        found = wp.int32(0)
         reach = distance[0]
         xi = x[0, i]
         for j in range(nodes):
             offset = x[0, j] - xi
-            if wp.abs(offset[0]) < reach and j != i:
+            # The nested test is cheap first: most nodes are far along x already.
+            if wp.abs(offset[0]) < reach and j != i:  # noqa: SIM102
                 if wp.length(offset) < reach:
                     if found < capacity:
                         partners[i, found] = j
@@ -78,7 +78,7 @@ def kernels(real: Any) -> Kernels:  # noqa: C901 - kernels must share the closur
         e = response[0]
         mu = response[1]
         total = vec3(zero, zero, zero)
-        hits = int(0)
+        hits = wp.int32(0)
         for k in range(count[i]):
             j = partners[i, k]
             dx = x[slot, j] - x[slot, i]
@@ -114,7 +114,7 @@ def kernels(real: Any) -> Kernels:  # noqa: C901 - kernels must share the closur
         e = response[0]
         mu = response[1]
         h = adj_after[i]
-        hits = int(0)
+        hits = wp.int32(0)
         for k in range(count[i]):
             j = partners[i, k]
             dx = x[slot, j] - x[slot, i]
@@ -233,6 +233,4 @@ def kernels(real: Any) -> Kernels:  # noqa: C901 - kernels must share the closur
             adj_v[i] = adj_v[i] + hx * dt
 
     unique = wp.kernel(module="unique", enable_backward=False)
-    return Kernels(
-        unique(find_candidates), unique(collide), unique(collide_adjoint), unique(ground), unique(ground_adjoint)
-    )
+    return Kernels(unique(find_candidates), unique(collide), unique(collide_adjoint), unique(ground), unique(ground_adjoint))

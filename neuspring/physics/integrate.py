@@ -1,10 +1,8 @@
 """Velocity update (force, gravity, drag), free position update, controller motion, and their adjoints.
 
-    v' = (v + dt (f + g)) delta,   delta = exp(-dt drag),   unit mass          (velocity)
-    x' = x + dt v'                                                              (advance; contact.py has the version with ground)
+v' = (v + dt (f + g)) delta,   delta = exp(-dt drag),   unit mass          (velocity)
+x' = x + dt v'                                                              (advance; contact.py has the version with ground)
 """
-# mypy: disable-error-code="valid-type,name-defined"
-
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools

@@ -86,7 +86,7 @@ class FrameSolver:
         self.device, self.dtype, self.differentiable = device, dtype, differentiable
         self._real = wp.float32 if dtype == torch.float32 else wp.float64
         self._vec3 = wp.types.vector(3, self._real)
-        self._pairs = wp.array(np.ascontiguousarray(spring_pairs, np.int32), dtype=wp.vec2i, device=device)
+        self._pairs: Any = wp.array(np.ascontiguousarray(spring_pairs, np.int32), dtype=wp.vec2i, device=device)
         self._count = len(spring_pairs)
         self._buffers: dict[str, torch.Tensor] = {}
         self._views: dict[str, Any] = {}
@@ -186,7 +186,17 @@ class FrameSolver:
             here, there, kept = (step, step + 1, step) if self.differentiable else (step % 2, (step + 1) % 2, 0)
             fraction = (step + 1) / sim.substeps
             self._run(
-                terms.controllers, self.controllers, w["x"], w["v"], here, fraction, inverse_time, n, w["begin"], w["end"], w["force"]
+                terms.controllers,
+                self.controllers,
+                w["x"],
+                w["v"],
+                here,
+                fraction,
+                inverse_time,
+                n,
+                w["begin"],
+                w["end"],
+                w["force"],
             )
             if step == 0 and sim.self_collision:
                 capacity = sim.collision_capacity

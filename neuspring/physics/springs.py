@@ -7,8 +7,6 @@ With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing spe
 Per-spring parameters are packed as (Y [N], 1 / l0 [1/m], gamma [N s/m]) so that one load serves a spring; the adjoint
 accumulates (dL/dY, (1/Y) dL/d(1/l0), dL/dgamma) the same way.
 """
-# mypy: disable-error-code="valid-type,name-defined"
-
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools

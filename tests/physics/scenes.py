@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,7 @@ def warp(
 
     hands = tensor(controllers)
     states = [(tensor(x), tensor(v))]
-    for begin, end in zip(hands[:-1], hands[1:], strict=True):
+    for begin, end in pairwise(hands):
         states.append(solver.forward(*states[-1], begin, end))
     xs, vs = zip(*states, strict=True)
     return torch.stack(xs).cpu().numpy(), torch.stack(vs).cpu().numpy()
@@ -134,7 +135,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
     x = rng.uniform(-0.04, 0.04, (nodes, 3))
     x[:, 2] = up * rng.uniform(0.002, 0.06, nodes)
     v = rng.uniform(-0.6, 0.6, (nodes, 3))
-    start = rng.uniform(-0.05, 0.05, (controllers, 3)) + [0, 0, up * 0.1]
+    start = rng.uniform(-0.05, 0.05, (controllers, 3)) + np.array([0, 0, up * 0.1])
     hands = start + np.cumsum(np.concatenate([[np.zeros((controllers, 3))], rng.uniform(-0.01, 0.01, (frames, controllers, 3))]), 0)
     inner = [(i, j) for i in range(nodes) for j in range(i + 1, nodes) if rng.random() < 0.4]
     outer = [(nodes + c, int(i)) for c in range(controllers) for i in rng.choice(nodes, 2, replace=False)]

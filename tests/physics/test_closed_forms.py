@@ -41,16 +41,16 @@ def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: 
     """v_n = delta^n v_0 - s g dt,  x_n = x_0 + dt (s v_0 - g dt sum of partial sums),  s = delta + ... + delta^n."""
     substeps = 50
     x, v = fall(engine, substeps, drag, up)
-    dt = 0.1 / substeps
+    dt, gravity = 0.1 / substeps, -sign(up) * G * 0.1 / substeps
     delta = np.exp(-dt * drag)
     powers = delta ** np.arange(1, 4 * substeps + 1)
     partial = np.cumsum(powers)
     for frame in range(1, 5):
         n = frame * substeps
-        gravity = -sign(up) * G * dt
-        np.testing.assert_allclose(v[frame, 0], [0.7 * powers[n - 1], 0, 2.0 * powers[n - 1] + gravity * partial[n - 1]], atol=ROUNDING)
+        speed = [0.7 * powers[n - 1], 0, 2.0 * powers[n - 1] + gravity * partial[n - 1]]
+        np.testing.assert_allclose(v[frame, 0], speed, atol=ROUNDING)
         travelled = dt * np.array([0.7 * partial[n - 1], 0, 2.0 * partial[n - 1] + gravity * partial[:n].sum()])
-        np.testing.assert_allclose(x[frame, 0], [0.1, 0, 3.0] + travelled, atol=ROUNDING)
+        np.testing.assert_allclose(x[frame, 0], np.array([0.1, 0, 3.0]) + travelled, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("drag", [0.0, 3.0])
@@ -72,11 +72,11 @@ OMEGA_SQUARED = 2 * STIFFNESS / LENGTH
 PERIOD = 2 * np.pi / np.sqrt(OMEGA_SQUARED)
 
 
-def oscillate(engine: Engine, substep: float, steps: int, per_frame: int = 1, dashpot: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def oscillate(
+    engine: Engine, substep: float, steps: int, per_frame: int = 1, dashpot: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Extension q [F] and its rate, at frame ends, along a tilted axis, starting at AMPLITUDE with rate 0."""
-    made = scene(
-        2, [(0, 1)], [LENGTH], stiffness=STIFFNESS, dashpot=dashpot, substeps=per_frame, frame_time=substep * per_frame
-    )
+    made = scene(2, [(0, 1)], [LENGTH], stiffness=STIFFNESS, dashpot=dashpot, substeps=per_frame, frame_time=substep * per_frame)
     axis = np.array([2.0, -1.0, 2.0]) / 3
     x = np.stack([np.zeros(3), axis * (LENGTH + AMPLITUDE)])
     x, v = engine(made, x, np.zeros((2, 3)), no_hands(steps // per_frame))

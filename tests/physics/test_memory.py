@@ -16,7 +16,7 @@ VECTOR = 3 * 4
 
 
 def saved_bytes(substeps: int, frames: int) -> int:
-    """Bytes of distinct storage that autograd keeps for a chain of up to 9 frames. Parameters and hands are shared by all frames."""
+    """Bytes of distinct storage that autograd keeps for a chain of up to 9 frames; hands are not counted."""
     made, x, v, hands = random_scene(31, nodes=10, frames=9, substeps=substeps, self_collision=True)
     solver = solver_for(made, hands.shape[1], dtype=torch.float32)
     motion = torch.tensor(hands, dtype=torch.float32)

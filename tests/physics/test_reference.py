@@ -93,7 +93,5 @@ def test_upside_down_is_a_mirror_image() -> None:
 def test_a_scene_without_springs_or_hands() -> None:
     falling = scene(3, gravity=9.8, on_ground=True, substeps=10, frame_time=0.1)
     x = np.array([[0.0, 0, 0.01], [0, 0, 0.2], [0, 0, 5.0]])
-    for got, wanted in zip(
-        warp(falling, x, 0 * x, no_hands(3)), reference.rollout(falling, x, 0 * x, no_hands(3)), strict=True
-    ):
+    for got, wanted in zip(warp(falling, x, 0 * x, no_hands(3)), reference.rollout(falling, x, 0 * x, no_hands(3)), strict=True):
         np.testing.assert_allclose(got, wanted, atol=SAME, rtol=0)

@@ -1,6 +1,5 @@
 # Validates the configuration before any job, and holds the helpers that rules use.
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from neuspring.errors import InputError
 from neuspring.provenance import code_digest
 
 # Jobs call `python -m neuspring`; take the interpreter that runs Snakemake unless a software deployment provides one.
-os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+shell.prefix(f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH; ")
 
 ROOT = Path(workflow.basedir)
 
@@ -58,20 +57,28 @@ wildcard_constraints:
 
 def section(*names):
     """Sections of the configuration as the JSON text that a command takes."""
-    return json.dumps({name: settings.plain(CONFIG)[name] for name in names}, sort_keys=True)
+    return json.dumps(
+        {name: settings.plain(CONFIG)[name] for name in names}, sort_keys=True
+    )
 
 
 def observe_settings(wildcards):
-    names = {"toy": ["toy"], "mocap": ["mocap"], "phystwin": []}[BENCHMARK.scenarios[wildcards.scenario].source]
+    names = {"toy": ["toy"], "mocap": ["mocap"], "phystwin": []}[
+        BENCHMARK.scenarios[wildcards.scenario].source
+    ]
     return section("data_root", "scenario_table", *names)
 
 
 def scenario_row(wildcards):
-    return json.dumps(settings.plain(BENCHMARK.scenarios[wildcards.scenario]), sort_keys=True)
+    return json.dumps(
+        settings.plain(BENCHMARK.scenarios[wildcards.scenario]), sort_keys=True
+    )
 
 
 def reader_digest(wildcards):
-    return code_digest(f"neuspring.data.{BENCHMARK.scenarios[wildcards.scenario].source}")
+    return code_digest(
+        f"neuspring.data.{BENCHMARK.scenarios[wildcards.scenario].source}"
+    )
 
 
 def scenario_files(wildcards):
@@ -81,14 +88,22 @@ def scenario_files(wildcards):
         return []
     if path.is_file():
         return [str(path)]
-    return [str(path / name) for name in ("final_data.pkl", "split.json") if (path / name).exists()]
+    return [
+        str(path / name)
+        for name in ("final_data.pkl", "split.json")
+        if (path / name).exists()
+    ]
 
 
 def fit_settings(wildcards):
     """The fit's sections, with the method's own settings on top."""
     values = settings.plain(CONFIG)
-    chosen = {name: values[name] for name in ("simulation", "losses", "released_quirks")}
-    chosen["fit"] = settings.plain(settings.fit_of(CONFIG, BENCHMARK.methods[wildcards.method], wildcards.method))
+    chosen = {
+        name: values[name] for name in ("simulation", "losses", "released_quirks")
+    }
+    chosen["fit"] = settings.plain(
+        settings.fit_of(CONFIG, BENCHMARK.methods[wildcards.method], wildcards.method)
+    )
     return json.dumps(chosen, sort_keys=True)
 
 
@@ -103,7 +118,11 @@ def search_record(wildcards):
 def fit_records(wildcards):
     """The fit's record if the method has that stage, else nothing."""
     has_fit = BENCHMARK.methods[wildcards.method].fit is not None
-    return [f"{RESULTS}/{wildcards.scenario}/{wildcards.method}/{wildcards.seed}/fit.json"] if has_fit else []
+    return (
+        [f"{RESULTS}/{wildcards.scenario}/{wildcards.method}/{wildcards.seed}/fit.json"]
+        if has_fit
+        else []
+    )
 
 
 def twin_record(wildcards):
@@ -117,7 +136,10 @@ def fit_option(wildcards, input):
 
 def variant(wildcards):
     row = settings.plain(BENCHMARK.methods[wildcards.method])
-    return json.dumps({"search": row["search"], "fit": row["fit"] or "none", **row["settings"]}, sort_keys=True)
+    return json.dumps(
+        {"search": row["search"], "fit": row["fit"] or "none", **row["settings"]},
+        sort_keys=True,
+    )
 
 
 def run_records():
@@ -131,12 +153,23 @@ def run_records():
 
 
 def tracked_runs():
-    return [path.replace("run.json", "mlflow.txt") for path in run_records()] if CONFIG.tracking.enabled else []
+    return (
+        [path.replace("run.json", "mlflow.txt") for path in run_records()]
+        if CONFIG.tracking.enabled
+        else []
+    )
 
 
 def table_arguments():
     return [
-        *("--results", RESULTS, "--output", f"{RESULTS}/tables", "--scenarios", *CONFIG.scenarios),
+        *(
+            "--results",
+            RESULTS,
+            "--output",
+            f"{RESULTS}/tables",
+            "--scenarios",
+            *CONFIG.scenarios,
+        ),
         *("--methods", *CONFIG.methods, "--seeds", *map(str, CONFIG.seeds)),
     ]
 
@@ -147,8 +180,16 @@ def report_end(failed):
     if failed:
         print("\nThe run did not finish. What is done so far:", flush=True)
         subprocess.run(command, check=False)
-        print("Logs are named above. The same command continues where this one stopped.", flush=True)
+        print(
+            "Logs are named above. The same command continues where this one stopped.",
+            flush=True,
+        )
     else:
         print(f"\n{Path(TABLES).read_text()}")
-        print(f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/")
-        print(f"Look at the runs in MLflow:  {Path(sys.executable).parent}/neuspring ui --results {RESULTS}", flush=True)
+        print(
+            f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/"
+        )
+        print(
+            f"Look at the runs in MLflow:  {Path(sys.executable).parent}/neuspring ui --results {RESULTS}",
+            flush=True,
+        )

@@ -7,17 +7,17 @@ rule observe:
         f"{RESULTS}/logs/observe/{{scenario}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/observe/{{scenario}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        settings=observe_settings,
-        row=scenario_row,
-        code=reader_digest,
-    retries: 1
     threads: 1
     resources:
         mem_mb=4000,
         runtime=30,
+    params:
+        settings=observe_settings,
+        row=scenario_row,
+        code=reader_digest,
     shell:
         "python -m neuspring observe --scenario {wildcards.scenario} --settings {params.settings:q} --output {output}"
         " 2>&1 | tee {log}"

@@ -10,17 +10,17 @@ rule score:
         f"{RESULTS}/logs/score/{{scenario}}-{{method}}-{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/score/{{scenario}}-{{method}}-{{seed}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        fit=fit_option,
-        variant=variant,
-        code=code_digest("neuspring.metrics"),
-    retries: 1
     threads: 1
     resources:
         mem_mb=4000,
         runtime=30,
+    params:
+        fit=fit_option,
+        variant=variant,
+        code=code_digest("neuspring.metrics"),
     shell:
         "python -m neuspring score --observations {input.observations} --search {input.search} {params.fit}"
         " --rollout {input.rollout} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"

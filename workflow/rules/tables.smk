@@ -7,15 +7,15 @@ rule tables:
         f"{RESULTS}/logs/tables.log",
     benchmark:
         f"{RESULTS}/benchmarks/tables.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        arguments=table_arguments(),
-        code=code_digest("neuspring.tables"),
-    retries: 1
     threads: 1
     resources:
         mem_mb=2000,
         runtime=10,
+    params:
+        arguments=table_arguments(),
+        code=code_digest("neuspring.tables"),
     shell:
         "python -m neuspring tables {params.arguments:q} > {log} 2>&1"

@@ -6,16 +6,16 @@ rule track_init:
         f"{RESULTS}/logs/track_init.log",
     benchmark:
         f"{RESULTS}/benchmarks/track_init.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        settings=section("tracking"),
-        results=RESULTS,
-    retries: 1
     threads: 1
     resources:
         mem_mb=2000,
         runtime=10,
+    params:
+        settings=section("tracking"),
+        results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
         "python -m neuspring track-init --results {params.results:q} --settings {params.settings:q} --output {output} 2>&1 | tee {log}"
 
@@ -30,16 +30,16 @@ rule log_run:
         f"{RESULTS}/logs/log_run/{{scenario}}-{{method}}-{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/log_run/{{scenario}}-{{method}}-{{seed}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        settings=section("tracking"),
-        results=RESULTS,
-    retries: 1
     threads: 1
     resources:
         mem_mb=2000,
         runtime=10,
+    params:
+        settings=section("tracking"),
+        results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
         "python -m neuspring log --record {input.record} --results {params.results:q} --settings {params.settings:q}"
         " --output {output} 2>&1 | tee {log}"

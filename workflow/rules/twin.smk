@@ -7,20 +7,21 @@ rule search:
         f"{RESULTS}/logs/search/{{scenario}}-{{search}}-{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/search/{{scenario}}-{{search}}-{{seed}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        settings=section("search", "simulation", "losses", "released_quirks"),
-        code=code_digest("neuspring.search"),
-    retries: 1
     threads: 1
     resources:
+        device=DEVICE,
         gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
         mem_mb=8000,
         runtime=240,
+    params:
+        settings=section("search", "simulation", "losses", "released_quirks"),
+        code=code_digest("neuspring.search"),
     shell:
         "python -m neuspring search --observations {input.observations} --settings {params.settings:q} --seed {wildcards.seed}"
-        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
+        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"
 
 
 rule fit:
@@ -33,20 +34,21 @@ rule fit:
         f"{RESULTS}/logs/fit/{{scenario}}-{{method}}-{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/fit/{{scenario}}-{{method}}-{{seed}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        settings=fit_settings,
-        code=code_digest("neuspring.fit"),
-    retries: 1
     threads: 1
     resources:
+        device=DEVICE,
         gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
         mem_mb=8000,
         runtime=480,
+    params:
+        settings=fit_settings,
+        code=code_digest("neuspring.fit"),
     shell:
         "python -m neuspring fit --observations {input.observations} --search {input.search} --settings {params.settings:q}"
-        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
+        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"
 
 
 rule rollout:
@@ -59,16 +61,17 @@ rule rollout:
         f"{RESULTS}/logs/rollout/{{scenario}}-{{method}}-{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/rollout/{{scenario}}-{{method}}-{{seed}}.tsv"
+    retries: 1
     conda:
         ENVIRONMENT
-    params:
-        code=code_digest("neuspring.rollout"),
-    retries: 1
     threads: 1
     resources:
+        device=DEVICE,
         gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
         mem_mb=4000,
         runtime=60,
+    params:
+        code=code_digest("neuspring.rollout"),
     shell:
         "python -m neuspring rollout --observations {input.observations} --twin {input.twin}"
-        " --device {DEVICE} --threads {threads} --output {output} 2>&1 | tee {log}"
+        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"

@@ -1,0 +1,42 @@
+# make demo | test | lint | bench: each makes or reuses .venv by itself.
+PYTHON ?= $(shell for p in python3.12 python3.13 python3.11 python3; do \
+	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+SNAKEMAKE := $(BIN)/snakemake --profile workflow/profiles/default
+CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
+export MLFLOW_DISABLE_TELEMETRY = true
+export DO_NOT_TRACK = true
+
+.PHONY: demo test lint format bench clean
+
+$(INSTALLED): pyproject.toml workflow/envs/constraints.txt
+	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
+	@echo "Creating .venv with $(PYTHON) (about two minutes)"
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c workflow/envs/constraints.txt -e ".[dev]"
+	@touch $@
+
+demo: $(INSTALLED)
+	$(SNAKEMAKE) --cores $(CORES) --quiet rules
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/snakefmt --check Snakefile workflow/rules
+	$(BIN)/snakemake --lint
+
+format: $(INSTALLED)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/snakefmt Snakefile workflow/rules
+
+bench: $(INSTALLED)
+	$(BIN)/python -m tests.benchmarks.bench_frame
+
+clean:
+	rm -rf .venv .snakemake

@@ -1,0 +1,169 @@
+"""Time and memory of one simulated frame: `python -m tests.benchmarks.bench_frame [--device cuda:0] [--repeats 15]`.
+
+One CPU thread, float32, points drawn in a box with springs from `uniform_topology`. Columns: min and median over repeats, and
+the median per spring and substep. `captured` is what FrameSolver runs (a recorded graph); `launched` issues every kernel again
+from Python. Finishes within two minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.artifacts import Material, Simulation, Twin
+from neuspring.physics import reference, stability
+from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
+from neuspring.physics.solver import FrameSolver
+from neuspring.topology import uniform_topology
+
+HANDS = 8
+FRAME_TIME = 1 / 30
+CASES = {"a": (400, 67, 22), "b": (2000, 667, 31)}
+"""Nodes, substeps, neighbours asked for (self included). Radius below: never the limit."""
+
+
+def box(nodes: int, substeps: int, neighbours: int, *, self_collision: bool = False) -> tuple[Twin, np.ndarray]:
+    """A box of random points just above the ground, held by hands at its top, and the hands of one frame [2, C, 3]."""
+    rng = np.random.default_rng(0)
+    edge = 0.01 * nodes ** (1 / 3)
+    points = rng.uniform(0, edge, (nodes, 3)) + np.array([0, 0, 0.001])
+    hands = rng.uniform(0, edge, (HANDS, 3)) * [1, 1, 0] + [0, 0, edge + 0.005]
+    topology = uniform_topology(points, hands, 10 * edge, neighbours, 10 * edge, 20)
+    count = len(topology.springs)
+    scalars = dict.fromkeys(("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction"), 0.5)
+    simulation = Simulation(frame_time=FRAME_TIME, substeps=substeps, self_collision=self_collision)
+    # As stiff as the substep allows with a margin: lambda <= twice the largest row sum of Y / l0.
+    unit = Material(stiffness=topology.rest_lengths, dashpot=np.zeros(count), drag=3.0, contact_distance=0.005, **scalars)
+    spectrum = stability.twin_spectrum(Twin(topology=topology, material=unit, simulation=simulation))
+    stiffness = topology.rest_lengths * min(3e6, 1.0 / (spectrum.stiffness * simulation.substep**2))
+    material = Material(stiffness=stiffness, dashpot=np.full(count, 0.5), drag=3.0, contact_distance=0.005, **scalars)
+    twin = Twin(topology=topology, material=material, simulation=simulation)
+    stability.check(twin)
+    return twin, np.stack([hands, hands + np.array([0, 0, 0.005])])
+
+
+def solver_for(twin: Twin, device: str, *, differentiable: bool) -> FrameSolver:
+    t = twin.topology
+    solver = FrameSolver(t.springs, len(t.nodes), len(t.controllers), twin.simulation, device=device, differentiable=differentiable)
+    solver.set_parameters(pack(**twin_tensors(twin, device), substep=twin.simulation.substep))
+    return solver
+
+
+def timed(action: Callable[[], object], repeats: int, device: str) -> tuple[float, float]:
+    """(min, median) seconds, after one untimed call."""
+    seconds = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        action()
+        if device != "cpu":
+            wp.synchronize_device(device)
+        seconds.append(time.perf_counter() - start)
+    return min(seconds[1:]), statistics.median(seconds[1:])
+
+
+def bench(name: str, device: str, repeats: int) -> dict[str, float]:
+    """Print the rows of a case; return medians by row."""
+    twin, motion = box(*CASES[name])
+    springs, substeps = len(twin.topology.springs), twin.simulation.substeps
+    print(f"\n({name}) {len(twin.topology.nodes)} nodes, {springs} springs, {substeps} substeps per frame")
+    x = torch.tensor(twin.topology.nodes, device=device)
+    v, (begin, end) = torch.zeros_like(x), torch.tensor(motion, dtype=torch.float32, device=device)
+    free, kept = solver_for(twin, device, differentiable=False), solver_for(twin, device, differentiable=True)
+    packed = pack(**twin_tensors(twin, device), substep=twin.simulation.substep)
+    packed.springs.requires_grad_()
+
+    def learn() -> None:
+        after, _ = simulate_frame(kept, packed, x, v, begin, end)
+        after.square().sum().backward()
+
+    def relaunched() -> None:
+        kept._record_forward()
+        for adjoint in (b for name, b in kept._buffers.items() if name.startswith("adj_")):
+            adjoint.zero_()
+        kept._buffers["adj_x"][: len(x)].copy_(x)
+        kept._record_backward()
+
+    start = time.perf_counter()
+    free.forward(x, v, begin, end)
+    print(f"    first forward (compile, record, run): {time.perf_counter() - start:.2f} s")
+    start = time.perf_counter()
+    learn()
+    print(f"    first forward + backward:             {time.perf_counter() - start:.2f} s")
+    rows = {
+        "forward only, captured": lambda: free.forward(x, v, begin, end),
+        "forward only, launched": free._record_forward,
+        "forward + backward, captured": learn,
+        "forward + backward, launched": relaunched,
+    }
+    if name == "a" and device == "cpu":
+        scene, state = reference.Scene.of(twin), (twin.topology.nodes.astype(np.float64), np.zeros((len(x), 3)))
+        rows["float64 NumPy reference"] = lambda: reference.frame(scene, *state, *motion)
+    print(f"    {'':30}{'min ms':>10}{'median ms':>11}{'ns/spring/substep':>19}")
+    medians = {}
+    for row, action in rows.items():
+        shortest, medians[row] = timed(action, repeats, device)
+        each = medians[row] / springs / substeps * 1e9
+        print(f"    {row:30}{shortest * 1e3:10.2f}{medians[row] * 1e3:11.2f}{each:19.1f}")
+    captured, direct = medians["forward only, captured"], medians["forward only, launched"]
+    print(f"    captured graph: forward {direct / captured:.2f} x", end="")
+    print(f", forward + backward {medians['forward + backward, launched'] / medians['forward + backward, captured']:.2f} x as fast")
+    if "float64 NumPy reference" in medians:
+        print(f"    forward is {medians['float64 NumPy reference'] / captured:.1f} x as fast as the NumPy reference")
+    return medians
+
+
+def peak_mib() -> float:
+    """Largest resident memory since `reset_peak` (Linux)."""
+    status = Path("/proc/self/status").read_text()
+    return float(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def reset_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def memory(device: str) -> None:
+    """Growth of the peak resident memory by the horizon of the gradient, on case (a)."""
+    twin, motion = box(*CASES["a"])
+    solver = solver_for(twin, device, differentiable=True)
+    hands = torch.tensor(motion, dtype=torch.float32, device=device)
+    packed = pack(**twin_tensors(twin, device), substep=twin.simulation.substep)
+    packed.springs.requires_grad_()
+    start = torch.tensor(twin.topology.nodes, device=device)
+    state_kib = 2 * start.numel() * start.element_size() / 1024
+    print(f"\nPeak resident memory by horizon, case (a); states kept per further frame: {state_kib:.1f} KiB")
+    before = None
+    for horizon in (1, 10, 50):
+        reset_peak()
+        x, v, total = start, torch.zeros_like(start), start.new_zeros(())
+        for k in range(horizon):
+            x, v = simulate_frame(solver, packed, x, v, hands[k % 2], hands[(k + 1) % 2])
+            total = total + x.square().sum()
+        total.backward()
+        packed.springs.grad = None
+        peak = peak_mib()
+        before = peak if before is None else before
+        print(f"    {horizon:3d} frames: {peak:8.1f} MiB, {peak - before:+.2f} MiB since 1 frame")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--repeats", type=int, default=15)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"device {options.device}, torch {torch.__version__}, warp {wp.__version__}, float32, one CPU thread")
+    bench("a", options.device, options.repeats)
+    memory(options.device)
+    bench("b", options.device, max(3, options.repeats // 3))
+
+
+if __name__ == "__main__":
+    main()

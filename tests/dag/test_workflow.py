@@ -1,0 +1,205 @@
+"""The real workflow on tiny configurations: it runs, it explains bad input, it survives being killed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from neuspring import config, tracking
+from neuspring.artifacts import Twin
+
+ROOT = Path(__file__).parents[2]
+TINY = {
+    "scenarios": ["toy_rope_lift_smooth"],
+    "methods": ["search_only", "phystwin"],
+    "seeds": [0],
+    "search": {"rollouts": 11},
+    "fit": {"epochs": 3, "checkpoint_every": 1},
+    "toy": {"frames": 8},
+    "device": "cpu",
+}
+SCENE = TINY["scenarios"][0]
+
+
+@pytest.fixture()
+def place(tmp_path):
+    """A working copy of the workflow's own files, so that locks and metadata of tests do not meet."""
+    return copy_workflow(tmp_path / "project")
+
+
+def copy_workflow(project: Path) -> Path:
+    project.mkdir()
+    for name in ("Snakefile", "workflow", "config"):
+        source = ROOT / name
+        shutil.copytree(source, project / name) if source.is_dir() else shutil.copy(source, project / name)
+    return project
+
+
+def arguments(project: Path, changes=None, *extra: str) -> list[str]:
+    overlay = project / "overlay.yaml"
+    overlay.write_text(yaml.safe_dump(config_with(changes or {})))
+    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2"]
+    return [*command, "--configfile", "config/config.yaml", str(overlay), *extra]
+
+
+def config_with(changes: dict) -> dict:
+    values = json.loads(json.dumps(TINY))
+    config.merge(values, changes)
+    return values
+
+
+def run(project: Path, changes=None, *extra: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        arguments(project, changes, *extra), cwd=project, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One finished run of two methods."""
+    project = copy_workflow(tmp_path_factory.mktemp("dag") / "project")
+    result = run(project)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return project, result
+
+
+def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(finished):
+    project, result = finished
+    results = project / "results"
+    assert "| phystwin " in result.stdout + result.stderr
+    assert "neuspring ui --results results" in result.stdout + result.stderr
+    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    assert len(scores) == 8
+    assert np.isfinite(scores["value"]).all()
+    assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
+    # Everything is there already: sync finds two complete runs and sends nothing.
+    assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"already logged": 2}
+
+
+def test_the_search_is_shared_and_nothing_reruns_without_a_change(finished):
+    project, result = finished
+    assert (result.stdout + result.stderr).count("localrule search:") == 1
+    again = run(project, None, "--dry-run")
+    assert "Nothing to be done" in again.stdout + again.stderr
+
+
+def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(finished):
+    project, _ = finished
+    planned = jobs(run(project, {"fit": {"epochs": 4}}, "--dry-run"))
+    assert planned == {"fit": 1, "rollout": 1, "score": 1, "log_run": 1, "tables": 1, "all": 1}
+    planned = jobs(run(project, {"tracking": {"experiment": "other"}}, "--dry-run"))
+    assert planned == {"track_init": 1, "log_run": 2, "all": 1}
+    planned = jobs(run(project, {"seeds": [0, 1]}, "--dry-run"))
+    assert planned == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "all": 1}
+
+
+def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
+    lines = (result.stdout + result.stderr).split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
+    return {name: int(count) for name, count in (line.split() for line in lines) if name != "total"}
+
+
+def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, place):
+    project, _ = finished
+    changes = {"methods": ["phystwin"], "fit": {"epochs": 60}, "tracking": {"enabled": False}}
+    whole = run(project, changes)
+    assert whole.returncode == 0, whole.stdout + whole.stderr
+
+    process = subprocess.Popen(
+        arguments(place, changes),
+        cwd=place,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    folder = place / "results" / SCENE / "phystwin" / "0"
+    deadline = time.monotonic() + 120
+    while not (folder / "fit.partial.npz").exists():
+        assert process.poll() is None, "the run ended before its first checkpoint"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (folder / "fit.json").exists()
+
+    run(place, changes, "--unlock")
+    continued = run(place, changes)
+    assert continued.returncode == 0, continued.stdout + continued.stderr
+    assert "continuing the fit after epoch" in continued.stdout + continued.stderr
+    assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
+    expected = Twin.load(project / "results" / SCENE / "phystwin" / "0" / "twin.npz")
+    np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)
+
+
+def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):
+    # Three substeps cannot integrate any candidate of the rope, so its search fails; the softer cloth's does too.
+    changes = {"simulation": {"substeps": 3}, "methods": ["search_only"], "tracking": {"enabled": False}}
+    result = run(place, changes)
+    text = result.stdout + result.stderr
+    assert result.returncode == 0, text
+    assert "0/1 (1 failed)" in text
+    assert "none of 11 candidates could be simulated" in text
+
+
+def test_an_infrastructure_failure_is_retried_and_does_not_stop_the_others(place):
+    changes = {"scenarios": [SCENE, "DLO1_train_48"], "methods": ["search_only"], "tracking": {"enabled": False}}
+    changes |= {"data_root": str(place / "data")}
+    broken = place / "data" / "DLO1" / "train" / "48.pkl"
+    broken.parent.mkdir(parents=True)
+    broken.write_bytes(b"\x80\x04 truncated")
+    result = run(place, changes)
+    text = result.stdout + result.stderr
+    assert result.returncode == 1
+    assert f"neuspring: error: {broken}" in text
+    assert "Trying to restart job" in text
+    # The healthy scenario is finished and in the table; the broken one is listed as missing.
+    assert (place / "results" / SCENE / "search_only" / "0" / "run.json").exists()
+    assert "DLO1_train_48 / search_only / seed 0: missing" in text
+    assert "1/2" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fitt": {"epochs": 3}}, "fitt: unknown key"),
+        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
+        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
+        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
+        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
+        ({"scenarios": ["a;touch hacked"]}, "scenarios.0: string should match pattern"),
+        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
+        ({"results": "/proc/nowhere"}, "this folder must be writable"),
+        ({"seeds": []}, "seeds: at least one entry is required"),
+    ],
+)
+def test_bad_configuration_is_explained_before_any_job(place, changes, message):
+    result = run(place, changes, "--dry-run")
+    text = result.stdout + result.stderr
+    assert result.returncode != 0
+    assert message in text
+    assert "Traceback" not in text
+    assert not list(place.rglob("hacked"))
+
+
+def test_the_pinned_conda_environment_has_the_versions_of_the_constraints():
+    pins = dict(line.strip().split("==") for line in (ROOT / "workflow/envs/constraints.txt").open() if "==" in line)
+    listed = yaml.safe_load((ROOT / "workflow/envs/neuspring.yaml").read_text())["dependencies"][-1]["pip"]
+    assert {name: pins[name] for name, _ in (item.split("==") for item in listed)} == dict(item.split("==") for item in listed)
+
+
+def test_the_benchmark_of_22_scenarios_is_known_to_the_table():
+    rows = config.read_scenarios(ROOT / "config" / "scenarios.tsv")
+    released = [row for row in rows.values() if row.source == "phystwin"]
+    assert len(released) == 22
+    assert {row.category for row in released} == {"cloth", "rope", "package", "zebra", "sloth", "dinosaur"}
+    assert sum(row.self_collision for row in released) == 9

@@ -1,0 +1,280 @@
+"""The configuration is strict: what is wrong is named with its path, nothing is cast, nothing is ignored."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neuspring import artifacts, config
+from neuspring.config import Benchmark, Config, Method, parse, plain
+from neuspring.errors import InputError
+
+MINIMAL = "scenarios: [rope]\nmethods: [ours]\n"
+
+
+def load(text: str) -> Config:
+    return parse(Config, yaml.safe_load(MINIMAL + text), "config.yaml")
+
+
+def refused(text: str) -> str:
+    with pytest.raises(InputError) as caught:
+        load(text)
+    message = str(caught.value)
+    assert message.startswith("config.yaml: ")
+    return message
+
+
+# Defaults -------------------------------------------------------------------------------------------------------------
+
+
+def test_defaults_are_valid() -> None:
+    made = load("")
+    assert (made.scenarios, made.methods, made.seeds) == (("rope",), ("ours",), (0,))
+    assert made.simulation.substeps == "auto"
+    assert not any(dataclasses.asdict(made.released_quirks).values())
+
+
+def test_plain_settings_are_read_back() -> None:
+    """The whole default configuration, through plain values and YAML text, is itself."""
+    made = load("")
+    assert parse(Config, yaml.safe_load(yaml.safe_dump(plain(made))), "again") == made
+
+
+def test_values_reach_their_place() -> None:
+    made = load("simulation: {substeps: 40, gravity: 9}\nfit: {learning_rate: 1.0e-2, horizon: 0}\nseeds: [3, 1]\n")
+    assert made.simulation.substeps == 40
+    assert made.simulation.gravity == 9.0
+    assert (made.fit.learning_rate, made.fit.horizon, made.seeds) == (0.01, 0, (3, 1))
+
+
+# Mistakes -------------------------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "unknown key": ("fit: {learning_rat: 0.1}", "fit.learning_rat: unknown key"),
+    "unknown top key": ("sede: 1", "sede: unknown key"),
+    "number as text": (
+        "fit: {learning_rate: 5e-5}",
+        "fit.learning_rate",
+        "'5e-5' (YAML reads a number such as 5e-5 as text: write 5.0e-5)",
+    ),
+    "integer as text": ("fit: {epochs: '3'}", "fit.epochs", "received '3'"),
+    "float for a count": ("fit: {epochs: 2.5}", "fit.epochs", "received 2.5"),
+    "whole float for a count": ("fit: {epochs: 2.0}", "fit.epochs", "received 2.0"),
+    "truth for a count": ("fit: {epochs: true}", "fit.epochs", "received True"),
+    "number for a truth": ("tracking: {enabled: 1}", "tracking.enabled", "received 1"),
+    "nothing for a number": ("fit: {learning_rate: }", "fit.learning_rate", "received None"),
+    "zero rate": ("fit: {learning_rate: 0}", "fit.learning_rate", "greater than 0"),
+    "infinite rate": ("fit: {learning_rate: .inf}", "fit.learning_rate", "finite"),
+    "nan weight": ("losses: {track: .nan}", "losses.track", "finite"),
+    "negative weight": ("losses: {track: -1}", "losses.track", "greater than or equal to 0"),
+    "negative horizon": ("fit: {horizon: -1}", "fit.horizon", "received -1"),
+    "nan gravity": ("simulation: {gravity: .nan}", "simulation.gravity", "finite"),
+    "safety": ("simulation: {safety: 1.5}", "simulation.safety", "less than or equal to 1"),
+    "substeps word": ("simulation: {substeps: many}", "simulation.substeps", "'auto'"),
+    "no substeps": ("simulation: {substeps: 0}", "simulation.substeps", "received 0"),
+    "occlusion": ("toy: {occlusion: 1}", "toy.occlusion", "less than 1"),
+    "reversed range": (
+        "search: {ranges: {drag: [5, 1]}}",
+        "search.ranges",
+        "drag: 0 <= low < high is required, received [5.0, 1.0]",
+    ),
+    "negative range": ("search: {ranges: {drag: [-5, 1]}}", "drag: 0 <= low < high is required"),
+    "infinite range": ("search: {ranges: {drag: [0, .inf]}}", "search.ranges.drag", "finite"),
+    "range of one": ("search: {ranges: {drag: [5]}}", "search.ranges.drag"),
+    "start outside": ("search: {start: {drag: 50}}", "start.drag = 50.0 lies outside ranges.drag = [0.0, 20.0]"),
+    "clamp reversed": ("fit: {stiffness_range: [5, 1]}", "stiffness_range", "received [5.0, 1.0]"),
+    "betas": ("fit: {betas: [0.9, 1.5]}", "fit.betas", "less than 1"),
+    "device": ("device: gpu", "device", "received 'gpu'"),
+    "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
+    "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
+    "a mapping for a list": ("seeds: {a: 1}", "seeds"),
+    "a date": ("results: 2026-01-01", "values must be plain YAML"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(name: str) -> None:
+    text, *parts = MISTAKES[name]
+    message = refused(text)
+    for part in parts:
+        assert part in message
+
+
+def test_all_problems_are_listed_at_once() -> None:
+    message = refused("fit: {epochs: x, horizon: -1}\ntoy: {frames: 2}\n")
+    for path in ("fit.epochs", "fit.horizon", "toy.frames"):
+        assert path in message
+    assert "See config/README.md" in message
+
+
+@pytest.mark.parametrize("name", ["../up", "a b", "", "a/b", ".hidden", "-x", "a;rm", "é", "a\n", "x" * 81, "$HOME", "a*"])
+def test_unsafe_names(name: str) -> None:
+    """Names become folders and command-line words."""
+    for key in ("scenarios", "methods"):
+        with pytest.raises(InputError, match=f"{key}.0"):
+            parse(Config, yaml.safe_load(MINIMAL) | {key: [name]}, "config.yaml")
+    assert not artifacts.SAFE_NAME.fullmatch(name)
+
+
+@given(st.text(max_size=90))
+def test_configuration_and_artifacts_agree_on_names(name: str) -> None:
+    try:
+        parse(Config, {"scenarios": [name], "methods": ["ours"]}, "config.yaml")
+        accepted = True
+    except InputError:
+        accepted = False
+    assert accepted == bool(artifacts.SAFE_NAME.fullmatch(name))
+
+
+# Methods --------------------------------------------------------------------------------------------------------------
+
+METHODS = """
+full: {search: uniform, fit: springs, description: both stages}
+coarse: {search: uniform, fit: null, description: search only}
+long:
+  search: uniform
+  fit: springs
+  description: through all frames
+  settings: {horizon: 0, epochs: 7}
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_methods(tmp_path: Path) -> None:
+    found = config.read_methods(write(tmp_path / "methods.yaml", METHODS))
+    assert list(found) == ["full", "coarse", "long"]
+    assert (found["full"].fit, found["coarse"].fit) == ("springs", None)
+    made = load("fit: {epochs: 3, learning_rate: 0.5}")
+    merged = config.fit_of(made, found["long"], "long")
+    assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
+    assert config.fit_of(made, found["full"], "full") == made.fit
+    assert made.fit.epochs == 3
+
+
+BAD_METHODS = {
+    "search": ("a: {search: random, fit: null, description: x}", "method a.*search.*'uniform', received 'random'"),
+    "missing": ("a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
+    "unknown": ("a: {search: uniform, fit: null, description: x, lr: 1}", "method a.*lr: unknown key"),
+    "not a mapping": ("a: 3", "method a"),
+    "empty": ("", "must hold a YAML mapping; received NoneType"),
+    "list": ("[a]", "must hold a YAML mapping; received list"),
+    "not YAML": ("a: [", "must be YAML"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_METHODS)
+def test_bad_method_tables(name: str, tmp_path: Path) -> None:
+    text, message = BAD_METHODS[name]
+    path = write(tmp_path / "methods.yaml", text)
+    with pytest.raises(InputError, match="(?s)" + message) as caught:
+        config.read_methods(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("settings", [{"horizont": 0}, {"epochs": "7"}, {"fit": {}}])
+def test_bad_method_settings(settings: dict[str, Any]) -> None:
+    method = Method(search="uniform", fit=None, description="x", settings=settings)
+    with pytest.raises(InputError, match="method long, settings: "):
+        config.fit_of(load(""), method, "long")
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    """Missing, a folder, and not UTF-8."""
+    latin = tmp_path / "latin"
+    latin.write_bytes("# Größe\n".encode("latin-1"))
+    for read in (config.read_methods, config.read_scenarios):
+        for path in (tmp_path / "missing", tmp_path, latin):
+            with pytest.raises(InputError, match="must be readable") as caught:
+                read(path)
+            assert str(path) in str(caught.value)
+
+
+# Scenarios ------------------------------------------------------------------------------------------------------------
+
+HEADER = "scenario\tsource\tcategory\tpath\tself_collision\tground\n"
+ROW = "rope\ttoy\ttoy\trope\tfalse\ttrue\n"
+
+
+def test_scenarios(tmp_path: Path) -> None:
+    path = write(tmp_path / "scenarios.tsv", f"# a comment\n{HEADER}\n{ROW}# more\ncloth\tphystwin\tcloth\ta/b c\ttrue\tfalse\n")
+    rows = config.read_scenarios(path)
+    assert list(rows) == ["rope", "cloth"]
+    assert (rows["rope"].ground, rows["rope"].self_collision, rows["cloth"].self_collision) == (True, False, True)
+    assert rows["cloth"].path == "a/b c"
+
+
+BAD_TABLES = {
+    "empty": ("", "the header must be"),
+    "header": ("name\tsource\n", r"the header must be the tab-separated columns \['scenario', 'source'"),
+    "spaces": (HEADER.replace("\t", " "), "the header must be"),
+    "cells": (HEADER + "rope\ttoy\n", "row 'rope': 6 tab-separated cells are required; received 2"),
+    "flag": (HEADER + ROW.replace("false", "no"), "row 'rope', self_collision: must be true or false; received no"),
+    "source": (HEADER + ROW.replace("\ttoy\ttoy", "\tweb\ttoy"), "(?s)row 'rope'.*source.*received 'web'"),
+    "name": (HEADER + "../" + ROW, r"(?s)row '\.\./rope'.*scenario"),
+    "twice": (HEADER + ROW + ROW, "row 'rope': scenario names must differ"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
+    text, message = BAD_TABLES[name]
+    path = write(tmp_path / "scenarios.tsv", text)
+    with pytest.raises(InputError, match=message) as caught:
+        config.read_scenarios(path)
+    assert str(path) in str(caught.value)
+
+
+# A benchmark: the configuration with its tables -----------------------------------------------------------------------
+
+
+def benchmark(root: Path, **values: Any) -> Benchmark:
+    write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n")
+    write(root / "methods.yaml", METHODS)
+    tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml"}
+    return Benchmark.of({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
+
+
+def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
+    made = benchmark(tmp_path, methods=["long", "full"])
+    assert (list(made.scenarios), list(made.methods)) == (["rope"], ["long", "full"])
+    assert made.data_path("rope") is None
+    (tmp_path / "cable.csv").touch()
+    found = benchmark(tmp_path, scenarios=["cable"], data_root=str(tmp_path))
+    assert found.data_path("cable") == tmp_path / "cable.csv"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"scenarios": []}, "configuration, scenarios: at least one entry is required"),
+        ({"methods": []}, "configuration, methods: at least one entry is required"),
+        ({"seeds": []}, "configuration, seeds: at least one entry is required"),
+        ({"methods": ["ful"]}, r"every entry must be a row of methods\.yaml; received 'ful' \(did you mean 'full'\?\)"),
+        ({"scenarios": ["nothing"]}, r"every entry must be a row of scenarios\.tsv; received 'nothing'.*Known: rope, cable"),
+        ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
+        ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
+        ({"method_table": "missing.yaml"}, "must be readable"),
+        ({"device": "gpu"}, "device"),
+    ],
+)
+def test_a_benchmark_is_checked_before_any_job(values: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        benchmark(tmp_path, **values)
+
+
+@pytest.mark.parametrize("settings", ["{horizont: 0}", "{betas: [2, 2]}"])
+def test_settings_of_chosen_methods_are_checked_too(settings: str, tmp_path: Path) -> None:
+    text = f"full: {{search: uniform, fit: springs, description: x, settings: {settings}}}\n"
+    write(tmp_path / "bad.yaml", text)
+    with pytest.raises(InputError, match="method full, settings"):
+        benchmark(tmp_path, method_table="bad.yaml")

@@ -1,0 +1,103 @@
+"""Rerun digests follow code, not text; and imports point one way."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from neuspring import provenance
+
+PACKAGE = Path(provenance.__file__).parent
+
+
+@pytest.fixture()
+def copy(tmp_path, monkeypatch):
+    """A copy of the package that digests read from."""
+    target = tmp_path / "neuspring"
+    shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(provenance, "ROOT", target)
+    clear()
+    yield target
+    clear()
+
+
+def clear():
+    for function in (provenance._source, provenance._tree, provenance.imported_modules, provenance.code_digest):
+        function.cache_clear()
+
+
+def digest(module: str) -> str:
+    clear()
+    return provenance.code_digest(module)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert text.count(old) >= 1
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_docstrings_comments_and_layout_do_not_count(copy):
+    before = digest("neuspring.fit")
+    edit(copy / "fit.py", "Runs epochs.", "Runs its epochs.")
+    edit(copy / "fit.py", "class NonFinite", "# A comment.\n\nclass NonFinite")
+    assert digest("neuspring.fit") == before
+
+
+def test_code_counts_where_it_is_used_and_nowhere_else(copy):
+    before = {name: digest(f"neuspring.{name}") for name in ("search", "fit", "metrics", "tables")}
+    edit(copy / "fit.py", "MAX_ROLLBACKS = 5", "MAX_ROLLBACKS = 6")
+    assert digest("neuspring.fit") != before["fit"]
+    assert {name: digest(f"neuspring.{name}") for name in ("search", "metrics", "tables")} == {
+        name: before[name] for name in ("search", "metrics", "tables")
+    }
+
+
+def test_transitive_imports_count(copy):
+    before = digest("neuspring.search")
+    edit(copy / "physics" / "springs.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
+    assert digest("neuspring.search") != before
+    assert "neuspring.physics.springs" in provenance.used_modules("neuspring.fit")
+
+
+def test_declarations_and_reporting_do_not_count(copy):
+    before = digest("neuspring.search")
+    edit(copy / "config.py", "max_substeps: Count = 2000", "max_substeps: Count = 2001")
+    edit(copy / "progress.py", "0.2 if", "0.3 if")
+    assert digest("neuspring.search") == before
+
+
+LEVELS = [
+    {"errors"},
+    {"artifacts", "config", "progress"},
+    {"records", "topology", "physics", "losses", "metrics", "provenance"},
+    {"rollout", "data", "figures", "tables", "tracking"},
+    {"search", "fit"},
+    {"stages"},
+    {"cli"},
+    {"__main__"},
+]
+
+
+def test_imports_point_one_way():
+    level = {name: index for index, names in enumerate(LEVELS) for name in names}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        if parts == ("__init__",):
+            continue
+        module = ".".join(["neuspring", *(part for part in parts if part != "__init__")])
+        for other in provenance.imported_modules(module):
+            target = other.split(".")[1]
+            assert target == parts[0] or level[target] < level[parts[0]], f"{module} imports {other}"
+
+
+def test_only_tracking_imports_mlflow():
+    users = [path.name for path in PACKAGE.rglob("*.py") if "import mlflow" in path.read_text() or "from mlflow" in path.read_text()]
+    assert users == ["tracking.py"]
+
+
+def test_import_is_light():
+    code = "import sys, neuspring; print([m for m in ('torch', 'warp', 'mlflow', 'numpy', 'pandas') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"

@@ -1,0 +1,134 @@
+"""Stages by hand: records name their files, failures pass through, the run record is complete."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from neuspring import config, metrics, stages, tables, tracking
+from neuspring.artifacts import Observations, Trajectory, Twin
+from neuspring.errors import InputError, NumericalFailure
+from neuspring.records import StageRecord
+from tests import small
+
+SETTINGS = config.Config(
+    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    fit=config.Fit(epochs=2),
+    toy=config.Toy(frames=8),
+    device="cpu",
+)
+
+
+def run_all(folder, name="small", *, fit=True):
+    """Observe, search, fit, roll out and score one toy scene; returns the path of run.json."""
+    seen, found = folder / name / "observations.npz", folder / name / "search-uniform" / "0" / "search.json"
+    out = folder / name / ("phystwin" if fit else "search_only") / "0"
+    if not seen.exists():
+        stages.observe(small.row(name=name), SETTINGS, seen)
+        stages.search(seen, SETTINGS, 0, "cpu", found)
+    records = {"search": found}
+    if fit:
+        stages.fit(seen, found, SETTINGS, "cpu", out / "fit.json")
+        records["fit"] = out / "fit.json"
+    stages.rollout(seen, list(records.values())[-1], "cpu", out / "rollout.json")
+    stages.score(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
+    return out / "run.json"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Results of one scene, with and without the second stage."""
+    folder = tmp_path_factory.mktemp("results")
+    return folder, run_all(folder), run_all(folder, fit=False)
+
+
+def test_every_step_leaves_what_its_record_names(finished):
+    folder, run, _ = finished
+    record = StageRecord.load(run.with_name("fit.json"))
+    assert record.status == "ok"
+    twin = Twin.load(record.file("twin", run.with_name("fit.json")))
+    observations = Observations.load(folder / "small" / "observations.npz")
+    assert len(twin.topology.nodes) == len(observations.nodes)
+    assert Twin.load(folder / "small" / "truth.npz").topology.nodes.shape == twin.topology.nodes.shape
+    assert not list(folder.rglob("*partial*"))
+    assert not list(folder.rglob("*.part"))
+    plots = sorted(path.name for path in run.parent.glob("plots/*.png"))
+    assert plots == ["errors.png", "losses.png", "motion.png"]
+
+
+def test_scores_are_the_metrics_of_the_trajectory(finished):
+    folder, run, _ = finished
+    observations = Observations.load(folder / "small" / "observations.npz")
+    trajectory = Trajectory.load(run.with_name("trajectory.npz"))
+    expected = metrics.score(trajectory, observations, "phystwin", 0)
+    pd.testing.assert_frame_equal(pd.read_parquet(run.with_name("scores.parquet")), expected)
+    assert len(expected) == 4
+
+
+def test_the_tracking_module_accepts_the_run_record(finished):
+    _, run, _ = finished
+    record = tracking.RunRecord.load(run)
+    assert record.status == "ok"
+    assert set(record.timings) == {"search", "fit", "rollout", "score"}
+    assert record.params["search.result.springs"] > 0
+    assert set(record.histories) == {"search", "fit"}
+
+
+def test_a_method_without_second_stage_shares_the_search(finished):
+    _, run, coarse = finished
+    first, second = (json.loads(path.read_text()) for path in (run, coarse))
+    assert first["histories"]["search"] == second["histories"]["search"] == "../../search-uniform/0/history.parquet"
+    assert second["artifacts"]["twin"] == ["../../search-uniform/0/twin.npz"]
+    assert first["run_key"] != second["run_key"]
+
+
+def test_the_same_results_have_the_same_key(finished, tmp_path):
+    _, run, _ = finished
+    again = run_all(tmp_path)
+    first, second = (json.loads(path.read_text()) for path in (run, again))
+    assert first["run_key"] == second["run_key"]
+
+
+def test_a_missing_or_changed_artefact_is_an_error_that_says_what_to_do(finished, tmp_path):
+    twin = tmp_path / "twin.npz"
+    _, run, _ = finished
+    record = tmp_path / "fit.json"
+    record.write_bytes(run.with_name("fit.json").read_bytes())
+    with pytest.raises(InputError, match=r"twin.npz: named by .*no such file.*Delete .*fit.json and run again"):
+        StageRecord.load(record).file("twin", record)
+    twin.write_bytes(b"other")
+    with pytest.raises(InputError, match="other content"):
+        StageRecord.load(record).file("twin", record)
+
+
+def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypatch):
+    def fails(*_arguments, **_options):
+        raise NumericalFailure("every candidate diverged")
+
+    monkeypatch.setattr("neuspring.search.search", fails)
+    run_all(tmp_path, "bad")
+    monkeypatch.undo()
+    run_all(tmp_path, "good")
+    collected = tables.collect(tmp_path, ["bad", "good"], ["phystwin"], [0])
+    by_name = collected.runs.set_index("scenario")
+    assert by_name.loc["bad", "status"] == "failed"
+    assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
+    text = tables.summary_text(collected, "phystwin")
+    assert "1/2 (1 failed)" in text
+    assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
+    assert "nan" not in text.lower()
+    assert tracking.RunRecord.load(tmp_path / "bad" / "phystwin" / "0" / "run.json").status == "failed"
+
+
+def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
+    folder, _, _ = finished
+    monkeypatch.setattr("neuspring.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
+    found = folder / "small" / "search-uniform" / "0" / "search.json"
+    stages.rollout(folder / "small" / "observations.npz", found, "cpu", tmp_path / "rollout.json")
+    record = StageRecord.load(tmp_path / "rollout.json")
+    assert record.status == "failed"
+    assert "left the scene in frame" in record.reason
+    records = {"search": found, "rollout": tmp_path / "rollout.json"}
+    stages.score(folder / "small" / "observations.npz", records, "search_only", {}, 0, tmp_path / "run.json")
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
+    assert len(pd.read_parquet(tmp_path / "scores.parquet")) < 4

@@ -1,0 +1,62 @@
+"""Tables compare like with like, and never hide a gap."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring import tables
+from neuspring.metrics import COLUMNS
+from neuspring.tables import Collected
+
+
+def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str, str, int], ...] = ()) -> Collected:
+    """Future track errors in metres by (scenario, method, seed); the other runs failed."""
+    rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
+    runs = [{"scenario": s, "method": m, "seed": seed, "status": "ok", "reason": ""} for s, m, seed in values]
+    runs += [{"scenario": s, "method": m, "seed": seed, "status": "failed", "reason": "diverged"} for s, m, seed in failed]
+    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs))
+
+
+def test_paired_differences_use_the_same_scenario_and_seed():
+    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.100, ("b", "y", 0): 0.098}
+    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    assert row["difference"] == pytest.approx(-0.002)
+    assert row["low"] == pytest.approx(-0.002)
+    assert row["high"] == pytest.approx(-0.002)
+    assert row["relative"] == pytest.approx(-0.002 / 0.055)
+
+
+def test_the_interval_covers_the_mean_of_noisy_differences():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(60):
+        deltas = rng.normal(0.001, 0.002, 20)
+        values = {(f"s{i}", m, 0): 0.05 + (d if m == "y" else 0.0) for i, d in enumerate(deltas) for m in ("x", "y")}
+        row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+        hits += row["low"] <= 0.001 <= row["high"]
+    # 95 % nominal; with 60 trials, below 50 has a probability under 1e-3 even at the bootstrap's usual 92 %.
+    assert hits >= 50
+
+
+def test_seeds_of_one_scenario_are_not_independent():
+    values = {("a", m, seed): 0.01 + (0.001 if m == "y" else 0) for m in ("x", "y") for seed in range(5)}
+    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    assert row["scenarios"] == 1
+    assert np.isnan(row["low"])
+
+
+def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
+    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
+    text = tables.summary_text(collected(values, failed=(("b", "y", 0),)), "x")
+    assert "10.00" in text
+    assert "500" not in text
+    assert "b / y / seed 0: failed: diverged" in text
+    assert "1/2 (1 failed)" in text
+
+
+def test_missing_runs_are_listed(tmp_path):
+    found = tables.collect(tmp_path, ["a"], ["x", "y"], [0, 1])
+    assert (found.runs["status"] == "missing").all()
+    text = tables.write(found, "x", tmp_path / "tables")
+    assert text.count("missing: no run.json") == 4
+    assert (tmp_path / "tables" / "summary.md").is_file()
