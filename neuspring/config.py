@@ -43,8 +43,11 @@ class Simulation:
     max_substeps: Count = 2000
     """`auto` never asks for more; a candidate that would need more is penalised by the search."""
     gravity: Finite = 9.8
+    """m/s^2, downwards."""
     collision_capacity: Count = 500
+    """Candidate partners per node and frame; overflow is reported."""
     controller_velocity: bool = False
+    """Controllers have their finite-difference velocity in the dashpots; the released simulator uses zero."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +56,9 @@ class Losses:
 
     __pydantic_config__ = STRICT
     chamfer: NonNegative = 1.0
+    """Squared single-directional Chamfer distance."""
     track: NonNegative = 1.0
+    """Smooth-L1 error of tracked points."""
     acceleration: NonNegative = 0.01
     """Used by the search only, as in the released method."""
 
@@ -64,17 +69,29 @@ class SearchRanges:
 
     __pydantic_config__ = STRICT
     stiffness: Range = (0.0, 1e5)
+    """Y, N."""
     object_radius: Range = (0.01, 0.05)
+    """Search radius between object nodes, m."""
     object_neighbours: Range = (10, 50)
+    """Most neighbours of an object node, itself included."""
     controller_radius: Range = (0.01, 0.08)
+    """Search radius of controllers, m."""
     controller_neighbours: Range = (10, 80)
+    """Most nodes held by a controller."""
     ground_elasticity: Range = (0.0, 1.0)
+    """Restitution on the ground."""
     ground_friction: Range = (0.0, 2.0)
+    """Friction on the ground."""
     contact_elasticity: Range = (0.0, 1.0)
+    """Restitution between nodes."""
     contact_friction: Range = (0.0, 2.0)
+    """Friction between nodes."""
     contact_distance: Range = (0.01, 0.05)
+    """Distance at which nodes collide, m."""
     drag: Range = (0.0, 20.0)
+    """Velocity decay, 1/s."""
     dashpot: Range = (0.0, 200.0)
+    """Damping along springs, N s/m."""
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):
@@ -89,17 +106,29 @@ class SearchStart:
 
     __pydantic_config__ = STRICT
     stiffness: float = 3e4
+    """Y, N."""
     object_radius: float = 0.02
+    """Search radius between object nodes, m."""
     object_neighbours: float = 30
+    """Most neighbours of an object node, itself included."""
     controller_radius: float = 0.04
+    """Search radius of controllers, m."""
     controller_neighbours: float = 50
+    """Most nodes held by a controller."""
     ground_elasticity: float = 0.5
+    """Restitution on the ground."""
     ground_friction: float = 0.3
+    """Friction on the ground."""
     contact_elasticity: float = 0.7
+    """Restitution between nodes."""
     contact_friction: float = 0.3
+    """Friction between nodes."""
     contact_distance: float = 0.02
+    """Distance at which nodes collide, m."""
     drag: float = 3.0
+    """Velocity decay, 1/s."""
     dashpot: float = 100.0
+    """Damping along springs, N s/m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +141,9 @@ class Search:
     sigma: Positive = 1 / 6
     """Initial step in normalised variables."""
     ranges: SearchRanges = field(default_factory=SearchRanges)
+    """Bounds, see [search.ranges](#searchranges)."""
     start: SearchStart = field(default_factory=SearchStart)
+    """Start, see [search.start](#searchstart)."""
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self.start):
@@ -128,8 +159,11 @@ class Fit:
 
     __pydantic_config__ = STRICT
     epochs: Count = 200
+    """Passes over the training frames."""
     learning_rate: Positive = 1e-3
+    """Of Adam, on log stiffness and contact scalars."""
     betas: tuple[Beta, Beta] = (0.9, 0.99)
+    """Of Adam."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimiser step, with the gradient through all of them; 0 means all training frames."""
     clip_gradient_norm: NonNegative = 0.0
@@ -169,12 +203,15 @@ class Toy:
 
     __pydantic_config__ = STRICT
     frames: Annotated[int, Field(ge=4)] = 60
+    """Frames per scene; the first 70 % are for training."""
     frame_rate: Positive = 30.0
+    """Frames per second."""
     noise: NonNegative = 0.0005
     """Standard deviation of the observation noise, m."""
     occlusion: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Fraction of point-frames hidden, in runs of several frames."""
     seed: Annotated[int, Field(ge=0)] = 0
+    """Of noise and occlusion; the scenario's name enters too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,6 +230,7 @@ class Mocap:
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
     train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    """Frames before this fraction are for training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,9 +239,11 @@ class Tracking:
 
     __pydantic_config__ = STRICT
     enabled: bool = True
+    """Log runs to MLflow."""
     uri: str | None = None
     """Tracking URI; null means SQLite at <results>/mlflow.db."""
     experiment: Name = "neuspring"
+    """Name of the MLflow experiment."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,22 +252,37 @@ class Config:
 
     __pydantic_config__ = STRICT
     scenarios: tuple[Name, ...] = ()
+    """Rows of the scenario table."""
     methods: tuple[Name, ...] = ()
+    """Rows of the method table; the first is what others are compared with."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
+    """Of the search; every method runs with the same ones."""
     results: str = "results"
+    """Folder that everything is written to."""
     data_root: str | None = None
     """Folder that relative scenario paths start from."""
     scenario_table: str = "config/scenarios.tsv"
+    """Relative to the Snakefile."""
     method_table: str = "config/methods.yaml"
+    """Relative to the Snakefile."""
     device: Annotated[str, StringConstraints(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
+    """auto (CUDA where it works), cpu, cuda or cuda:N."""
     simulation: Simulation = field(default_factory=Simulation)
+    """See [simulation](#simulation)."""
     losses: Losses = field(default_factory=Losses)
+    """See [losses](#losses)."""
     search: Search = field(default_factory=Search)
+    """See [search](#search)."""
     fit: Fit = field(default_factory=Fit)
+    """See [fit](#fit)."""
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
+    """See [released_quirks](#released_quirks)."""
     toy: Toy = field(default_factory=Toy)
+    """See [toy](#toy)."""
     mocap: Mocap = field(default_factory=Mocap)
+    """See [mocap](#mocap)."""
     tracking: Tracking = field(default_factory=Tracking)
+    """See [tracking](#tracking)."""
 
     def __post_init__(self) -> None:
         for name in ("scenarios", "methods", "seeds"):

@@ -12,7 +12,7 @@ from neuspring import provenance
 PACKAGE = Path(provenance.__file__).parent
 
 
-@pytest.fixture()
+@pytest.fixture
 def copy(tmp_path, monkeypatch):
     """A copy of the package that digests read from."""
     target = tmp_path / "neuspring"
@@ -94,7 +94,9 @@ def test_imports_point_one_way():
 
 
 def test_only_tracking_imports_mlflow():
-    users = [path.name for path in PACKAGE.rglob("*.py") if "import mlflow" in path.read_text() or "from mlflow" in path.read_text()]
+    users = [
+        path.name for path in PACKAGE.rglob("*.py") if "import mlflow" in path.read_text() or "from mlflow" in path.read_text()
+    ]
     assert users == ["tracking.py"]
 
 

@@ -7,9 +7,13 @@ start (see `autograd.py`). Without gradients two substep slots are enough.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
-from collections.abc import Callable
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +31,29 @@ def start_warp() -> None:
     """Initialise Warp once, quietly: kernels here carry their own adjoints."""
     wp.config.enable_backward = False
     wp.config.log_level = logging.ERROR
-    wp.init()
+    with _without_driver_warning():
+        wp.init()
+
+
+@contextlib.contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Drop Warp's native line about a missing CUDA driver where torch finds no GPU either; pass on everything else."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            caught.seek(0)
+            for line in caught.read().decode(errors="replace").splitlines(keepends=True):
+                if "NVIDIA CUDA driver" not in line:
+                    sys.stderr.write(line)
 
 
 def resolve_device(device: str) -> str:

@@ -30,7 +30,7 @@ TINY = {
 SCENE = TINY["scenarios"][0]
 
 
-@pytest.fixture()
+@pytest.fixture
 def place(tmp_path):
     """A working copy of the workflow's own files, so that locks and metadata of tests do not meet."""
     return copy_workflow(tmp_path / "project")
