@@ -138,7 +138,7 @@ class Artifact:
         """Read an artefact of this kind from `path`. Raises InputError if the file is missing, damaged or of another kind."""
         path = Path(path)
         if not path.is_file():
-            raise InputError(path, f"this file must hold a {cls.kind}", "no such file", "Run the step that makes it first.")
+            raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that makes it first.")
         try:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
@@ -149,12 +149,12 @@ class Artifact:
         except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise InputError(
                 path,
-                f"this file must be a readable {cls.kind}",
+                f"this file must be readable, of kind {cls.kind}",
                 f"{type(error).__name__}: {error}",
                 "Delete it and re-run its step.",
             ) from error
         if meta.get("kind") != cls.kind:
-            raise InputError(path, f"this file must hold a {cls.kind}", meta.get("kind"))
+            raise InputError(path, f"this file must be of kind {cls.kind}", meta.get("kind"))
         if meta.get("format") != FORMAT_VERSION:
             raise InputError(
                 path, f"this version reads format {FORMAT_VERSION}", meta.get("format"), "Re-run the step that made it."
@@ -163,7 +163,7 @@ class Artifact:
             return cls._build(arrays, meta["fields"], "")
         except (KeyError, TypeError) as error:
             raise InputError(
-                path, f"this file must hold every field of a {cls.kind}", f"{type(error).__name__}: {error}"
+                path, f"this file must hold every field of kind {cls.kind}", f"{type(error).__name__}: {error}"
             ) from error
 
     @classmethod

@@ -230,14 +230,14 @@ def refuses(kind: type[Artifact], path: Path, message: str) -> None:
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    refuses(Twin, tmp_path / "no.npz", "must hold a twin; received no such file. Run the step that makes it first")
+    refuses(Twin, tmp_path / "no.npz", "must be of kind twin; received no such file. Run the step that makes it first")
     refuses(Twin, tmp_path, "no such file")
 
 
 def test_another_kind_or_version(tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
     twin().save(path)
-    refuses(Trajectory, path, "must hold a trajectory; received twin")
+    refuses(Trajectory, path, "must be of kind trajectory; received twin")
     rewrite(path, format=99)
     refuses(Twin, path, r"reads format 1; received 99\. Re-run")
 
@@ -246,12 +246,12 @@ def test_missing_fields(tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
     trajectory().save(path)
     rewrite(path, fields={})
-    refuses(Trajectory, path, "every field of a trajectory; received KeyError: 'frame_count'")
+    refuses(Trajectory, path, "every field of kind trajectory; received KeyError: 'frame_count'")
     trajectory().save(path)
     with np.load(path) as stored:
         meta = stored["meta"]
     np.savez(path, meta=meta)
-    refuses(Trajectory, path, "every field of a trajectory.*positions")
+    refuses(Trajectory, path, "every field of kind trajectory.*positions")
 
 
 def damaged(path: Path, content: bytes) -> None:

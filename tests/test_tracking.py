@@ -339,7 +339,7 @@ def test_damaged_records_are_input_errors(results: Path) -> None:
     del good["started"]
     for text in ("{", "[]", json.dumps(good)):
         path.write_text(text)
-        with pytest.raises(InputError, match="run.json"):
+        with pytest.raises(InputError, match=r"run\.json"):
             tracking.log_run(path, results, SETTINGS)
     with pytest.raises(InputError, match="readable"):
         tracking.log_run(results / "none" / "run.json", results, SETTINGS)

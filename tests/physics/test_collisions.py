@@ -19,11 +19,16 @@ DISTANCE = 0.02
 
 
 def clump(crowded: int, pairs: int) -> np.ndarray:
-    """`crowded` nodes all within DISTANCE of each other, and `pairs` far pairs of near nodes, shuffled."""
+    """`crowded` nodes all within DISTANCE of each other, and `pairs` far pairs of near nodes, shuffled.
+
+    A lonely node follows each of them: its empty list lies right behind theirs, where an overrun would show.
+    """
     rng = np.random.default_rng(1)
     near = rng.uniform(-0.004, 0.004, (crowded, 3))
     far = np.repeat(np.arange(1, pairs + 1)[:, None] * [1.0, 0, 0], 2, axis=0) + rng.uniform(-0.004, 0.004, (2 * pairs, 3))
-    return rng.permutation(np.concatenate([near, far]))
+    others = rng.permutation(np.concatenate([near, far]))
+    lonely = np.arange(1, len(others) + 1)[:, None] * [0, 1.0, 0]
+    return np.stack([others, lonely], axis=1).reshape(-1, 3)
 
 
 def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") -> tuple[list[list[int]], int]:
@@ -31,12 +36,15 @@ def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") ->
     made = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
     solver = solver_for(made, 0, device)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
+    solver._views["partners"].fill_(-1)
     for _ in range(frames):
         after, _ = solver.forward(state, 0 * state, nobody, nobody)
         np.testing.assert_array_equal(after.cpu().numpy(), x)
     partners, count = solver._views["partners"].numpy(), solver._views["count"].numpy()
     assert partners.shape == (len(x), capacity)
     assert (count <= capacity).all()
+    # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
+    assert (partners[np.arange(capacity) >= count[:, None]] == -1).all()
     return [row[:n].tolist() for row, n in zip(partners, count, strict=True)], solver.collision_overflow
 
 
@@ -52,7 +60,7 @@ def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -
     x = clump(7, 4)
     found, overflow = lists(x, capacity, device=device)
     wanted = expected_lists(x)
-    assert sorted(len(row) for row in wanted) == [1] * 8 + [6] * 7
+    assert sorted(len(row) for row in wanted) == [0] * 15 + [1] * 8 + [6] * 7
     assert found == [row[:capacity] for row in wanted]
     assert overflow == 7 * max(6 - capacity, 0)
 
@@ -64,7 +72,8 @@ def test_overflow_adds_up_over_frames() -> None:
 def test_a_full_list_still_collides_with_its_partners() -> None:
     """Nodes whose lists are complete move as with room to spare; the others stay finite."""
     x = clump(7, 4)
-    v = np.random.default_rng(2).uniform(-1, 1, x.shape)
+    # Towards the middle of each group: all pairs approach.
+    v = 100 * (x.round() - x)
     states = []
     for capacity in (1, 500):
         made = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
