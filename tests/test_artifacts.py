@@ -256,7 +256,7 @@ def test_missing_fields(tmp_path: Path) -> None:
 
 def damaged(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-    refuses(Twin, path, r"must be a readable twin.*Delete it and re-run its step")
+    refuses(Twin, path, r"must be readable, of kind twin.*Delete it and re-run its step")
 
 
 def test_truncated_files(tmp_path: Path) -> None:
