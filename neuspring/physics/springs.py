@@ -70,8 +70,11 @@ def kernels(real: Any) -> tuple[Any, Any]:
         wd = wp.dot(relative, d)
         strain = length * p[1] - one
         magnitude = p[0] * strain + p[2] * wd
-        # d(f.c)/d(offset): the direction turns (projected parts), the length stretches the spring.
-        g = (c - d * cd) * (magnitude * inverse) + d * (cd * p[0] * p[1]) + (relative - d * wd) * (cd * p[2] * inverse)
+        # d(f.c)/d(offset): the direction turns (c and the relative velocity, without their parts along d), the length
+        # stretches the spring (along d).
+        turn = magnitude * inverse
+        drift = cd * p[2] * inverse
+        g = c * turn + relative * drift + d * (cd * p[0] * p[1] - cd * turn - wd * drift)
         h = d * (cd * p[2])
         wp.atomic_add(adj_x, j, g)
         wp.atomic_sub(adj_x, i, g)
