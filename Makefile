@@ -14,7 +14,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
 	@echo "Creating .venv with $(PYTHON) (about two minutes)"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c workflow/envs/constraints.txt -e ".[dev]"
+	PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@touch $@
 
 demo: $(INSTALLED)

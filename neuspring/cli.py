@@ -1,6 +1,6 @@
 """The `neuspring` command: every workflow step by hand, and the tools around it.
 
-Exit status: 0 done (a numerical failure is a recorded result), 2 bad input (retrying cannot help), 1 anything else.
+Exit status: 0 done (a numerical failure is a recorded result), 2 bad input (only another input can help), 1 anything else.
 Heavy imports happen inside the commands, after the number of threads is set.
 """
 
@@ -42,24 +42,35 @@ def _settings(text: str) -> Config:
     from neuspring import config
 
     if text.lstrip().startswith("{"):
-        try:
-            return config.parse(config.Config, json.loads(text), "--settings")
-        except json.JSONDecodeError as error:
-            raise InputError("--settings", "must be JSON or YAML files", str(error)) from error
+        return config.parse(config.Config, _json_mapping("--settings", text), "--settings")
     values: dict[str, object] = {}
     for name in text.split(","):
         config.merge(values, config.read_yaml(Path(name)))
     return config.parse(config.Config, values, f"--settings {text}")
 
 
+def _json_mapping(option: str, text: str) -> dict[str, object]:
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(option, "must be JSON", str(error)) from error
+    if not isinstance(values, dict):
+        raise InputError(option, "must be a JSON object", type(values).__name__)
+    return values
+
+
 def _observe(a: argparse.Namespace) -> int:
     from neuspring import config, stages
 
     settings = _settings(a.settings)
-    rows = config.read_scenarios(Path(settings.scenario_table))
-    if a.scenario not in rows:
-        raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
-    stages.observe(rows[a.scenario], settings, a.output)
+    if a.row:
+        row = config.parse(config.ScenarioRow, _json_mapping("--row", a.row), "--row")
+    else:
+        rows = config.read_scenarios(Path(settings.scenario_table))
+        if a.scenario not in rows:
+            raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
+        row = rows[a.scenario]
+    stages.observe(row, settings, a.output)
     return 0
 
 
@@ -88,7 +99,7 @@ def _score(a: argparse.Namespace) -> int:
     from neuspring import stages
 
     records = {"search": a.search} | ({"fit": a.fit} if a.fit else {}) | {"rollout": a.rollout}
-    stages.score(a.observations, records, a.method, json.loads(a.variant), a.seed, a.output)
+    stages.score(a.observations, records, a.method, _json_mapping("--variant", a.variant), a.seed, a.output)
     return 0
 
 
@@ -129,7 +140,7 @@ def _sync(a: argparse.Namespace) -> int:
     outcomes = tracking.sync(a.results, settings, progress=print)
     for outcome, names in outcomes.items():
         print(f"{outcome}: {len(names)}")
-    return 1 if any(outcome.startswith("unreachable") for outcome in outcomes) else 0
+    return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
 
 
 def _ui(a: argparse.Namespace) -> int:
@@ -161,7 +172,9 @@ def _parser() -> argparse.ArgumentParser:
     add = _Adder(commands)
 
     observe = add("observe", _observe, "capture -> observations.npz", "settings", "output")
-    observe.add_argument("--scenario", required=True, help="a row of the scenario table")
+    which = observe.add_mutually_exclusive_group(required=True)
+    which.add_argument("--scenario", help="name of a row of the scenario table")
+    which.add_argument("--row", help="the row itself, as JSON")
 
     search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
     search.add_argument("--seed", type=int, default=0)

@@ -27,6 +27,7 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published")
 Range = tuple[Finite, Finite]
 Beta = Annotated[float, Field(ge=0, lt=1)]
 
@@ -98,6 +99,13 @@ class SearchRanges:
             low, high = getattr(self, f.name)
             if not 0 <= low < high:
                 raise ValueError(f"{f.name}: 0 <= low < high is required, received [{low}, {high}]")
+        for name in ("object_neighbours", "controller_neighbours"):
+            # An object node counts itself among its neighbours.
+            least = 2 if name == "object_neighbours" else 1
+            if getattr(self, name)[0] < least:
+                raise ValueError(f"{name}: at least {least} is required, received {getattr(self, name)[0]}")
+        if self.contact_distance[0] <= 0:
+            raise ValueError(f"contact_distance: must be positive, received {self.contact_distance[0]}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +145,7 @@ class Search:
 
     __pydantic_config__ = STRICT
     rollouts: Count = 220
-    """Budget in candidate rollouts; every method compared gets the same."""
+    """Budget in candidate rollouts, used in whole generations (of 11; at least one); every method compared gets the same."""
     sigma: Positive = 1 / 6
     """Initial step in normalised variables."""
     ranges: SearchRanges = field(default_factory=SearchRanges)
@@ -257,7 +265,7 @@ class Config:
     """Rows of the method table; the first is what others are compared with."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
     """Of the search; every method runs with the same ones."""
-    results: str = "results"
+    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
     """Folder that everything is written to."""
     data_root: str | None = None
     """Folder that relative scenario paths start from."""
@@ -417,8 +425,15 @@ class Benchmark:
         _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
         _require_known("methods", config.methods, methods, config.method_table)
         chosen = cls(config, {n: scenarios[n] for n in config.scenarios}, {n: methods[n] for n in config.methods})
+        for name in [*chosen.scenarios, *chosen.methods]:
+            if name in RESERVED or name.startswith("search-"):
+                rule = f"{', '.join(RESERVED)} and search-... are folders of the results"
+                raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in chosen.methods.items():
-            fit_of(config, method, name)
+            high, limit = config.search.ranges.stiffness[1], fit_of(config, method, name).stiffness_range[1]
+            if method.fit and limit < high:
+                rule = f"must reach the search's upper bound of {high}, or springs start beyond their clamp"
+                raise InputError(f"method {name}, fit.stiffness_range", rule, limit)
         chosen._require_data()
         return chosen
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 class InputError(ValueError):
     """Bad input: `where` broke `rule`; we received `value`; do `remedy` next.
 
-    Exit status 2 on the command line: retrying cannot help, so the workflow does not retry it.
+    Exit status 2 on the command line: only another input can help.
     """
 
     def __init__(self, where: object, rule: str, value: object = None, remedy: str = "") -> None:

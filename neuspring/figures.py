@@ -65,7 +65,12 @@ def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
                     rows["step"], rows["value"], label=metric.replace("_", " ")
                 )
         best = history.loc[history["metric"].isin(["best_cost", "loss"]), "value"]
-        axis.set(yscale="log", xlabel="rollout" if stage == "search" else "epoch", ylabel="training loss [m$^2$]", title=stage)
+        axis.set(
+            yscale="log",
+            xlabel="rollout" if stage == "search" else "epoch",
+            ylabel="training cost" if stage == "search" else "training loss [m$^2$]",
+            title=stage,
+        )
         if stage == "search":
             # Diverged candidates carry a penalty far above the picture.
             axis.set_ylim(best.min() / 1.5, min(best.max(), 1e3) * 3)

@@ -9,6 +9,7 @@ restores the parameters of the epoch's start, halves the learning rate and is re
 from __future__ import annotations
 
 import json
+import time
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,7 +60,11 @@ class FitResult:
     history: pd.DataFrame
     best_epoch: int
     rollbacks: list[str]
-    continued: bool
+    attempts: int
+    """1, plus one for every time the fit continued from a checkpoint."""
+    earlier_seconds: float
+    """Wall time of the attempts that this one continued, up to their last checkpoint."""
+    collision_overflow: int
 
 
 class SpringParameters:
@@ -105,8 +110,11 @@ class _State:
     rollbacks: list[str]
     best_epoch: int
     best_values: dict[str, np.ndarray]
+    substeps: int
+    attempts: int = 1
+    seconds: float = 0.0
 
-    def save(self, path: Path, key: str) -> None:
+    def save(self, path: Path, key: str, seconds: float) -> None:
         arrays = {f"values.{k}": v for k, v in self.values.items()} | {f"best.{k}": v for k, v in self.best_values.items()}
         arrays |= {f"moments.{k}": v for k, v in self.moments.items()}
         meta = {
@@ -116,6 +124,9 @@ class _State:
             "history": self.history,
             "rollbacks": self.rollbacks,
             "best_epoch": self.best_epoch,
+            "substeps": self.substeps,
+            "attempts": self.attempts,
+            "seconds": seconds,
         }
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
 
@@ -144,6 +155,7 @@ class _State:
             return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
         print(f"continuing the fit after epoch {meta['epoch']}")
+        meta["attempts"] += 1
         return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **meta)
 
 
@@ -165,23 +177,36 @@ class SpringFit:
         self._solver: FrameSolver | None = None
 
     def solver(self) -> FrameSolver:
-        """A solver whose substep is safe for the present stiffness. Raises NonFinite if a fixed count no longer is."""
-        chosen = self.problem.simulation
-        current = self.as_twin(self.parameters.copy())
-        spectrum = stability.twin_spectrum(current)
-        if spectrum.load(current.simulation.substep) >= stability.LIMIT * (1 + chosen.safety) / 2:
-            automatic = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
-            count = stability.smallest_safe_substeps(spectrum, current.simulation.frame_time, chosen.safety)
-            if automatic and count <= chosen.max_substeps:
-                self.twin = replace(self.twin, simulation=replace(self.twin.simulation, substeps=count))
-                self._solver = None
-            elif spectrum.load(current.simulation.substep) >= stability.LIMIT:
-                raise NonFinite(f"stiffness grew beyond what {current.simulation.substeps} substeps per frame can integrate")
+        """The solver for the present number of substeps."""
         if self._solver is None:
             topology = self.twin.topology
             counts = (len(topology.nodes), len(topology.controllers))
             self._solver = FrameSolver(topology.springs, *counts, self.twin.simulation, device=self.problem.device)
         return self._solver
+
+    def use_substeps(self, count: int) -> None:
+        """Integrate with `count` substeps per frame from now on."""
+        if count != self.twin.simulation.substeps:
+            self.twin = replace(self.twin, simulation=replace(self.twin.simulation, substeps=count))
+            self._solver = None
+
+    def settle(self) -> None:
+        """See that the present stiffness can be integrated: ask for more substeps where they may grow.
+
+        Raises NonFinite where they may not (a fixed count, the released 667, `max_substeps`) and the bound is passed.
+        """
+        chosen, frame_time = self.problem.simulation, self.twin.simulation.frame_time
+        spectrum = stability.twin_spectrum(self.as_twin(self.parameters.copy()))
+        load = spectrum.load(self.twin.simulation.substep)
+        # Half of the safety margin is kept for the parameters' way through the next epoch.
+        if load < stability.LIMIT * (1 + chosen.safety) / 2:
+            return
+        count = stability.smallest_safe_substeps(spectrum, frame_time, chosen.safety)
+        may_grow = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
+        if may_grow and count <= chosen.max_substeps:
+            self.use_substeps(count)
+        elif load >= stability.LIMIT:
+            raise NonFinite(f"stiffness grew beyond what {self.twin.simulation.substeps} substeps per frame can integrate")
 
     def as_twin(self, values: dict[str, np.ndarray]) -> Twin:
         """A twin with the given trained values, clamped as they are used."""
@@ -249,32 +274,38 @@ def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "") -> F
 
     Raises NumericalFailure if no epoch could be completed.
     """
+    clock = time.perf_counter()
     run = SpringFit(problem)
     state = _State.load(partial, key)
-    continued = state is not None
     if state is None:
         initial = run.parameters.copy()
-        state = _State(0, initial, {}, problem.fit.learning_rate, [], [], -1, initial)
+        substeps = problem.twin.simulation.substeps
+        state = _State(0, initial, {}, problem.fit.learning_rate, [], [], -1, initial, substeps)
+    earlier = state.seconds
+    run.use_substeps(state.substeps)
     run.restore(state.values, state.moments, state.learning_rate)
     progress = Progress(f"fit {problem.observations.scenario.name}", problem.fit.epochs)
+    overflow = 0
     while state.epoch < problem.fit.epochs and len(state.rollbacks) < MAX_ROLLBACKS:
         _advance(run, state, problem)
+        overflow = max(overflow, run.solver().collision_overflow)
         last = state.history[-1]
         progress.update(state.epoch, f"loss {last['loss']:.3e} m^2" if not last["rolled_back"] else "rolled back")
         if partial is not None and state.epoch % problem.fit.checkpoint_every == 0:
-            state.save(partial, key)
+            state.save(partial, key, earlier + time.perf_counter() - clock)
     if state.best_epoch < 0:
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
-    twin = run.as_twin(state.best_values)
-    return FitResult(_settled(problem, twin), pd.DataFrame(state.history), state.best_epoch, state.rollbacks, continued)
+    best = run.as_twin(state.best_values)
+    return FitResult(best, pd.DataFrame(state.history), state.best_epoch, state.rollbacks, state.attempts, earlier, overflow)
 
 
 def _advance(run: SpringFit, state: _State, problem: FitProblem) -> None:
-    """One epoch, or its rollback, recorded in `state`."""
+    """One epoch, or its rollback, recorded in `state`. Accepted values can always be integrated with `state.substeps`."""
     row: dict[str, Any] = {"epoch": state.epoch, "learning_rate": state.learning_rate, "rolled_back": False}
     try:
         loss, norm = run.epoch()
-        state.values, state.moments = run.parameters.copy(), run.moments()
+        run.settle()
+        state.values, state.moments, state.substeps = run.parameters.copy(), run.moments(), run.twin.simulation.substeps
         row |= {"loss": loss, "gradient_norm": norm}
         if _eligible(state.epoch, problem) and loss < _best_loss(state):
             state.best_epoch, state.best_values = state.epoch, state.values
@@ -296,12 +327,3 @@ def _eligible(epoch: int, problem: FitProblem) -> bool:
 
 def _best_loss(state: _State) -> float:
     return float(state.history[state.best_epoch]["loss"]) if state.best_epoch >= 0 else float("inf")
-
-
-def _settled(problem: FitProblem, twin: Twin) -> Twin:
-    """The twin with more substeps if its final stiffness needs them (post-epoch values may exceed the checked ones)."""
-    spectrum = stability.twin_spectrum(twin)
-    if problem.simulation.substeps == "auto" and spectrum.load(twin.simulation.substep) >= stability.LIMIT:
-        count = stability.smallest_safe_substeps(spectrum, twin.simulation.frame_time, problem.simulation.safety)
-        return replace(twin, simulation=replace(twin.simulation, substeps=count))
-    return twin

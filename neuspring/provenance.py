@@ -92,7 +92,7 @@ def code_digest(*modules: str) -> str:
 def commit() -> str:
     """The commit of the working copy this package runs from, with `-dirty` if it has changes; empty if unknown."""
     try:
-        run = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, timeout=10, check=True)
+        run = functools.partial(subprocess.run, cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
         name = run(["git", "rev-parse", "HEAD"]).stdout.strip()
         changed = run(["git", "status", "--porcelain", "--untracked-files=no", "--", "."]).stdout.strip()
     except (OSError, subprocess.SubprocessError):

@@ -10,6 +10,7 @@ import hashlib
 import json
 import platform
 import resource
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -55,10 +56,10 @@ class StageRecord:
     settings: dict[str, Any] = field(default_factory=dict)
     started: str = ""
     seconds: float = 0.0
-    """Wall time of this attempt."""
+    """Wall time, with the attempts that it continued."""
     peak_memory_mb: float = 0.0
     attempts: int = 1
-    """1 if the stage ran in one go, 2 if it continued from a checkpoint of a killed attempt."""
+    """1, plus one for every time the stage continued from a checkpoint."""
     device: str = "cpu"
     machine: str = ""
 
@@ -71,7 +72,11 @@ class StageRecord:
     @classmethod
     def load(cls, path: Path) -> StageRecord:
         """Read a record. Raises InputError if it is missing or damaged."""
-        return cls(**read_json(path, RECORD_FORMAT))
+        values = read_json(path, RECORD_FORMAT)
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise InputError(path, "must be a stage record", str(error), "Delete it and run again.") from error
 
     def file(self, role: str, record_path: Path) -> Path:
         """The file of a role, checked against its digest. Raises InputError if it is missing or has changed."""
@@ -113,16 +118,19 @@ class Stopwatch:
         """Seconds so far."""
         return time.perf_counter() - self._start
 
-    def stage(self, stage: str, status: Status, files: Mapping[str, Path] | None = None, **values: Any) -> StageRecord:
+    def stage(
+        self, stage: str, status: Status, files: Mapping[str, Path] | None = None, earlier_seconds: float = 0.0, **values: Any
+    ) -> StageRecord:
         """A record of this stage with its time, memory, machine and the digests of its files."""
         named = {role: [path.name, digest_file(path)] for role, path in (files or {}).items()}
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        # Linux counts in KiB, macOS in bytes.
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
         return StageRecord(
             stage=stage,
             status=status,
             files=named,
             started=self.started,
-            seconds=round(self.seconds, 3),
+            seconds=round(earlier_seconds + self.seconds, 3),
             peak_memory_mb=round(peak, 1),
             machine=f"{platform.machine()}, Python {platform.python_version()}",
             **values,

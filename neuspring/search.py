@@ -30,6 +30,7 @@ VARIABLES = tuple(f.name for f in fields(config.SearchRanges))
 INTEGERS = ("object_neighbours", "controller_neighbours")
 PENALTY = 1e6
 """Cost of a candidate that diverges or cannot be integrated; far above any loss in square metres."""
+UNSTABLE = "unstable"
 RELEASED_FRAME_TIME = 667 * 5e-5
 RELEASED_SUBSTEPS = 667
 
@@ -121,19 +122,23 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
 
 
-def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> float:
-    """Mean training loss over frames 1 .. train_end - 1, acceleration term included. Raises Diverged."""
+def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, int]:
+    """Mean training loss over frames 1 .. train_end - 1, acceleration term included, and the collision list's overflow.
+
+    Raises Diverged.
+    """
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
     before = torch.zeros((len(twin.topology.nodes), 3), device=problem.device)
     previous: torch.Tensor | None = None
     total = 0.0
-    for frame, x, v in frames(twin, solver_for(twin, problem.device), hands):
+    solver = solver_for(twin, problem.device)
+    for frame, x, v in frames(twin, solver, hands):
         total += float(loss(frame, x))
         change = v - before
         if previous is not None:
             total += problem.losses.acceleration * float(acceleration(change, previous))
         before, previous = v, change
-    return total / (len(hands) - 1)
+    return total / (len(hands) - 1), solver.collision_overflow
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,10 @@ class SearchResult:
     values: dict[str, float]
     cost: float
     trace: pd.DataFrame
-    continued: bool
+    attempts: int
+    """1, plus one for every time the search continued from its record."""
+    earlier_seconds: float
+    """Wall time of the attempts that this one continued, up to their last complete generation."""
 
 
 def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, key: str = "") -> SearchResult:
@@ -153,9 +161,8 @@ def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, ke
     `partial` is where the trace is kept after every generation; a file with the same `key` there is continued from.
     Raises NumericalFailure if no candidate could be simulated.
     """
-    strategy = _strategy(problem.search, seed)
-    trace = _resume(strategy, partial, key)
-    continued = len(trace) > 0
+    clock = time.perf_counter()
+    strategy, trace, attempts, earlier = _resume(problem.search, seed, partial, key)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     progress = Progress(f"search {problem.observations.scenario.name} seed {seed}", problem.search.rollouts)
     # Whole generations only: CMA-ES learns from complete populations, and every method gets the same count.
@@ -163,18 +170,21 @@ def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, ke
         population = strategy.ask()
         for normalised in population:
             trace.append(_evaluate(problem, np.asarray(normalised), loss, len(trace), strategy.countiter))
-            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e} m^2")
+            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
         strategy.tell(population, [row["cost"] for row in trace[-len(population) :]])
         if partial is not None:
-            _save_partial(partial, key, trace)
+            _save_partial(partial, key, trace, attempts, earlier + time.perf_counter() - clock)
     table = pd.DataFrame(trace)
     best = table.iloc[int(table["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
+        if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
+            rule = f"at least one of {len(table)} candidates must be stable with this count"
+            raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
     values = {name: float(best[name]) for name in VARIABLES}
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
-    return SearchResult(candidate(problem, values), values, float(best["cost"]), table, continued)
+    return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
 
 
 def _strategy(settings: config.Search, seed: int) -> cma.CMAEvolutionStrategy:
@@ -194,46 +204,60 @@ def _strategy(settings: config.Search, seed: int) -> cma.CMAEvolutionStrategy:
 def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
     start = time.perf_counter()
     values = decode(normalised, problem.search.ranges)
-    row: dict[str, Any] = {"rollout": index, "generation": generation, "cost": PENALTY, "reason": "", "springs": 0, "substeps": 0}
+    row: dict[str, Any] = {
+        "rollout": index,
+        "generation": generation,
+        "cost": PENALTY,
+        "reason": "",
+        "springs": 0,
+        "substeps": 0,
+        "collision_overflow": 0,
+    }
     try:
         twin = candidate(problem, values)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        row["cost"] = min(cost(problem, twin, loss), PENALTY)
+        value, row["collision_overflow"] = cost(problem, twin, loss)
+        row["cost"] = min(value, PENALTY)
     except (Diverged, NumericalFailure) as failure:
         row["reason"] = str(failure)
-    except InputError as failure:
+    except stability.Unstable as failure:
         # A fixed substep count that this candidate is too stiff for: penalised, like divergence.
-        row["reason"] = f"unstable: {failure}"
+        row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
     return row | values | {f"normalised.{name}": float(u) for name, u in zip(VARIABLES, normalised, strict=True)}
 
 
-def _save_partial(path: Path, key: str, trace: list[dict[str, Any]]) -> None:
+def _save_partial(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
     table = pd.DataFrame(trace)
-    table.attrs["key"] = key
+    table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
     write_atomically(path, lambda p: table.to_parquet(p))
 
 
-def _resume(strategy: cma.CMAEvolutionStrategy, path: Path | None, key: str) -> list[dict[str, Any]]:
-    """Replay a recorded search into `strategy`; returns its candidates, or nothing if there is no matching record."""
+_Start = tuple[cma.CMAEvolutionStrategy, list[dict[str, Any]], int, float]
+
+
+def _resume(settings: config.Search, seed: int, path: Path | None, key: str) -> _Start:
+    """(strategy, candidates, attempts, seconds) of a recorded search, by replaying it; a fresh start if none matches."""
+    strategy = _strategy(settings, seed)
+    fresh: _Start = (strategy, [], 1, 0.0)
     if path is None or not path.is_file():
-        return []
+        return fresh
     try:
         table = pd.read_parquet(path)
     except (OSError, ValueError) as error:
         print(f"{path}: unreadable ({error}); the search starts afresh")
-        return []
+        return fresh
     if table.attrs.get("key") != key:
         print(f"{path}: made with other inputs or settings; the search starts afresh")
-        return []
+        return fresh
     columns = [f"normalised.{name}" for name in VARIABLES]
     for start in range(0, len(table), strategy.popsize):
         rows = table.iloc[start : start + strategy.popsize]
         population = strategy.ask()
         if len(rows) != strategy.popsize or not np.array_equal(np.asarray(population), rows[columns].to_numpy()):
-            raise InputError(
-                path, "the recorded candidates must replay exactly", "a different sequence", "Delete this file and run again."
-            )
+            print(f"{path}: does not replay on this machine; the search starts afresh")
+            return _strategy(settings, seed), [], 1, 0.0
         strategy.tell(population, rows["cost"].tolist())
     print(f"continuing the search after {len(table)} rollouts")
-    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+    records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+    return strategy, records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])

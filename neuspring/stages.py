@@ -86,9 +86,12 @@ def search(observations_path: Path, settings: Config, seed: int, device: str, ou
         "cost": result.cost,
         "rollouts": len(result.trace),
         "failed_rollouts": int((result.trace["reason"] != "").sum()),
+        "collision_overflow": int(result.trace["collision_overflow"].max()),
         **_twin_facts(result.twin),
     }
-    clock.stage("search", "ok", files, facts=facts, attempts=1 + result.continued, **common).save(output)
+    clock.stage(
+        "search", "ok", files, facts=facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds, **common
+    ).save(output)
     partial.unlink(missing_ok=True)
 
 
@@ -123,11 +126,15 @@ def fit(observations_path: Path, search_record: Path, settings: Config, device: 
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": float(result.history.loc[result.history["epoch"] == result.best_epoch, "loss"].iloc[0]),
+        "epochs": len(result.history),
         "rollbacks": result.rollbacks,
+        "collision_overflow": result.collision_overflow,
         **_twin_facts(result.twin),
     }
     files = {"twin": folder / "twin.npz", "history": folder / "history.parquet"}
-    clock.stage("fit", "ok", files, facts=facts, attempts=1 + result.continued, **common).save(output)
+    clock.stage("fit", "ok", files, facts=facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds, **common).save(
+        output
+    )
     partial.unlink(missing_ok=True)
 
 
@@ -150,7 +157,7 @@ def rollout(observations_path: Path, twin_record: Path, device: str, output: Pat
     path = output.with_name("trajectory.npz")
     trajectory.save(path)
     if trajectory.collision_overflow:
-        print(f"warning: {trajectory.collision_overflow} collision candidates did not fit; raise simulation.collision_capacity")
+        print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")
     failed = trajectory.diverged_frame is not None
     facts = {"collision_overflow": trajectory.collision_overflow, "frames": len(trajectory.positions)}
     reason = f"rollout: {trajectory.reason}" if failed else ""
@@ -188,6 +195,8 @@ def score(
         "seed": seed,
         "status": last.status,
         "reason": last.reason,
+        "notes": _notes(stages),
+        "settings": {name: record.settings for name, record in stages.items()},
         "data_digest": digest_file(observations_path),
     }
     # The content of a run, without its timings: the same results have the same key, however often they are made.
@@ -212,6 +221,19 @@ def score(
         "artifacts": {name: [_relative(path, folder) for path in paths] for name, paths in artefacts.items()},
     }
     write_text(output, json.dumps(run, indent=1, sort_keys=True, allow_nan=False) + "\n")
+
+
+def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
+    """What a reader of the scores should know although the run did not fail."""
+    notes = []
+    for name, record in stages.items():
+        if record.facts.get("rollbacks"):
+            wanted = record.settings["fit"]["epochs"]
+            count = len(record.facts["rollbacks"])
+            notes.append(f"{name}: {count} of {record.facts['epochs']} epochs rolled back, {wanted} asked for")
+        if record.facts.get("collision_overflow"):
+            notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
+    return notes
 
 
 def _files(stages: Mapping[str, StageRecord], name: str) -> dict[str, list[str]]:

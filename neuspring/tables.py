@@ -45,12 +45,21 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
                 path = Path(results) / scenario / method / str(seed) / "run.json"
                 identity: dict[str, Any] = {"scenario": scenario, "method": method, "seed": seed}
                 if not path.is_file():
-                    rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished"})
+                    rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished", "notes": ""})
                     continue
                 record = read_json(path, RECORD_FORMAT)
                 timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
                 memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
-                rows.append(identity | {"status": record["status"], "reason": record["reason"], **timings, **memory})
+                rows.append(
+                    identity
+                    | {
+                        "status": record["status"],
+                        "reason": record["reason"],
+                        "notes": "; ".join(record["notes"]),
+                        **timings,
+                        **memory,
+                    }
+                )
                 tables.append(pd.read_parquet(path.parent / record["scores_file"]))
     filled = [table for table in tables if len(table)]
     scores = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
@@ -109,6 +118,10 @@ def summary_text(collected: Collected, baseline: str) -> str:
     if len(bad):
         lines += ["", "Not in the averages:", ""]
         lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in bad.itertuples()]
+    noted = collected.runs[collected.runs["notes"] != ""]
+    if len(noted):
+        lines += ["", "Notes:", ""]
+        lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
     return "\n".join(lines) + "\n"
 
 
@@ -188,15 +201,15 @@ def write(collected: Collected, baseline: str, folder: Path) -> str:
     """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv and summary.md; returns the summary."""
     scores = collected.scores
     usable = comparable(collected)
-    frames = {"scores": scores, "runs": collected.runs}
-    if len(usable):
-        frames |= {"averages": averages(usable), "differences": paired_differences(usable, baseline)}
-    for name, table in frames.items():
-        text = table.to_csv(index=False)
-        write_text(folder / f"{name}.csv", text)
+    averaged = averages(usable) if len(usable) else pd.DataFrame()
+    differences = paired_differences(usable, baseline) if len(usable) else pd.DataFrame()
+    # All files are written every time, empty ones too, so that none is left over from an earlier run.
+    for name, table in {"scores": scores, "runs": collected.runs, "averages": averaged, "differences": differences}.items():
+        write_text(folder / f"{name}.csv", table.to_csv(index=False))
     write_atomically(folder / "scores.parquet", lambda temporary: scores.to_parquet(temporary, index=False))
     summary = summary_text(collected, baseline)
-    details = per_scenario_text(scores) if len(scores) else "No run has scores.\n"
+    finished = scores.merge(collected.runs.loc[collected.runs["status"] == "ok", ["scenario", "method", "seed"]])
+    details = per_scenario_text(finished) if len(finished) else "No run has finished.\n"
     timings = timing_text(collected.runs)
     text = f"# Scores\n\n{summary}\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
     write_text(folder / "summary.md", text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 from neuspring import config
 from neuspring.artifacts import Observations
@@ -27,6 +28,21 @@ def scene(path: str = "rope/lift/smooth", noise: float = 0.0, occlusion: float =
 def observations() -> Observations:
     """Exact observations of the default scene."""
     return scene().observations
+
+
+def spoiled_future() -> Observations:
+    """The default scene with everything that a method must not read made wrong: all arrays after the split, and the tracks."""
+    seen = observations()
+    changed = {}
+    for name in ("object_points", "controller_points"):
+        values = getattr(seen, name).copy()
+        values[seen.scenario.train_end :] += 1.0
+        changed[name] = values
+    for name in ("object_visibility", "object_motion_valid"):
+        values = getattr(seen, name).copy()
+        values[seen.scenario.train_end :] ^= True
+        changed[name] = values
+    return replace(seen, **changed, tracks=seen.tracks + 1.0)
 
 
 def search_problem(seen: Observations | None = None, **changes: object) -> SearchProblem:

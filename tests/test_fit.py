@@ -12,6 +12,7 @@ from neuspring import config
 from neuspring import fit as module
 from neuspring.errors import NumericalFailure
 from neuspring.fit import FitProblem, SpringFit, fit
+from neuspring.physics import stability
 from tests import small
 
 
@@ -45,8 +46,12 @@ def test_the_whole_horizon_gradient_moves_stiffness_towards_the_truth():
     assert result.history["loss"].iloc[-1] < 0.1 * result.history["loss"].iloc[0]
 
 
-def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch):
-    whole = fit(small.fit_problem())
+GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0, checkpoint_every=1)}
+
+
+@pytest.mark.parametrize(("changes", "killed_in"), [({}, 3), (GROWING, 8), (GROWING, 10)])
+def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
+    whole = fit(small.fit_problem(**changes))
     partial = tmp_path / "fit.npz"
     epochs = 0
     run_epoch = SpringFit.epoch
@@ -54,24 +59,25 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch):
     def dying(self):
         nonlocal epochs
         epochs += 1
-        if epochs == 3:
+        if epochs == killed_in:
             raise KeyboardInterrupt
         return run_epoch(self)
 
     with monkeypatch.context() as patch:
         patch.setattr(SpringFit, "epoch", dying)
         with pytest.raises(KeyboardInterrupt):
-            fit(small.fit_problem(), partial=partial, key="k")
-    continued = fit(small.fit_problem(), partial=partial, key="k")
-    assert continued.continued
+            fit(small.fit_problem(**changes), partial=partial, key="k")
+    continued = fit(small.fit_problem(**changes), partial=partial, key="k")
+    assert (whole.attempts, continued.attempts) == (1, 2)
     np.testing.assert_array_equal(continued.twin.material.stiffness, whole.twin.material.stiffness)
+    assert continued.twin.simulation == whole.twin.simulation
     pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
 
 
 def test_a_checkpoint_of_another_problem_is_ignored(tmp_path, capsys):
     partial = tmp_path / "fit.npz"
     fit(small.fit_problem(), partial=partial, key="one")
-    assert not fit(small.fit_problem(), partial=partial, key="two").continued
+    assert fit(small.fit_problem(), partial=partial, key="two").attempts == 1
     assert "other inputs or settings" in capsys.readouterr().out
 
 
@@ -119,12 +125,33 @@ def test_stiffness_stays_within_its_clamp():
 
 
 def test_stiffening_springs_get_more_substeps():
-    start = small.fit_problem()
-    problem = replace(start, fit=config.Fit(epochs=12, learning_rate=0.3, horizon=0))
+    problem = small.fit_problem(**GROWING)
     result = fit(problem)
-    grown = result.twin.material.stiffness.max() / start.twin.material.stiffness.max()
-    assert grown > 2
-    assert result.twin.simulation.substeps > start.twin.simulation.substeps
+    assert result.twin.material.stiffness.max() > 2 * problem.twin.material.stiffness.max()
+    assert result.twin.simulation.substeps > problem.twin.simulation.substeps
+    stability.check(result.twin)
+
+
+def limited(kind: str) -> dict[str, object]:
+    """Settings under which stiffness outgrows the substeps that it may have."""
+    start = small.fit_problem(**GROWING).twin
+    count = start.simulation.substeps
+    if kind == "fixed":
+        return GROWING | {"simulation": config.Simulation(substeps=count)}
+    return GROWING | {"simulation": config.Simulation(max_substeps=count)}
+
+
+@pytest.mark.parametrize("kind", ["fixed", "max_substeps"])
+def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind):
+    problem = small.fit_problem(**limited(kind))
+    result = fit(problem)
+    assert any("stiffness grew beyond" in text for text in result.rollbacks)
+    # The learning rate is halved, so training goes on after a rollback ...
+    rolled = result.history["rolled_back"].tolist()
+    assert not all(rolled[rolled.index(True) :])
+    # ... and what comes out can be rolled out as it is.
+    assert result.twin.simulation.substeps == problem.twin.simulation.substeps
+    stability.check(result.twin)
 
 
 def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epochs():
@@ -136,11 +163,7 @@ def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epoch
 
 
 def test_the_future_is_never_read():
-    seen = small.observations()
-    spoiled = seen.object_points.copy()
-    spoiled[seen.scenario.train_end :] += 1.0
-    other = replace(seen, object_points=spoiled)
-    first, second = fit(small.fit_problem(seen)), fit(small.fit_problem(other))
+    first, second = fit(small.fit_problem()), fit(small.fit_problem(small.spoiled_future()))
     np.testing.assert_array_equal(first.twin.material.stiffness, second.twin.material.stiffness)
 
 

@@ -1,5 +1,8 @@
 """The zero-order stage: coding of variables, budget, failure handling, and exact continuation."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -34,7 +37,7 @@ def test_the_truth_costs_less_than_its_neighbours():
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
     values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbours": 12.0}
     values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
-    by_stiffness = [cost(problem, candidate(problem, values | {"stiffness": s}), loss) for s in (2e3, 1.2e4, 9e4)]
+    by_stiffness = [cost(problem, candidate(problem, values | {"stiffness": s}), loss)[0] for s in (2e3, 1.2e4, 9e4)]
     assert by_stiffness[1] == min(by_stiffness)
 
 
@@ -45,7 +48,7 @@ def test_the_best_evaluated_candidate_wins_within_the_budget():
     assert result.cost == result.trace["cost"].min()
     # The returned twin is that candidate: simulating it again gives its cost.
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    assert cost(problem, result.twin, loss) == result.cost
+    assert cost(problem, result.twin, loss) == (result.cost, 0)
 
 
 def test_seeds_decide_the_candidates():
@@ -74,34 +77,60 @@ def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
             search(small.search_problem(), seed=5, partial=partial, key="k")
     assert len(pd.read_parquet(partial)) == 11
     continued = search(small.search_problem(), seed=5, partial=partial, key="k")
-    assert continued.continued
+    assert (whole.attempts, continued.attempts) == (1, 2)
+    assert continued.earlier_seconds > 0
     exact = [name for name in whole.trace if name != "seconds"]
     pd.testing.assert_frame_equal(continued.trace[exact], whole.trace[exact], check_exact=True)
 
 
-def test_a_checkpoint_of_another_problem_is_ignored_and_a_forged_one_refused(tmp_path):
+def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_path, capsys):
     partial = tmp_path / "partial.parquet"
     first = search(small.search_problem(), seed=0, partial=partial, key="one")
     other = search(small.search_problem(), seed=0, partial=partial, key="two")
-    assert not other.continued
-    assert other.cost == first.cost
+    assert "other inputs or settings" in capsys.readouterr().out
+    assert (other.attempts, other.cost) == (1, first.cost)
     table = pd.read_parquet(partial)
     table.loc[0, "normalised.drag"] += 0.01
     table.to_parquet(partial)
-    with pytest.raises(InputError, match="replay exactly"):
-        search(small.search_problem(), seed=0, partial=partial, key="two")
+    forged = search(small.search_problem(), seed=0, partial=partial, key="two")
+    assert "does not replay" in capsys.readouterr().out
+    assert (forged.attempts, forged.cost) == (1, first.cost)
 
 
-def test_a_fixed_count_that_no_candidate_can_use_is_a_named_failure():
+def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
     problem = small.search_problem(simulation=config.Simulation(substeps=1))
-    with pytest.raises(NumericalFailure, match=r"none of 22 candidates could be simulated; the first: unstable: .*substeps"):
+    with pytest.raises(
+        InputError, match=r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1"
+    ) as caught:
         search(problem, seed=0)
+    assert re.search(r"unstable: simulation.substeps, node \d+: .*stability bound.* Use at least \d+ substeps", str(caught.value))
+
+
+def test_a_search_whose_candidates_all_fail_is_a_named_failure():
+    problem = small.search_problem(simulation=config.Simulation(max_substeps=1))
+    with pytest.raises(
+        NumericalFailure, match=r"none of 22 candidates could be simulated; the first: needs \d+ substeps per frame"
+    ):
+        search(problem, seed=0)
+
+
+def test_bad_input_is_not_mistaken_for_a_bad_candidate():
+    seen = small.observations()
+    hands = seen.controller_points.copy()
+    hands[:, 0] += seen.object_points[0, 0] - hands[0, 0]
+    with pytest.raises(InputError, match="controller may not coincide"):
+        search(small.search_problem(replace(seen, controller_points=hands)), seed=0)
+
+
+def test_the_future_is_never_read():
+    first, second = (search(small.search_problem(o), seed=0) for o in (small.observations(), small.spoiled_future()))
+    assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
 
 
 def test_a_search_started_on_a_damaged_checkpoint_starts_afresh(tmp_path, capsys):
     partial = tmp_path / "partial.parquet"
     partial.write_bytes(b"PAR1 not really")
-    assert not search(small.search_problem(), seed=0, partial=partial, key="k").continued
+    assert search(small.search_problem(), seed=0, partial=partial, key="k").attempts == 1
     assert "starts afresh" in capsys.readouterr().out
 
 

@@ -12,8 +12,10 @@ from neuspring.tables import Collected
 def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str, str, int], ...] = ()) -> Collected:
     """Future track errors in metres by (scenario, method, seed); the other runs failed."""
     rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
-    runs = [{"scenario": s, "method": m, "seed": seed, "status": "ok", "reason": ""} for s, m, seed in values]
-    runs += [{"scenario": s, "method": m, "seed": seed, "status": "failed", "reason": "diverged"} for s, m, seed in failed]
+    runs = [{"scenario": s, "method": m, "seed": seed, "status": "ok", "reason": "", "notes": ""} for s, m, seed in values]
+    runs += [
+        {"scenario": s, "method": m, "seed": seed, "status": "failed", "reason": "diverged", "notes": ""} for s, m, seed in failed
+    ]
     return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs))
 
 

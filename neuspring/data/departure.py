@@ -43,11 +43,14 @@ def _departure(file: Path, level: Level, key: str, rule: str, value: object) -> 
 
 
 def refuse(departures: list[Departure]) -> None:
-    """Raise the first error among `departures` as InputError, naming file and key; do nothing when there is none."""
+    """Raise the first error among `departures` as InputError, naming file and key; print warnings when there is none."""
     errors = [d for d in departures if d.level == "error"]
     if errors:
         more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
         raise InputError(errors[0].file, errors[0].message, remedy=f"{more}`neuspring check-data` lists every departure.")
+    for departure in departures:
+        if departure.level == "warning":
+            print(f"warning: {departure.file}: {departure.message}")
 
 
 @dataclass

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import logging
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -24,6 +25,8 @@ import warp as wp
 from neuspring.artifacts import Simulation
 from neuspring.errors import InputError
 from neuspring.physics import contact, integrate, springs
+
+DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
 @functools.cache
@@ -57,16 +60,16 @@ def _without_driver_warning() -> Iterator[None]:
 
 
 def resolve_device(device: str) -> str:
-    """`auto` -> `cuda:0` where CUDA works, else `cpu`. Raises InputError for a CUDA device that is not there."""
-    if device == "auto":
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
-    if device.startswith("cuda"):
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        index = int(device.partition(":")[2] or 0)
-        if index >= count:
-            raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
-        return f"cuda:{index}"
-    return "cpu"
+    """`auto` -> `cuda:0` where CUDA works, else `cpu`. Raises InputError for other words and for a device that is not there."""
+    if not DEVICES.fullmatch(device):
+        raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device == "cpu" or (device == "auto" and count == 0):
+        return "cpu"
+    index = int(device.partition(":")[2] or 0)
+    if index >= count:
+        raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
+    return f"cuda:{index}"
 
 
 @dataclass(frozen=True)

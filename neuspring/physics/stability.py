@@ -23,6 +23,10 @@ from neuspring.errors import InputError
 LIMIT = 4.0
 
 
+class Unstable(InputError):
+    """The substep is beyond the stability bound."""
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """Largest eigenvalues of K [1/s^2] and C [1/s], and the node that moves most in the stiffest mode."""
@@ -84,7 +88,7 @@ def rest_spectrum(
         operator = LinearOperator((3 * count, 3 * count), matvec=lambda u: transpose @ (weights * (incidence @ u)))  # type: ignore[call-arg]
         start = np.random.default_rng(0).standard_normal(3 * count)
         try:
-            value, vector = eigsh(operator, k=1, which="LA", tol=1e-3, v0=start, maxiter=2000)
+            value, vector = eigsh(operator, k=1, which="LA", tol=1e-3, v0=start, maxiter=2000, rng=np.random.default_rng(0))
         except ArpackNoConvergence:
             bound = gershgorin(springs, count, weights, weights)
             return bound.stiffness, bound.node
@@ -107,7 +111,7 @@ def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float)
 
 
 def check(twin: Twin) -> None:
-    """Raise InputError, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
+    """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
     topology, material, simulation = twin.topology, twin.material, twin.simulation
     k = material.stiffness.astype(np.float64) / topology.rest_lengths
     c = material.dashpot.astype(np.float64)
@@ -117,7 +121,7 @@ def check(twin: Twin) -> None:
     if spectrum.load(simulation.substep) >= LIMIT:
         largest = spectrum.largest_substep(1.0)
         needed = smallest_safe_substeps(spectrum, simulation.frame_time, 1.0)
-        raise InputError(
+        raise Unstable(
             f"simulation.substeps, node {spectrum.node}",
             f"the substep must stay below {largest:.3g} s, the stability bound of this node (the stiffest, most damped)",
             f"{simulation.substep:.3g} s ({simulation.substeps} substeps per frame)",

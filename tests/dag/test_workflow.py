@@ -16,6 +16,7 @@ import yaml
 
 from neuspring import config, tracking
 from neuspring.artifacts import Twin
+from neuspring.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 TINY = {
@@ -142,8 +143,8 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
 
 
 def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):
-    # Three substeps cannot integrate any candidate of the rope, so its search fails; the softer cloth's does too.
-    changes = {"simulation": {"substeps": 3}, "methods": ["search_only"], "tracking": {"enabled": False}}
+    # No candidate can be integrated with a single substep, so the search fails numerically.
+    changes = {"simulation": {"max_substeps": 1}, "methods": ["search_only"], "tracking": {"enabled": False}}
     result = run(place, changes)
     text = result.stdout + result.stderr
     assert result.returncode == 0, text
@@ -151,7 +152,7 @@ def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):
     assert "none of 11 candidates could be simulated" in text
 
 
-def test_an_infrastructure_failure_is_retried_and_does_not_stop_the_others(place):
+def test_a_job_that_breaks_is_retried_and_does_not_stop_the_others(place):
     changes = {"scenarios": [SCENE, "DLO1_train_48"], "methods": ["search_only"], "tracking": {"enabled": False}}
     changes |= {"data_root": str(place / "data")}
     broken = place / "data" / "DLO1" / "train" / "48.pkl"
@@ -168,18 +169,26 @@ def test_an_infrastructure_failure_is_retried_and_does_not_stop_the_others(place
     assert "1/2" in text
 
 
+def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(place, tmp_path):
+    results = tmp_path / "my 'best' results; echo"
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(place / "Snakefile"), "--cores", "1"]
+    target = f"{results}/{SCENE}/observations.npz"
+    arguments(place)
+    command += ["--configfile", str(place / "config/config.yaml"), str(place / "overlay.yaml"), "--config", f"results={results}"]
+    done = subprocess.run([*command, "--", target], cwd=elsewhere, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert Path(target).is_file()
+    assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"fitt": {"epochs": 3}}, "fitt: unknown key"),
-        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
-        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
-        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
-        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
-        ({"scenarios": ["a;touch hacked"]}, "scenarios.0: string should match pattern"),
-        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
         ({"results": "/proc/nowhere"}, "this folder must be writable"),
-        ({"seeds": []}, "seeds: at least one entry is required"),
+        ({"scenarios": ["a;touch hacked"]}, "scenarios.0: string should match pattern"),
     ],
 )
 def test_bad_configuration_is_explained_before_any_job(place, changes, message):
@@ -189,6 +198,29 @@ def test_bad_configuration_is_explained_before_any_job(place, changes, message):
     assert message in text
     assert "Traceback" not in text
     assert not list(place.rglob("hacked"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
+        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
+        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
+        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
+        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
+        ({"scenarios": ["DLO1_train_48"], "data_root": "/nowhere"}, "its data must exist; received /nowhere/DLO1/train/48.pkl"),
+        ({"seeds": []}, "seeds: at least one entry is required"),
+        ({"seeds": [0, 0]}, "seeds: entries must differ"),
+        ({"results": "a{b}"}, "results: string should match pattern"),
+        ({"device": "gpu"}, "device: string should match pattern"),
+        ({"search": {"ranges": {"object_neighbours": [0, 5]}}}, "object_neighbours: at least 2 is required"),
+        ({"search": {"ranges": {"stiffness": [0.0, 2e5]}}}, "must reach the search's upper bound of 200000.0"),
+    ],
+)
+def test_what_the_workflow_checks_first(changes, message):
+    with pytest.raises(InputError) as caught:
+        config.Benchmark.of(config_with(changes), ROOT)
+    assert message in str(caught.value)
 
 
 def test_the_pinned_conda_environment_has_the_versions_of_the_constraints():

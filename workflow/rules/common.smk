@@ -3,14 +3,16 @@ import json
 import shlex
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from neuspring import config as settings
 from neuspring.errors import InputError
 from neuspring.provenance import code_digest
 
-# Jobs call `python -m neuspring`; take the interpreter that runs Snakemake unless a software deployment provides one.
-shell.prefix(f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH; ")
+# Jobs call `python -m neuspring`: with the interpreter that runs Snakemake, unless conda provides one.
+if not workflow.deployment_settings.deployment_method:
+    shell.prefix(f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH; ")
 
 ROOT = Path(workflow.basedir)
 
@@ -22,9 +24,7 @@ def checked_benchmark():
         results = Path(benchmark.config.results)
         try:
             results.mkdir(parents=True, exist_ok=True)
-            probe = results / ".writable"
-            probe.touch()
-            probe.unlink()
+            tempfile.TemporaryFile(dir=results).close()
         except OSError as error:
             raise InputError(
                 f"configuration, results ({results})",
@@ -66,7 +66,7 @@ def observe_settings(wildcards):
     names = {"toy": ["toy"], "mocap": ["mocap"], "phystwin": []}[
         BENCHMARK.scenarios[wildcards.scenario].source
     ]
-    return section("data_root", "scenario_table", *names)
+    return section("data_root", *names)
 
 
 def scenario_row(wildcards):
@@ -131,7 +131,7 @@ def twin_record(wildcards):
 
 
 def fit_option(wildcards, input):
-    return f"--fit {shlex.quote(str(input.fit))}" if input.get("fit") else ""
+    return ["--fit", str(input.fit)] if input.get("fit") else []
 
 
 def variant(wildcards):
@@ -176,20 +176,44 @@ def table_arguments():
 
 def report_end(failed):
     """Print the table of what is finished and what to do next, also after an interruption."""
-    command = [sys.executable, "-m", "neuspring", "tables", *table_arguments()]
     if failed:
         print("\nThe run did not finish. What is done so far:", flush=True)
-        subprocess.run(command, check=False)
+        subprocess.run(
+            [sys.executable, "-m", "neuspring", "tables", *table_arguments()],
+            check=False,
+        )
         print(
-            "Logs are named above. The same command continues where this one stopped.",
+            "The logs of failed jobs are named above. The same command continues where this one stopped.",
             flush=True,
         )
-    else:
-        print(f"\n{Path(TABLES).read_text()}")
+        return
+    if not Path(TABLES).exists():
+        return
+    print(f"\n{Path(TABLES).read_text()}")
+    print(
+        f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/"
+    )
+    tell_tracking()
+
+
+def tell_tracking():
+    if not CONFIG.tracking.enabled:
+        return
+    neuspring = Path(sys.executable).parent / "neuspring"
+    given = (
+        f" --settings {shlex.quote(section('tracking'))}" if CONFIG.tracking.uri else ""
+    )
+    waiting = [
+        path
+        for path in tracked_runs()
+        if Path(path).exists() and "logged" not in Path(path).read_text()
+    ]
+    if waiting:
         print(
-            f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/"
+            f"{len(waiting)} runs could not be logged ({Path(waiting[0]).read_text().strip()}). Their records wait on disk; send them:"
         )
-        print(
-            f"Look at the runs in MLflow:  {Path(sys.executable).parent}/neuspring ui --results {RESULTS}",
-            flush=True,
-        )
+        print(f"  {neuspring} sync --results {shlex.quote(RESULTS)}{given}")
+    print(
+        f"Look at the runs in MLflow:\n  {neuspring} ui --results {shlex.quote(RESULTS)}{given}",
+        flush=True,
+    )

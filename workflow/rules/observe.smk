@@ -19,5 +19,5 @@ rule observe:
         row=scenario_row,
         code=reader_digest,
     shell:
-        "python -m neuspring observe --scenario {wildcards.scenario} --settings {params.settings:q} --output {output}"
-        " 2>&1 | tee {log}"
+        "python -m neuspring observe --row {params.row:q} --settings {params.settings:q} --output {output:q}"
+        " 2>&1 | tee -a {log:q}"

@@ -7,9 +7,9 @@ rule score:
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/run.json",
     log:
-        f"{RESULTS}/logs/score/{{scenario}}-{{method}}-{{seed}}.log",
+        f"{RESULTS}/logs/score/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/score/{{scenario}}-{{method}}-{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/score/{{scenario}}/{{method}}/{{seed}}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
@@ -20,8 +20,8 @@ rule score:
     params:
         fit=fit_option,
         variant=variant,
-        code=code_digest("neuspring.metrics"),
+        code=code_digest("neuspring.metrics", "neuspring.figures"),
     shell:
-        "python -m neuspring score --observations {input.observations} --search {input.search} {params.fit}"
-        " --rollout {input.rollout} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
-        " --output {output} 2>&1 | tee {log}"
+        "python -m neuspring score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
+        " --rollout {input.rollout:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
+        " --output {output:q} 2>&1 | tee -a {log:q}"

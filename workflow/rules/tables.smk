@@ -18,4 +18,4 @@ rule tables:
         arguments=table_arguments(),
         code=code_digest("neuspring.tables"),
     shell:
-        "python -m neuspring tables {params.arguments:q} > {log} 2>&1"
+        "python -m neuspring tables {params.arguments:q} > {log:q} 2>&1"

@@ -17,7 +17,7 @@ rule track_init:
         settings=section("tracking"),
         results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
-        "python -m neuspring track-init --results {params.results:q} --settings {params.settings:q} --output {output} 2>&1 | tee {log}"
+        "python -m neuspring track-init --results {params.results:q} --settings {params.settings:q} --output {output:q} 2>&1 | tee -a {log:q}"
 
 
 rule log_run:
@@ -27,9 +27,9 @@ rule log_run:
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/mlflow.txt",
     log:
-        f"{RESULTS}/logs/log_run/{{scenario}}-{{method}}-{{seed}}.log",
+        f"{RESULTS}/logs/log_run/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/log_run/{{scenario}}-{{method}}-{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/log_run/{{scenario}}/{{method}}/{{seed}}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
@@ -41,5 +41,5 @@ rule log_run:
         settings=section("tracking"),
         results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
-        "python -m neuspring log --record {input.record} --results {params.results:q} --settings {params.settings:q}"
-        " --output {output} 2>&1 | tee {log}"
+        "python -m neuspring log --record {input.record:q} --results {params.results:q} --settings {params.settings:q}"
+        " --output {output:q} 2>&1 | tee -a {log:q}"

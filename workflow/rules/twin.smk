@@ -4,9 +4,9 @@ rule search:
     output:
         f"{RESULTS}/{{scenario}}/search-{{search}}/{{seed}}/search.json",
     log:
-        f"{RESULTS}/logs/search/{{scenario}}-{{search}}-{{seed}}.log",
+        f"{RESULTS}/logs/search/{{scenario}}/{{search}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/search/{{scenario}}-{{search}}-{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/search/{{scenario}}/{{search}}/{{seed}}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
@@ -20,8 +20,8 @@ rule search:
         settings=section("search", "simulation", "losses", "released_quirks"),
         code=code_digest("neuspring.search"),
     shell:
-        "python -m neuspring search --observations {input.observations} --settings {params.settings:q} --seed {wildcards.seed}"
-        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"
+        "python -m neuspring search --observations {input.observations:q} --settings {params.settings:q} --seed {wildcards.seed}"
+        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
 
 
 rule fit:
@@ -31,9 +31,9 @@ rule fit:
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/fit.json",
     log:
-        f"{RESULTS}/logs/fit/{{scenario}}-{{method}}-{{seed}}.log",
+        f"{RESULTS}/logs/fit/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/fit/{{scenario}}-{{method}}-{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/fit/{{scenario}}/{{method}}/{{seed}}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
@@ -47,8 +47,8 @@ rule fit:
         settings=fit_settings,
         code=code_digest("neuspring.fit"),
     shell:
-        "python -m neuspring fit --observations {input.observations} --search {input.search} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"
+        "python -m neuspring fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
+        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
 
 
 rule rollout:
@@ -58,9 +58,9 @@ rule rollout:
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:
-        f"{RESULTS}/logs/rollout/{{scenario}}-{{method}}-{{seed}}.log",
+        f"{RESULTS}/logs/rollout/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/rollout/{{scenario}}-{{method}}-{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/rollout/{{scenario}}/{{method}}/{{seed}}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
@@ -73,5 +73,5 @@ rule rollout:
     params:
         code=code_digest("neuspring.rollout"),
     shell:
-        "python -m neuspring rollout --observations {input.observations} --twin {input.twin}"
-        " --device {resources.device} --threads {threads} --output {output} 2>&1 | tee {log}"
+        "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q}"
+        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
