@@ -1,5 +1,5 @@
 # make demo | test | lint | bench: each makes or reuses .venv by itself.
-PYTHON ?= $(shell for p in python3.12 python3.13 python3.11 python3; do \
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
@@ -14,7 +14,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
 	@echo "Creating .venv with $(PYTHON) (about two minutes)"
 	$(PYTHON) -m venv .venv
-	PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@touch $@
 
 demo: $(INSTALLED)
