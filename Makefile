@@ -37,6 +37,7 @@ format: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench_frame
+	$(BIN)/python -m tests.benchmarks.bench_adjoint
 
 clean:
 	rm -rf .venv .snakemake
