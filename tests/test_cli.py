@@ -1,0 +1,62 @@
+"""The command line: exit status and messages."""
+
+import json
+
+import pytest
+
+from neuspring import config, tracking
+from neuspring.artifacts import Observations
+from neuspring.cli import main
+from neuspring.errors import InputError
+from neuspring.physics.solver import resolve_device
+from tests.data.phystwin_case import write_case
+
+
+def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
+    settings = tmp_path / "small.yaml"
+    settings.write_text("toy: {frames: 4}\n")
+    output = tmp_path / "observations.npz"
+    arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/config.yaml,{settings}"]
+    assert main([*arguments, "--output", str(output)]) == 0
+    assert Observations.load(output).scenario.frame_count == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["observe", "--scenario", "nothing", "--output", "x.npz"], "--scenario: must be a row of config/scenarios.tsv"),
+        (["observe", "--row", "{", "--output", "x.npz"], "--row: must be JSON"),
+        (["observe", "--row", "[]", "--output", "x.npz"], "--row: must be a JSON object; received list"),
+        (["observe", "--row", "{}", "--output", "x.npz"], "scenario: required, but missing"),
+        (["observe", "--scenario", "x", "--settings", '{"toy": {"framez": 3}}', "--output", "x.npz"], "toy.framez: unknown key"),
+        (["observe", "--scenario", "x", "--settings", "no.yaml", "--output", "x.npz"], "no.yaml: this file must be readable"),
+        (["search", "--observations", "no.npz", "--output", "x.json"], "no.npz: this file must be of kind observations"),
+        (["check-data", "no-such-folder"], "no-such-folder"),
+    ],
+)
+def test_bad_input_ends_with_status_2_and_says_why(arguments, message, capsys):
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_check_data_tells_errors_by_its_status(tmp_path, capsys):
+    case = write_case(tmp_path, "single_push_sloth_small")
+    assert main(["check-data", str(case)]) == 0
+    (case / "split.json").write_text(json.dumps({"frame_len": 5, "train": [0, 500], "test": [500, 900]}))
+    assert main(["check-data", str(case)]) == 2
+    assert "split.json" in capsys.readouterr().out
+
+
+def test_sync_reports_a_damaged_record(tmp_path, capsys):
+    tracking.init(tmp_path, config.Tracking())
+    record = tmp_path / "scene" / "method" / "0" / "run.json"
+    record.parent.mkdir(parents=True)
+    record.write_text("{}")
+    assert main(["sync", "--results", str(tmp_path)]) == 1
+    assert "damaged: 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:x", "cuda:-1", "CUDA:0", "cuda:99"])
+def test_a_device_that_is_not_there_is_an_error_not_a_fallback(device):
+    with pytest.raises(InputError, match="device"):
+        resolve_device(device)
