@@ -6,11 +6,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
 
-`config.yaml` is the default (the demo). Overlays merge on top of it, later ones win:
+`config.yaml` is the default (the demo) and always read first. Overlays merge on top of it, later ones win; nested keys are
+set in an overlay:
 
 ```
-snakemake --profile workflow/profiles/default --cores 2 \\
-  --configfile config/config.yaml config/mocap.yaml --config data_root=/path/to/mocap_dlo results=results/mocap
+snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
+  --configfile config/mocap.yaml --config data_root=/path/to/data_set
 ```
 
 Everything is checked before the first job: unknown keys, wrong types (YAML reads `5e-5` as text: write `5.0e-5`), unknown
