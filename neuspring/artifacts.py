@@ -26,6 +26,7 @@ from neuspring.errors import InputError
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
+InitialVelocity = Literal["rest", "observed"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 
@@ -358,6 +359,8 @@ class Simulation:
     """Candidate partners kept per node and frame; more are reported, never written."""
     controller_velocity: bool = False
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
+    initial_velocity: InitialVelocity = "rest"
+    """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
 
     def __post_init__(self) -> None:
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):

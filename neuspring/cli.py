@@ -77,21 +77,28 @@ def _observe(a: argparse.Namespace) -> int:
 def _search(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.search(a.observations, _settings(a.settings), a.seed, a.device, a.output)
+    stages.search(a.observations, _settings(a.settings), a.clusters, a.seed, a.device, a.output)
     return 0
 
 
 def _fit(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.fit(a.observations, a.search, _settings(a.settings), a.device, a.output)
+    stages.fit(a.observations, a.search, _settings(a.settings), a.kind, a.device, a.output)
     return 0
 
 
 def _rollout(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.rollout(a.observations, a.twin, a.device, a.output)
+    stages.rollout(a.observations, a.twin, a.carry_over, a.device, a.output)
+    return 0
+
+
+def _transfer(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    stages.transfer(a.targets, a.twin, a.method, a.seed, _settings(a.settings), a.device, a.output)
     return 0
 
 
@@ -107,7 +114,8 @@ def _tables(a: argparse.Namespace) -> int:
     from neuspring import tables
 
     collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds)
-    print(tables.write(collected, a.baseline or a.methods[0], a.output))
+    transfers = tables.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
+    print(tables.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
     return 0
 
@@ -177,13 +185,26 @@ def _parser() -> argparse.ArgumentParser:
     which.add_argument("--row", help="the row itself, as JSON")
 
     search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
+    search.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
     search.add_argument("--seed", type=int, default=0)
 
     fit = add("fit", _fit, "coarse twin -> fitted twin, by gradients", "observations", "settings", "compute", "output")
     fit.add_argument("--search", type=Path, required=True, help="search.json to start from")
+    fit.add_argument(
+        "--kind", choices=("springs", "field"), default="springs", help="train each spring, or the neural spring field"
+    )
 
     rollout = add("rollout", _rollout, "twin -> trajectory over all frames", "observations", "compute", "output")
-    rollout.add_argument("--twin", type=Path, required=True, help="search.json or fit.json that names the twin")
+    twins = "search.json or fit.json that names the twin; of several, the mean of the trajectories"
+    rollout.add_argument("--twin", type=Path, nargs="+", required=True, help=twins)
+    carry = "carry the residual of the last training frame into the prediction, where training frames say that it helps"
+    rollout.add_argument("--carry-over", action="store_true", help=carry)
+
+    transfer = add("transfer", _transfer, "twin -> scores on other recordings of the object", "settings", "compute", "output")
+    transfer.add_argument("--twin", type=Path, required=True, help="search.json or fit.json that names the twin")
+    transfer.add_argument("--targets", type=Path, nargs="+", required=True, help="observations.npz of the other recordings")
+    transfer.add_argument("--method", required=True)
+    transfer.add_argument("--seed", type=int, default=0)
 
     score = add("score", _score, "trajectory -> scores, plots and run.json", "observations", "output")
     score.add_argument("--search", type=Path, required=True, help="search.json")
@@ -197,6 +218,7 @@ def _parser() -> argparse.ArgumentParser:
     table.add_argument("--scenarios", nargs="+", required=True)
     table.add_argument("--methods", nargs="+", required=True)
     table.add_argument("--seeds", nargs="+", type=int, required=True)
+    table.add_argument("--transfers", nargs="*", default=[], help="scenarios whose twins were rolled out on other recordings")
     table.add_argument("--baseline", help="method that others are compared with (default: the first)")
 
     add("track-init", _track_init, "prepare the MLflow store, once before any run is logged", "results", "settings", "output")

@@ -49,6 +49,8 @@ class Simulation:
     """Candidate partners per node and frame; overflow is reported."""
     controller_velocity: bool = False
     """Controllers have their finite-difference velocity in the dashpots; the released simulator uses zero."""
+    initial_velocity: Literal["rest", "observed"] = "rest"
+    """Velocity in frame 0: zero, as released, or what the first three frames show (for captures that begin in motion)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,14 +142,31 @@ class SearchStart:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Clusters:
+    """Regions of a piecewise topology: agglomerative clustering of the canonical nodes."""
+
+    __pydantic_config__ = STRICT
+    linkage: Literal["ward", "complete", "average", "single"] = "ward"
+    """Which distance between regions is kept small; ward: the growth of their variance."""
+    connectivity: Annotated[int, Field(ge=0)] = 0
+    """Only regions joined by a graph of each node's nearest neighbours may merge: how many; 0 lets any two merge."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Search:
     """Zero-order stage: CMA-ES over homogeneous material and topology."""
 
     __pydantic_config__ = STRICT
     rollouts: Count = 220
-    """Budget in candidate rollouts, used in whole generations (of 11; at least one); every method compared gets the same."""
+    """Budget in candidate rollouts; every method compared gets the same. The last generation may be cut short."""
     sigma: Positive = 1 / 6
     """Initial step in normalised variables."""
+    stiffness_scale: Literal["linear", "log"] = "linear"
+    """Scale on which stiffness is normalised; log needs a positive lower bound."""
+    isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
+    """Nodes without any spring: joined to their 3 nearest nodes, cause for refusing the candidate, or left (as released)."""
+    clusters: Clusters = field(default_factory=Clusters)
+    """Regions of a piecewise topology, see [search.clusters](#searchclusters)."""
     ranges: SearchRanges = field(default_factory=SearchRanges)
     """Bounds, see [search.ranges](#searchranges)."""
     start: SearchStart = field(default_factory=SearchStart)
@@ -159,25 +178,83 @@ class Search:
             value = getattr(self.start, f.name)
             if not low <= value <= high:
                 raise ValueError(f"start.{f.name} = {value} lies outside ranges.{f.name} = [{low}, {high}]")
+        if self.stiffness_scale == "log" and self.ranges.stiffness[0] <= 0:
+            rule = "stiffness_scale: log needs a positive lower bound of ranges.stiffness"
+            raise ValueError(f"{rule}, received {list(self.ranges.stiffness)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringField:
+    """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over canonical spring midpoints."""
+
+    __pydantic_config__ = STRICT
+    triplane: bool = True
+    """Three feature planes (xy, yz, xz), bilinear, summed. Without them F is an MLP on Fourier features of the coordinates."""
+    resolution: Annotated[int, Field(ge=2)] | Literal["adaptive"] = "adaptive"
+    """Texels N per side of a plane; adaptive: round(0.85 sqrt(springs))."""
+    channels: Count = 32
+    """Features per texel, C."""
+    plane_scale: NonNegative = 0.1
+    """Standard deviation of the texels at the start."""
+    hidden: Count = 128
+    """Units per hidden layer of the MLP, which has three layers."""
+    fourier: Literal["feature", "coordinates", "both", "none"] = "both"
+    """What the Fourier transform is applied to: the summed plane feature, the coordinates (concatenated), or both."""
+    bands: Count = 4
+    """Frequencies 1, 2, 4, ... (times pi) of the Fourier transform."""
+    scale: Literal["log", "linear"] = "log"
+    """log: Y = Y0 exp(F). linear: Y = Y0 (1 + F)."""
+    controllers: bool = True
+    """Whether controller springs are covered too; otherwise they keep S0."""
+    plane_learning_rate: Positive | None = None
+    """Of the texels; null: as the MLP."""
+    plane_smoothness: NonNegative = 0.0
+    """Weight of the mean squared difference of neighbouring texels, m^2."""
+    weight_decay: NonNegative = 0.0
+    """Decoupled weight decay of texels and MLP."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """First-order stage: Adam on log stiffness per spring and contact scalars, gradients through the simulation."""
+    """First-order stage: Adam, gradients through the simulation. What is free per spring is a method's `fit`."""
 
     __pydantic_config__ = STRICT
     epochs: Count = 200
     """Passes over the training frames."""
     learning_rate: Positive = 1e-3
-    """Of Adam, on log stiffness and contact scalars."""
+    """Of Adam, on log stiffness per spring or the field's weights."""
+    scalar_learning_rate: Positive | None = None
+    """Of contact scalars, drag and homogeneous factors; null: as `learning_rate`."""
+    rest_learning_rate: Positive | None = None
+    """Of rest lengths that are free beside a field; null: as `learning_rate`."""
     betas: tuple[Beta, Beta] = (0.9, 0.99)
     """Of Adam."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """How the learning rates change over the epochs; cosine: down to a hundredth."""
+    warmup_epochs: Annotated[int, Field(ge=0)] = 0
+    """Epochs over which learning rates rise linearly."""
+    homogeneous_epochs: Annotated[int, Field(ge=0)] = 0
+    """Warm start: in these first epochs one common factor and the scalars are trained, not the single springs."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimiser step, with the gradient through all of them; 0 means all training frames."""
     clip_gradient_norm: NonNegative = 0.0
     """0 disables clipping."""
+    output_bound: NonNegative = 0.0
+    """Springs stay within exp(+-bound) of the searched stiffness (and dashpot), by bound tanh(./bound); 0: unbounded."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation."""
+    damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
+    """Train drag and one factor of all dashpots, or a dashpot per spring (by the field, where the method has one)."""
+    rest_length_bound: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Train rest lengths within exp(+-bound) of the distances in frame 0; 0: fixed."""
+    rest_lengths_by: Literal["springs", "field"] = "springs"
+    """Whether trained rest lengths are free per spring, or an output of the field (for methods that have one)."""
+    selection: Literal["training_loss", "tail"] = "training_loss"
+    """Best epoch by the loss seen while training (paper), or by a held-back tail of the training frames, the start included."""
+    tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """Fraction of the training frames that `selection: tail` holds back from training."""
+    field: SpringField = dataclasses.field(default_factory=SpringField)
+    """See [fit.field](#fitfield)."""
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
 
@@ -185,6 +262,8 @@ class Fit:
         low, high = self.stiffness_range
         if not 0 <= low < high:
             raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
+        if not self.field.triplane and self.field.fourier not in ("coordinates", "both"):
+            raise ValueError(f"field.fourier: coordinates is required without the tri-plane, received {self.field.fourier}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +312,8 @@ class Mocap:
     """Keep only the first frames (after the stride); null keeps all."""
     spacing: Positive = 0.012
     """Distance of rings along the centreline, m."""
+    rings: Annotated[int, Field(ge=2)] | None = None
+    """Number of rings, whatever their spacing: a twin can then move to another recording of the cable; null: by `spacing`."""
     radius: Positive = 0.006
     """Ring radius, m."""
     ring: Annotated[int, Field(ge=3)] = 4
@@ -262,9 +343,13 @@ class Config:
     scenarios: tuple[Name, ...] = ()
     """Rows of the scenario table."""
     methods: tuple[Name, ...] = ()
-    """Rows of the method table; the first is what others are compared with."""
+    """Rows of the method table."""
+    compare_with: Name | None = None
+    """The method that tables compare the others with; the first where it is null or not among `methods`."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
-    """Of the search; every method runs with the same ones."""
+    """Of the search and of a field's first weights; every method runs with the same ones."""
+    transfers: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
+    """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen."""
     results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
     """Folder that everything is written to."""
     data_root: str | None = None
@@ -272,6 +357,8 @@ class Config:
     scenario_table: str = "config/scenarios.tsv"
     """Relative to the Snakefile."""
     method_table: str = "config/methods.yaml"
+    """Relative to the Snakefile."""
+    search_table: str = "config/searches.yaml"
     """Relative to the Snakefile."""
     device: Annotated[str, StringConstraints(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
     """auto (CUDA where it works), cpu, cuda or cuda:N."""
@@ -300,15 +387,33 @@ class Config:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Method:
-    """A row of the method table: which search it starts from and which first-order stage follows."""
+class SearchRow:
+    """A row of the search table: into how many regions the topology is divided, and settings of its own."""
 
     __pydantic_config__ = STRICT
-    search: Literal["uniform"]
-    fit: Literal["springs"] | None
+    clusters: Count
+    """Regions K with their own radius and neighbours: 2K + 10 variables. 1 is the uniform topology."""
     description: str
     settings: dict[str, Any] = field(default_factory=dict)
-    """Fit settings of this method alone (keys of `fit`, for example `horizon: 0`). The search is shared by all methods."""
+    """Search settings of this row alone (keys of `search`), on top of the configuration's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A row of the method table: which search it starts from, which first-order stage follows, how it predicts."""
+
+    __pydantic_config__ = STRICT
+    search: Name
+    """A row of the search table; methods that name the same row share the search."""
+    fit: Literal["springs", "field"] | None
+    """What the first-order stage trains: each spring by itself, or the neural spring field."""
+    description: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Fit settings of this method alone (keys of `fit`, for example `horizon: 0`), on top of the configuration's."""
+    carry_over: bool = False
+    """Carry the residual of the last training frame into the prediction, where training frames say that it helps."""
+    average_seeds: bool = False
+    """Predict the mean of the trajectories of all seeds; costs as many fits as there are seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -378,6 +483,11 @@ def read_methods(path: Path) -> dict[str, Method]:
     return {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
 
 
+def read_searches(path: Path) -> dict[str, SearchRow]:
+    """The search table: name -> SearchRow."""
+    return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
+
+
 def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
     lines = [line for line in _read_text(path).splitlines() if line.strip() and not line.startswith("#")]
@@ -403,7 +513,18 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
 
 def fit_of(config: Config, method: Method, name: str) -> Fit:
     """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
-    return parse(Fit, plain(config.fit) | dict(method.settings), f"method {name}, settings")
+    return parse(Fit, _overlaid(config.fit, method.settings), f"method {name}, settings")
+
+
+def search_of(config: Config, row: SearchRow, name: str) -> Search:
+    """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
+    return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
+
+
+def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
+    values = plain(settings)
+    merge(values, own)
+    return values
 
 
 @dataclass(frozen=True)
@@ -412,7 +533,15 @@ class Benchmark:
 
     config: Config
     scenarios: dict[str, ScenarioRow]
+    """Chosen ones, and those that twins are transferred to."""
     methods: dict[str, Method]
+    searches: dict[str, SearchRow]
+    fits: dict[str, Method]
+    """The methods whose fits are made: of all rows of the table with the same fit, the first."""
+    fit_of_method: dict[str, str]
+    """Chosen method -> the method in whose folder its fit lies."""
+    transfers: dict[str, tuple[str, ...]]
+    """Chosen scenario -> those that its twins are transferred to."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
@@ -424,18 +553,44 @@ class Benchmark:
         scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
         _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
         _require_known("methods", config.methods, methods, config.method_table)
-        chosen = cls(config, {n: scenarios[n] for n in config.scenarios}, {n: methods[n] for n in config.methods})
+        searches, wanted = (
+            read_searches(root / config.search_table),
+            tuple(dict.fromkeys(methods[n].search for n in config.methods)),
+        )
+        _require_known("methods' search", wanted, searches, config.search_table)
+        _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
+        everyone = tuple(name for source, names in config.transfers.items() for name in (source, *names))
+        _require_known("transfers", everyone, scenarios, config.scenario_table)
+        transfers = {source: names for source, names in config.transfers.items() if source in config.scenarios}
+        targets = tuple(name for names in transfers.values() for name in names)
+        owners = {n: _first_alike(config, methods, n) for n in config.methods if methods[n].fit}
+        chosen = cls(
+            config,
+            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets)},
+            {n: methods[n] for n in config.methods},
+            {n: searches[n] for n in wanted},
+            {n: methods[n] for n in owners.values()},
+            owners,
+            transfers,
+        )
         for name in [*chosen.scenarios, *chosen.methods]:
             if name in RESERVED or name.startswith("search-"):
                 rule = f"{', '.join(RESERVED)} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in chosen.methods.items():
-            high, limit = config.search.ranges.stiffness[1], fit_of(config, method, name).stiffness_range[1]
+            high = search_of(config, searches[method.search], method.search).ranges.stiffness[1]
+            limit = fit_of(config, method, name).stiffness_range[1]
             if method.fit and limit < high:
                 rule = f"must reach the search's upper bound of {high}, or springs start beyond their clamp"
                 raise InputError(f"method {name}, fit.stiffness_range", rule, limit)
         chosen._require_data()
         return chosen
+
+    @property
+    def compared_with(self) -> str:
+        """The method that tables compare the others with."""
+        wanted = self.config.compare_with
+        return wanted if wanted in self.methods else self.config.methods[0]  # type: ignore[return-value]
 
     def data_path(self, name: str) -> Path | None:
         """Where a scenario's data lie; None for toy scenes, which need none."""
@@ -456,6 +611,16 @@ class Benchmark:
                 )
             if not path.exists():
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+
+
+def _first_alike(config: Config, methods: Mapping[str, Method], name: str) -> str:
+    """The first row of the table whose fit is that of `name`: same search, same stage, same settings."""
+
+    def fit(other: str) -> tuple[Any, ...]:
+        return methods[other].search, methods[other].fit, fit_of(config, methods[other], other)
+
+    wanted = fit(name)
+    return next(other for other in methods if methods[other].fit and fit(other) == wanted)
 
 
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:

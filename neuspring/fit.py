@@ -1,14 +1,17 @@
-"""First-order stage: stiffness per spring and contact scalars by Adam, gradients through the simulation (section 5.5).
+"""First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation (section 5.5).
 
 An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training
 span) one optimiser step is made with the gradient through those frames; the state is detached there and goes on while
-parameters change. The epoch with the lowest training loss wins; test frames are never read. A non-finite loss or gradient
-restores the parameters of the epoch's start, halves the learning rate and is reported.
+parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the
+training frames, to which the start counts too; test frames are never read. A non-finite loss or gradient restores the
+parameters of the epoch's start, halves the learning rates and is reported.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import time
 import zipfile
 from dataclasses import dataclass, replace
@@ -21,16 +24,17 @@ import torch
 
 from neuspring import config
 from neuspring.artifacts import Observations, Twin, write_atomically
-from neuspring.errors import NumericalFailure
+from neuspring.errors import InputError, NumericalFailure
 from neuspring.losses import FrameLoss
+from neuspring.motion import initial_velocity
+from neuspring.parameters import Kind, TwinParameters
 from neuspring.physics import stability
-from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
+from neuspring.physics.autograd import simulate_frame
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.progress import Progress
 
-TRAINED_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
-LOWEST_STIFFNESS = 1e-3
-"""Stiffness below this is raised to it before taking the logarithm, N."""
+LOWEST_RATE = 0.01
+"""Where the cosine schedule ends, as a fraction of the learning rate."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -50,52 +54,27 @@ class FitProblem:
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
+    kind: Kind = "springs"
+    seed: int = 0
+    """Of the field's first weights."""
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """The best twin, and the history: one row per epoch (epoch, loss, gradient_norm, rolled_back, learning_rate)."""
+    """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate)."""
 
     twin: Twin
     history: pd.DataFrame
     best_epoch: int
+    """The epoch whose end is the result; -1 is the start."""
+    best_loss: float
+    """What selected it: training loss or tail loss, m^2."""
     rollbacks: list[str]
     attempts: int
     """1, plus one for every time the fit continued from a checkpoint."""
     earlier_seconds: float
     """Wall time of the attempts that this one continued, up to their last checkpoint."""
     collision_overflow: int
-
-
-class SpringParameters:
-    """What is trained: theta = log stiffness per spring [S], and four contact scalars (clamped on use, as released)."""
-
-    def __init__(self, twin: Twin, limits: tuple[float, float], device: str) -> None:
-        self._fixed = twin_tensors(twin, device)
-        self._limits = limits
-        stiffness = self._fixed.pop("stiffness").clamp_min(LOWEST_STIFFNESS)
-        self.tensors = {"log_stiffness": stiffness.log().requires_grad_()}
-        for name in TRAINED_SCALARS:
-            self.tensors[name] = self._fixed.pop(name).requires_grad_()
-
-    def stiffness(self) -> torch.Tensor:
-        """Clamped stiffness [S], N."""
-        return self.tensors["log_stiffness"].exp().clamp(*self._limits)
-
-    def pack(self, substep: float) -> Parameters:
-        """Packed for the solver, differentiably."""
-        scalars = {name: self.tensors[name] for name in TRAINED_SCALARS}
-        return pack(stiffness=self.stiffness(), **scalars, **self._fixed, substep=substep)
-
-    def copy(self) -> dict[str, np.ndarray]:
-        """The trained values as arrays."""
-        return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors.items()}
-
-    def restore(self, values: dict[str, np.ndarray]) -> None:
-        """Set the trained values."""
-        with torch.no_grad():
-            for name, tensor in self.tensors.items():
-                tensor.copy_(torch.from_numpy(np.asarray(values[name])))
 
 
 @dataclass
@@ -105,12 +84,15 @@ class _State:
     epoch: int
     values: dict[str, np.ndarray]
     moments: dict[str, np.ndarray]
-    learning_rate: float
+    rate: float
     history: list[dict[str, Any]]
     rollbacks: list[str]
     best_epoch: int
+    best_loss: float
     best_values: dict[str, np.ndarray]
+    best_substeps: int
     substeps: int
+    overflow: int = 0
     attempts: int = 1
     seconds: float = 0.0
 
@@ -120,10 +102,13 @@ class _State:
         meta = {
             "key": key,
             "epoch": self.epoch,
-            "learning_rate": self.learning_rate,
+            "rate": self.rate,
             "history": self.history,
             "rollbacks": self.rollbacks,
             "best_epoch": self.best_epoch,
+            "best_loss": self.best_loss,
+            "best_substeps": self.best_substeps,
+            "overflow": self.overflow,
             "substeps": self.substeps,
             "attempts": self.attempts,
             "seconds": seconds,
@@ -159,22 +144,38 @@ class _State:
         return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **meta)
 
 
-class SpringFit:
+class TwinFit:
     """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
 
     def __init__(self, problem: FitProblem) -> None:
         self.problem = problem
-        observations = problem.observations
-        self.parameters = SpringParameters(problem.twin, problem.fit.stiffness_range, problem.device)
+        observations, settings = problem.observations, problem.fit
+        self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
             observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators
         )
-        hands = torch.tensor(observations.controller_points[: observations.scenario.train_end], device=problem.device)
-        self.hands = hands
+        end = observations.scenario.train_end
+        self.hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        held_back = round(settings.tail_fraction * (end - 1)) if settings.selection == "tail" else 0
+        if settings.selection == "tail" and end < 3:
+            raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
+        # At least one frame to train on and one to select by.
+        self.head_end = end - min(max(held_back, int(settings.selection == "tail")), end - 2)
+        self.horizon = settings.horizon or self.head_end - 1
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
-        self.optimiser = torch.optim.Adam(self.parameters.tensors.values(), lr=problem.fit.learning_rate, betas=problem.fit.betas)
+        velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
+        self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
+        self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas)
         self.twin = problem.twin
         self._solver: FrameSolver | None = None
+        self._overflow = 0
+        self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
+        """The last spectrum that was computed, and for which stiffness and dashpots."""
+
+    @property
+    def one_step(self) -> bool:
+        """Whether an epoch is a single optimiser step, so that its losses belong to the values before it."""
+        return self.horizon >= self.head_end - 1
 
     def solver(self) -> FrameSolver:
         """The solver for the present number of substeps."""
@@ -184,63 +185,115 @@ class SpringFit:
             self._solver = FrameSolver(topology.springs, *counts, self.twin.simulation, device=self.problem.device)
         return self._solver
 
+    @property
+    def collision_overflow(self) -> int:
+        """Collision candidates that did not fit the list, summed over all solvers so far."""
+        return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
+
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
         if count != self.twin.simulation.substeps:
             self.twin = replace(self.twin, simulation=replace(self.twin.simulation, substeps=count))
-            self._solver = None
+            self._overflow, self._solver = self.collision_overflow, None
 
-    def settle(self) -> None:
-        """See that the present stiffness can be integrated: ask for more substeps where they may grow.
+    def settled(self) -> Parameters:
+        """The present parameters, packed, after seeing that they can be integrated.
 
-        Raises NonFinite where they may not (a fixed count, the released 667, `max_substeps`) and the bound is passed.
+        More substeps are taken where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
+        `max_substeps`) and the bound is passed.
         """
-        chosen, frame_time = self.problem.simulation, self.twin.simulation.frame_time
-        spectrum = stability.twin_spectrum(self.as_twin(self.parameters.copy()))
-        load = spectrum.load(self.twin.simulation.substep)
-        # Half of the safety margin is kept for the parameters' way through the next epoch.
-        if load < stability.LIMIT * (1 + chosen.safety) / 2:
-            return
-        count = stability.smallest_safe_substeps(spectrum, frame_time, chosen.safety)
+        packed = self.parameters.pack(self.twin.simulation.substep)
+        springs = packed.springs.detach().double().cpu().numpy()
+        count = self._needed_substeps(springs[:, 0] * springs[:, 1], springs[:, 2])
+        if count <= self.twin.simulation.substeps:
+            return packed
+        self.use_substeps(count)
+        return self.parameters.pack(self.twin.simulation.substep)
+
+    def _needed_substeps(self, stiffness: np.ndarray, dashpot: np.ndarray) -> int:
+        """Substeps per frame for stiffness Y / l0 [S] and dashpots [S]. Raises NonFinite."""
+        chosen, simulation = self.problem.simulation, self.twin.simulation
+        # Half of the safety margin is kept for the parameters' way to the next look.
+        enough = stability.LIMIT * (1 + chosen.safety) / 2
+        if self._known is not None:
+            # K and C grow at most as much as their fastest growing spring (sums of positive semidefinite terms).
+            known, k, c = self._known
+            grown = stability.Spectrum(known.stiffness * _growth(stiffness, k), known.damping * _growth(dashpot, c), known.node)
+            if grown.load(simulation.substep) < enough:
+                return simulation.substeps
+        topology = self.twin.topology
+        spectrum = stability.rest_spectrum(topology.springs, topology.nodes, topology.controllers, stiffness, dashpot)
+        self._known = (spectrum, stiffness, dashpot)
+        if spectrum.load(simulation.substep) < enough:
+            return simulation.substeps
+        count = stability.smallest_safe_substeps(spectrum, simulation.frame_time, chosen.safety)
         may_grow = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
         if may_grow and count <= chosen.max_substeps:
-            self.use_substeps(count)
-        elif load >= stability.LIMIT:
-            raise NonFinite(f"stiffness grew beyond what {self.twin.simulation.substeps} substeps per frame can integrate")
+            return count
+        if spectrum.load(simulation.substep) >= stability.LIMIT:
+            raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
+        return simulation.substeps
 
-    def as_twin(self, values: dict[str, np.ndarray]) -> Twin:
-        """A twin with the given trained values, clamped as they are used."""
-        low, high = self.problem.fit.stiffness_range
-        stiffness = np.clip(np.exp(values["log_stiffness"].astype(np.float64)), low, high)
-        limits = {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}
-        scalars: dict[str, Any] = {n: float(np.clip(values[n], *limits[n.rpartition("_")[2]])) for n in TRAINED_SCALARS}
-        return replace(self.twin, material=replace(self.twin.material, stiffness=stiffness, **scalars))
+    def start_epoch(self, epoch: int, rate: float) -> None:
+        """Set what an epoch trains, and the learning rates: the settings' times `rate` (halved by rollbacks)."""
+        settings = self.problem.fit
+        self.parameters.homogeneous = epoch < settings.homogeneous_epochs
+        factor = rate * min((epoch + 1) / (settings.warmup_epochs + 1), 1.0)
+        if settings.schedule == "cosine":
+            factor *= LOWEST_RATE + (1 - LOWEST_RATE) * (1 + math.cos(math.pi * epoch / settings.epochs)) / 2
+        for group in self.optimiser.param_groups:
+            group["lr"] = factor * group["base_rate"]
 
-    def epoch(self) -> tuple[float, float]:
-        """One pass; returns the mean frame loss while parameters change, and the largest gradient norm. Raises NonFinite."""
-        solver, horizon = self.solver(), self.problem.fit.horizon or len(self.hands) - 1
-        x, v = self.rest, torch.zeros_like(self.rest)
-        total, largest = 0.0, 0.0
-        for start in range(1, len(self.hands), horizon):
-            window = range(start, min(start + horizon, len(self.hands)))
+    def epoch(self) -> dict[str, float]:
+        """One pass over the frames that are trained on; raises NonFinite.
+
+        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and, if
+        frames are held back and the epoch is one step, their `tail_loss` before it.
+        """
+        x, v = self.rest, self.velocity
+        total, largest, row = 0.0, 0.0, {}
+        for start in range(1, self.head_end, self.horizon):
+            window = range(start, min(start + self.horizon, self.head_end))
             self.optimiser.zero_grad(set_to_none=True)
-            packed = self.parameters.pack(self.twin.simulation.substep)
-            losses = []
-            for frame in window:
-                x, v = simulate_frame(solver, packed, x, v, self.hands[frame - 1], self.hands[frame])
-                losses.append(self.loss(frame, x))
-            mean = torch.stack(losses).mean()
+            packed = self.settled()
+            x, v, mean = self._simulate(x, v, window, packed)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
-            if mean.requires_grad:
-                mean.backward()  # type: ignore[no-untyped-call]
-            largest = max(largest, self._step(window))
+            objective = mean + self.parameters.penalty()
+            if objective.requires_grad:
+                objective.backward()  # type: ignore[no-untyped-call]
             total += float(mean.detach()) * len(window)
             x, v = x.detach(), v.detach()
-        return total / (len(self.hands) - 1), largest
+            if self.one_step and self.head_end < len(self.hands):
+                with torch.no_grad():
+                    row["tail_loss"] = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+            largest = max(largest, self._step(window))
+        return row | {"loss": total / (self.head_end - 1), "gradient_norm": largest}
+
+    def tail_loss(self) -> float:
+        """Mean loss of the held-back frames, m^2, in a rollout from rest with the present values. Raises NonFinite."""
+        with torch.no_grad():
+            packed = self.settled()
+            x, v = self.rest, self.velocity
+            for frame in range(1, self.head_end):
+                x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
+            loss = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+        if not math.isfinite(loss):
+            raise NonFinite("the loss of the held-back frames is not finite")
+        return loss
+
+    def _simulate(
+        self, x: torch.Tensor, v: torch.Tensor, window: range, packed: Parameters
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """State after the frames of `window`, and their mean loss."""
+        losses = []
+        for frame in window:
+            x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
+            losses.append(self.loss(frame, x))
+        return x, v, torch.stack(losses).mean()
 
     def _step(self, window: range) -> float:
-        tensors = [tensor for tensor in self.parameters.tensors.values() if tensor.grad is not None]
+        tensors = [tensor for tensor in self.parameters.parameters() if tensor.grad is not None]
         norm = torch.nn.utils.get_total_norm([tensor.grad for tensor in tensors])  # type: ignore[misc]
         if not bool(torch.isfinite(norm)):
             raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
@@ -255,8 +308,8 @@ class SpringFit:
         state = self.optimiser.state_dict()["state"]
         return {f"{index}.{name}": value.cpu().numpy().copy() for index, slots in state.items() for name, value in slots.items()}
 
-    def restore(self, values: dict[str, np.ndarray], moments: dict[str, np.ndarray], learning_rate: float) -> None:
-        """Set parameters, Adam's state and the learning rate."""
+    def restore(self, values: dict[str, np.ndarray], moments: dict[str, np.ndarray]) -> None:
+        """Set parameters and Adam's state."""
         self.parameters.restore(values)
         state: dict[int, dict[str, torch.Tensor]] = {}
         for name, value in moments.items():
@@ -264,57 +317,77 @@ class SpringFit:
             state.setdefault(int(index), {})[slot] = torch.from_numpy(value.copy())
         stored = self.optimiser.state_dict()
         stored["state"] = state
-        for group in stored["param_groups"]:
-            group["lr"] = learning_rate
         self.optimiser.load_state_dict(stored)
 
 
 def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "") -> FitResult:
-    """Fit stiffness per spring. `partial` is where checkpoints go; one with the same `key` is continued from.
+    """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
     Raises NumericalFailure if no epoch could be completed.
     """
     clock = time.perf_counter()
-    run = SpringFit(problem)
+    run = TwinFit(problem)
     state = _State.load(partial, key)
     if state is None:
         initial = run.parameters.copy()
         substeps = problem.twin.simulation.substeps
-        state = _State(0, initial, {}, problem.fit.learning_rate, [], [], -1, initial, substeps)
-    earlier = state.seconds
+        state = _State(0, initial, {}, 1.0, [], [], -1, math.inf, initial, substeps, substeps)
+        if problem.fit.selection == "tail" and not run.one_step:
+            # A start that cannot be simulated does not win; if no epoch can be completed either, that is said below.
+            with contextlib.suppress(NonFinite):
+                state.best_loss = run.tail_loss()
+    earlier, overflow = state.seconds, state.overflow
     run.use_substeps(state.substeps)
-    run.restore(state.values, state.moments, state.learning_rate)
+    run.restore(state.values, state.moments)
     progress = Progress(f"fit {problem.observations.scenario.name}", problem.fit.epochs)
-    overflow = 0
     while state.epoch < problem.fit.epochs and len(state.rollbacks) < MAX_ROLLBACKS:
         _advance(run, state, problem)
-        overflow = max(overflow, run.solver().collision_overflow)
+        state.overflow = overflow + run.collision_overflow
         last = state.history[-1]
         progress.update(state.epoch, f"loss {last['loss']:.3e} m^2" if not last["rolled_back"] else "rolled back")
         if partial is not None and state.epoch % problem.fit.checkpoint_every == 0:
             state.save(partial, key, earlier + time.perf_counter() - clock)
-    if state.best_epoch < 0:
+    if not math.isfinite(state.best_loss):
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
-    best = run.as_twin(state.best_values)
-    return FitResult(best, pd.DataFrame(state.history), state.best_epoch, state.rollbacks, state.attempts, earlier, overflow)
+    run.parameters.restore(state.best_values)
+    run.parameters.homogeneous = False
+    run.use_substeps(state.best_substeps)
+    best = run.parameters.as_twin(run.twin)
+    outcome = (state.best_epoch, state.best_loss, state.rollbacks, state.attempts, earlier, state.overflow)
+    return FitResult(best, pd.DataFrame(state.history), *outcome)
 
 
-def _advance(run: SpringFit, state: _State, problem: FitProblem) -> None:
+def _growth(values: np.ndarray, reference: np.ndarray) -> float:
+    """The largest ratio of `values` to `reference` [S], both >= 0; infinite where something grew from nothing."""
+    ratio = np.divide(values, reference, out=np.where(values > 0, np.inf, 0.0), where=reference > 0)
+    return float(ratio.max(initial=0.0))
+
+
+def _advance(run: TwinFit, state: _State, problem: FitProblem) -> None:
     """One epoch, or its rollback, recorded in `state`. Accepted values can always be integrated with `state.substeps`."""
-    row: dict[str, Any] = {"epoch": state.epoch, "learning_rate": state.learning_rate, "rolled_back": False}
+    row: dict[str, Any] = {"epoch": state.epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
+    run.start_epoch(state.epoch, state.rate)
+    row["learning_rate"] = run.optimiser.param_groups[0]["lr"]
     try:
-        loss, norm = run.epoch()
-        run.settle()
+        before = (state.values, state.substeps)
+        found = run.epoch()
+        run.settled()
+        if problem.fit.selection == "tail" and not run.one_step:
+            found["tail_loss"] = run.tail_loss()
         state.values, state.moments, state.substeps = run.parameters.copy(), run.moments(), run.twin.simulation.substeps
-        row |= {"loss": loss, "gradient_norm": norm}
-        if _eligible(state.epoch, problem) and loss < _best_loss(state):
-            state.best_epoch, state.best_values = state.epoch, state.values
+        row |= found
+        loss = found["tail_loss" if problem.fit.selection == "tail" else "loss"]
+        if _eligible(state.epoch, problem) and loss < state.best_loss:
+            state.best_loss = loss
+            state.best_epoch = state.epoch - run.one_step
+            state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
     except NonFinite as failure:
         state.rollbacks.append(f"epoch {state.epoch}: {failure}")
-        print(f"rolled back: {state.rollbacks[-1]}; the learning rate is halved")
-        state.learning_rate /= 2
-        run.restore(state.values, state.moments, state.learning_rate)
-        row |= {"loss": None, "gradient_norm": None, "rolled_back": True}
+        print(f"rolled back: {state.rollbacks[-1]}; the learning rates are halved")
+        state.rate /= 2
+        run.use_substeps(state.substeps)
+        run.restore(state.values, state.moments)
+        row["rolled_back"] = True
     state.history.append(row)
     state.epoch += 1
 
@@ -323,7 +396,3 @@ def _eligible(epoch: int, problem: FitProblem) -> bool:
     """Whether an epoch may become the best: all of them, or with the released quirk every 20th and the last."""
     last = problem.fit.epochs - 1
     return not problem.quirks.sparse_checkpoints or epoch % RELEASED_CHECKPOINT_EPOCHS == 0 or epoch == last
-
-
-def _best_loss(state: _State) -> float:
-    return float(state.history[state.best_epoch]["loss"]) if state.best_epoch >= 0 else float("inf")

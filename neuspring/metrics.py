@@ -6,7 +6,7 @@ Track: annotated tracks, matched to the nearest of all nodes at frame 0, Euclide
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -71,14 +71,21 @@ def score(trajectory: Trajectory, observations: Observations, method: str, seed:
 
     a task without frames, a metric without annotation, a task that the rollout diverged in.
     """
+    tasks = {task: task_frames(observations.scenario, task) for task in TASKS}
+    return score_tasks(trajectory, observations, method, seed, tasks)
+
+
+def score_tasks(
+    trajectory: Trajectory, observations: Observations, method: str, seed: int, tasks: Mapping[str, range]
+) -> pd.DataFrame:
+    """As `score`, for any tasks: name -> frames that it averages over."""
     scenario = observations.scenario
     rows = []
     per_frame = {
         "chamfer": chamfer_per_frame(trajectory.positions, observations),
         "track_error": track_error_per_frame(trajectory.positions, observations),
     }
-    for task in TASKS:
-        frames = task_frames(scenario, task)
+    for task, frames in tasks.items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue
         for metric, values in per_frame.items():

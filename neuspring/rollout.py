@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,10 +25,15 @@ class Diverged(Exception):
         self.frame, self.reason = frame, reason
 
 
-def frames(twin: Twin, solver: FrameSolver, hands: torch.Tensor) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
-    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3], from rest. Raises Diverged."""
+def frames(
+    twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None
+) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
+    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3]. Raises Diverged.
+
+    `velocity` [N, 3], m/s, is that of frame 0; none means at rest.
+    """
     x = torch.tensor(twin.topology.nodes, dtype=solver.dtype, device=solver.device)
-    v = torch.zeros_like(x)
+    v = torch.zeros_like(x) if velocity is None else torch.tensor(velocity, dtype=x.dtype, device=x.device)
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
         # NaN compares false, so this catches it together with infinity and absurd distances.
@@ -48,9 +54,13 @@ def solver_for(twin: Twin, device: str) -> FrameSolver:
 
 
 def roll_out(
-    twin: Twin, controller_points: np.ndarray, device: str = "cpu", progress: Callable[[int], None] | None = None
+    twin: Twin,
+    controller_points: np.ndarray,
+    device: str = "cpu",
+    progress: Callable[[int], None] | None = None,
+    velocity: np.ndarray | None = None,
 ) -> Trajectory:
-    """Simulate from rest over controller_points [T, C, 3], m. Divergence ends the rollout as a named result.
+    """Simulate over controller_points [T, C, 3], m, from velocity [N, 3], m/s (none: at rest). Divergence is a named result.
 
     Raises InputError if the substep is beyond the stability bound.
     """
@@ -60,7 +70,7 @@ def roll_out(
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
     try:
-        for frame, x, _ in frames(twin, solver, hands):
+        for frame, x, _ in frames(twin, solver, hands, velocity):
             positions.append(x.cpu())
             if progress is not None:
                 progress(frame)
@@ -72,4 +82,16 @@ def roll_out(
         diverged_frame=diverged,
         reason=reason,
         collision_overflow=solver.collision_overflow,
+    )
+
+
+def mean_trajectory(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """The mean of complete rollouts with equally many frames and nodes; one is returned as it is."""
+    if len(trajectories) == 1:
+        return trajectories[0]
+    mean: np.ndarray = np.stack([one.positions for one in trajectories]).mean(axis=0, dtype=np.float64)
+    return replace(
+        trajectories[0],
+        positions=mean,
+        collision_overflow=max(one.collision_overflow for one in trajectories),
     )

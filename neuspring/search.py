@@ -1,14 +1,15 @@
 """Zero-order stage: CMA-ES over topology and homogeneous material (dataset facts, section 5.4).
 
-Variables are normalised to [0, 1] by their ranges. A candidate is a whole twin: its springs are built, it is rolled out
-over the training frames, and its cost is the mean training loss. The best evaluated candidate wins. Every candidate is kept
-in a trace, from which a killed search continues: CMA-ES is replayed with the recorded costs.
+Variables are normalised to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
+whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
+evaluated candidate wins. Every candidate is kept in a trace, from which a killed search continues, or a finished one with
+a larger budget: CMA-ES is replayed with the recorded costs.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,15 @@ from neuspring import config
 from neuspring.artifacts import Material, Observations, Simulation, Twin, write_atomically
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.losses import FrameLoss, acceleration
+from neuspring.motion import initial_velocity
 from neuspring.physics import stability
 from neuspring.progress import Progress
 from neuspring.rollout import Diverged, frames, solver_for
-from neuspring.topology import uniform_topology
+from neuspring.topology import isolated, piecewise_topology, regions
 
-VARIABLES = tuple(f.name for f in fields(config.SearchRanges))
 INTEGERS = ("object_neighbours", "controller_neighbours")
+REGIONAL = ("object_radius", "object_neighbours")
+"""Variables of which every region has its own."""
 PENALTY = 1e6
 """Cost of a candidate that diverges or cannot be integrated; far above any loss in square metres."""
 UNSTABLE = "unstable"
@@ -45,22 +48,55 @@ class SearchProblem:
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
+    clusters: int = 1
+    labels: np.ndarray = field(init=False)
+    """Region of each node [N]."""
+    velocity: np.ndarray = field(init=False)
+    """Velocity of each node in frame 0 [N, 3], m/s."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", regions(self.observations.nodes, self.clusters, self.search.clusters))
+        object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
 
-def decode(normalised: np.ndarray, ranges: config.SearchRanges) -> dict[str, float]:
-    """Physical values of normalised variables [12]; neighbour counts are truncated to integers."""
-    values = {}
-    for name, u in zip(VARIABLES, normalised, strict=True):
-        low, high = getattr(ranges, name)
-        value = low + float(u) * (high - low)
-        values[name] = float(int(value)) if name in INTEGERS else value
-    return values
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables: those of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one region)."""
+        names: list[str] = []
+        for f in fields(config.SearchRanges):
+            regional = f.name in REGIONAL and self.clusters > 1
+            names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
+        return tuple(names)
 
+    def decode(self, normalised: np.ndarray) -> dict[str, float]:
+        """Physical values of normalised variables [2K + 10]; neighbour counts are truncated to integers."""
+        values = {}
+        for name, u in zip(self.variables, normalised, strict=True):
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
+            if self._logarithmic(base):
+                values[name] = float(low * (high / low) ** float(u))
+            else:
+                value = low + float(u) * (high - low)
+                values[name] = float(int(value)) if base in INTEGERS else value
+        return values
 
-def encode(start: config.SearchStart, ranges: config.SearchRanges) -> np.ndarray:
-    """Normalised variables [12] of the starting values."""
-    limits = [getattr(ranges, name) for name in VARIABLES]
-    return np.array([(getattr(start, name) - low) / (high - low) for name, (low, high) in zip(VARIABLES, limits, strict=True)])
+    def encode(self) -> np.ndarray:
+        """Normalised variables [2K + 10] of the starting values."""
+        normalised = []
+        for name in self.variables:
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
+            value = getattr(self.search.start, base)
+            logarithmic = self._logarithmic(base)
+            normalised.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
+        return np.array(normalised)
+
+    def of_regions(self, values: dict[str, float], name: str) -> list[float]:
+        """A regional variable's value in each region."""
+        return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
+
+    def _logarithmic(self, name: str) -> bool:
+        return name == "stiffness" and self.search.stiffness_scale == "log"
 
 
 def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
@@ -75,6 +111,7 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         self_collision=scenario.self_collision,
         collision_capacity=chosen.collision_capacity,
         controller_velocity=chosen.controller_velocity,
+        initial_velocity=chosen.initial_velocity,
     )
 
 
@@ -97,18 +134,23 @@ def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
 
 def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
-    observations = problem.observations
-    topology = uniform_topology(
+    observations, rule = problem.observations, problem.search.isolated_nodes
+    topology = piecewise_topology(
         observations.nodes,
         observations.controller_points[0],
-        values["object_radius"],
-        int(values["object_neighbours"]),
+        problem.labels,
+        problem.of_regions(values, "object_radius"),
+        [int(n) for n in problem.of_regions(values, "object_neighbours")],
         values["controller_radius"],
         int(values["controller_neighbours"]),
+        repair=rule == "repair",
     )
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
+    lonely = isolated(len(topology.nodes), topology.springs)
+    if rule == "penalise" and len(lonely):
+        raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
     material = Material(
         stiffness=np.full(count, values["stiffness"]),
         dashpot=np.full(count, values["dashpot"]),
@@ -128,11 +170,11 @@ def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, in
     Raises Diverged.
     """
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    before = torch.zeros((len(twin.topology.nodes), 3), device=problem.device)
+    before = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
     previous: torch.Tensor | None = None
     total = 0.0
     solver = solver_for(twin, problem.device)
-    for frame, x, v in frames(twin, solver, hands):
+    for frame, x, v in frames(twin, solver, hands, problem.velocity):
         total += float(loss(frame, x))
         change = v - before
         if previous is not None:
@@ -155,39 +197,50 @@ class SearchResult:
     """Wall time of the attempts that this one continued, up to their last complete generation."""
 
 
-def search(problem: SearchProblem, seed: int, *, partial: Path | None = None, key: str = "") -> SearchResult:
+def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
     """Run the search within its budget of rollouts.
 
-    `partial` is where the trace is kept after every generation; a file with the same `key` there is continued from.
-    Raises NumericalFailure if no candidate could be simulated.
+    `record` is where the trace is kept, written after every generation; a file with the same `key` there is continued from,
+    whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
     clock = time.perf_counter()
-    strategy, trace, attempts, earlier = _resume(problem.search, seed, partial, key)
+    trace, attempts, earlier = _recorded(record, key)
+    known = len(trace)
+    strategy = _strategy(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    progress = Progress(f"search {problem.observations.scenario.name} seed {seed}", problem.search.rollouts)
-    # Whole generations only: CMA-ES learns from complete populations, and every method gets the same count.
-    while len(trace) + strategy.popsize <= max(problem.search.rollouts, strategy.popsize):
-        population = strategy.ask()
-        for normalised in population:
+    budget = problem.search.rollouts
+    progress = Progress(f"search {problem.observations.scenario.name} seed {seed}", budget)
+    done = 0
+    # The last generation may be cut short, so that searches of any population size use exactly the same budget.
+    while done < budget:
+        population = strategy.ask()[: budget - done]
+        if not _replays(trace[done : done + len(population)], population, problem.variables):
+            print(f"{record}: does not replay on this machine; the search continues afresh from rollout {done}")
+            trace, known = trace[:done], done
+            if not done:
+                attempts, earlier = 1, 0.0
+        for normalised in population[max(len(trace) - done, 0) :]:
             trace.append(_evaluate(problem, np.asarray(normalised), loss, len(trace), strategy.countiter))
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
-        strategy.tell(population, [row["cost"] for row in trace[-len(population) :]])
-        if partial is not None:
-            _save_partial(partial, key, trace, attempts, earlier + time.perf_counter() - clock)
-    table = pd.DataFrame(trace)
+        done += len(population)
+        if len(population) == strategy.popsize:
+            strategy.tell(population, [row["cost"] for row in trace[done - len(population) : done]])
+        if record is not None and len(trace) > known:
+            _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
+    table = pd.DataFrame(trace[:budget])
     best = table.iloc[int(table["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
         if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
             rule = f"at least one of {len(table)} candidates must be stable with this count"
             raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
-    values = {name: float(best[name]) for name in VARIABLES}
+    values = {name: float(best[name]) for name in problem.variables}
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
 
 
-def _strategy(settings: config.Search, seed: int) -> cma.CMAEvolutionStrategy:
+def _strategy(problem: SearchProblem, seed: int) -> cma.CMAEvolutionStrategy:
     # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
     options = {
         "bounds": [0, 1],
@@ -198,12 +251,12 @@ def _strategy(settings: config.Search, seed: int) -> cma.CMAEvolutionStrategy:
         "tolx": 0,
         "tolstagnation": np.inf,
     }
-    return cma.CMAEvolutionStrategy(encode(settings.start, settings.ranges), settings.sigma, options)
+    return cma.CMAEvolutionStrategy(problem.encode(), problem.search.sigma, options)
 
 
 def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
     start = time.perf_counter()
-    values = decode(normalised, problem.search.ranges)
+    values = problem.decode(normalised)
     row: dict[str, Any] = {
         "rollout": index,
         "generation": generation,
@@ -224,22 +277,18 @@ def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, i
         # A fixed substep count that this candidate is too stiff for: penalised, like divergence.
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
-    return row | values | {f"normalised.{name}": float(u) for name, u in zip(VARIABLES, normalised, strict=True)}
+    return row | values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalised, strict=True)}
 
 
-def _save_partial(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
+def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
     table = pd.DataFrame(trace)
     table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
     write_atomically(path, lambda p: table.to_parquet(p))
 
 
-_Start = tuple[cma.CMAEvolutionStrategy, list[dict[str, Any]], int, float]
-
-
-def _resume(settings: config.Search, seed: int, path: Path | None, key: str) -> _Start:
-    """(strategy, candidates, attempts, seconds) of a recorded search, by replaying it; a fresh start if none matches."""
-    strategy = _strategy(settings, seed)
-    fresh: _Start = (strategy, [], 1, 0.0)
+def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
+    """(candidates, attempts, seconds) of a recorded search with this key; (nothing, 1, 0) if there is none."""
+    fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
     if path is None or not path.is_file():
         return fresh
     try:
@@ -250,14 +299,14 @@ def _resume(settings: config.Search, seed: int, path: Path | None, key: str) -> 
     if table.attrs.get("key") != key:
         print(f"{path}: made with other inputs or settings; the search starts afresh")
         return fresh
-    columns = [f"normalised.{name}" for name in VARIABLES]
-    for start in range(0, len(table), strategy.popsize):
-        rows = table.iloc[start : start + strategy.popsize]
-        population = strategy.ask()
-        if len(rows) != strategy.popsize or not np.array_equal(np.asarray(population), rows[columns].to_numpy()):
-            print(f"{path}: does not replay on this machine; the search starts afresh")
-            return _strategy(settings, seed), [], 1, 0.0
-        strategy.tell(population, rows["cost"].tolist())
     print(f"continuing the search after {len(table)} rollouts")
     records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
-    return strategy, records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
+    return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
+
+
+def _replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
+    """Whether recorded candidates are those that CMA-ES asks for now."""
+    return all(
+        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), asked)
+        for row, asked in zip(rows, population, strict=False)
+    )

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.errors import NumericalFailure
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
+Kind = Literal["springs", "field"]
 RESULT_ROLES = ("twin", "trajectory")
 """Files of a stage that are its result, as opposed to how it got there."""
 
@@ -52,8 +53,11 @@ def observe(row: ScenarioRow, settings: Config, output: Path) -> None:
     observations.save(output)
 
 
-def search(observations_path: Path, settings: Config, seed: int, device: str, output: Path) -> None:
-    """Observations -> coarse twin (twin.npz), the trace of candidates (trace.parquet), search.json."""
+def search(observations_path: Path, settings: Config, clusters: int, seed: int, device: str, output: Path) -> None:
+    """Observations -> coarse twin (twin.npz), search.json, and trace.parquet with every candidate, its cost and variables.
+
+    A trace that is already there is continued from if it fits, so a larger `search.rollouts` costs only the difference.
+    """
     from neuspring.physics.solver import resolve_device
     from neuspring.search import SearchProblem
     from neuspring.search import search as run
@@ -61,26 +65,28 @@ def search(observations_path: Path, settings: Config, seed: int, device: str, ou
     clock = Stopwatch()
     observations = Observations.load(observations_path)
     device = resolve_device(device)
-    problem = SearchProblem(observations, settings.search, settings.simulation, settings.losses, settings.released_quirks, device)
+    sections = (settings.search, settings.simulation, settings.losses, settings.released_quirks)
+    problem = SearchProblem(observations, *sections, device, clusters)
     chosen = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
     common: dict[str, Any] = {
         "inputs": {"observations": digest_file(observations_path)},
-        "settings": chosen | {"seed": seed},
+        "settings": chosen | {"clusters": clusters, "seed": seed},
         "device": device,
     }
-    key = _key(common["inputs"], common["settings"], device, "neuspring.search")
-    partial = output.with_name("search.partial.parquet")
+    # The budget is not part of the key: a search with a larger one begins with the same candidates.
+    same = common["settings"] | {"search": {name: value for name, value in chosen["search"].items() if name != "rollouts"}}
+    key = _key(common["inputs"], same, device, "neuspring.search")
+    trace = output.with_name("trace.parquet")
     try:
-        result = run(problem, seed, partial=partial, key=key)
+        result = run(problem, seed, record=trace, key=key)
     except NumericalFailure as failure:
         clock.stage("search", "failed", reason=str(failure), **common).save(output)
         return
     folder = output.parent
     result.twin.save(folder / "twin.npz")
-    write_table(result.trace, folder / "trace.parquet")
     costs = result.trace["cost"]
     write_table(_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}), folder / "history.parquet")
-    files = {"twin": folder / "twin.npz", "trace": folder / "trace.parquet", "history": folder / "history.parquet"}
+    files = {"twin": folder / "twin.npz", "trace": trace, "history": folder / "history.parquet"}
     facts = {
         **result.values,
         "cost": result.cost,
@@ -92,11 +98,13 @@ def search(observations_path: Path, settings: Config, seed: int, device: str, ou
     clock.stage(
         "search", "ok", files, facts=facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds, **common
     ).save(output)
-    partial.unlink(missing_ok=True)
 
 
-def fit(observations_path: Path, search_record: Path, settings: Config, device: str, output: Path) -> None:
-    """Observations + coarse twin -> fitted twin (twin.npz), losses per epoch (history.parquet), fit.json."""
+def fit(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> None:
+    """Observations + coarse twin -> fitted twin (twin.npz), losses per epoch (history.parquet), fit.json.
+
+    `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
+    """
     from neuspring.fit import FitProblem
     from neuspring.fit import fit as run
     from neuspring.physics.solver import resolve_device
@@ -106,13 +114,17 @@ def fit(observations_path: Path, search_record: Path, settings: Config, device: 
     device = resolve_device(device)
     chosen = {name: config.plain(getattr(settings, name)) for name in ("fit", "simulation", "losses", "released_quirks")}
     inputs = {"observations": digest_file(observations_path), "search": digest_file(search_record)}
-    common: dict[str, Any] = {"inputs": inputs, "settings": chosen, "device": device}
+    # The seed is the search's; it also draws a field's first weights.
+    seed = before.settings["seed"]
+    common: dict[str, Any] = {"inputs": inputs, "settings": chosen | {"kind": kind, "seed": seed}, "device": device}
     if before.status == "failed":
         clock.stage("fit", "failed", reason=f"search: {before.reason}", **common).save(output)
         return
     coarse = Twin.load(before.file("twin", search_record))
-    problem = FitProblem(observations, coarse, settings.fit, settings.simulation, settings.losses, settings.released_quirks, device)
-    key = _key({"observations": inputs["observations"], "twin": before.files["twin"][1]}, chosen, device, "neuspring.fit")
+    sections = (settings.fit, settings.simulation, settings.losses, settings.released_quirks)
+    problem = FitProblem(observations, coarse, *sections, device, kind, int(seed))
+    same = {"observations": inputs["observations"], "twin": before.files["twin"][1]}
+    key = _key(same, common["settings"], device, "neuspring.fit")
     partial = output.with_name("fit.partial.npz")
     try:
         result = run(problem, partial=partial, key=key)
@@ -121,11 +133,11 @@ def fit(observations_path: Path, search_record: Path, settings: Config, device: 
         return
     folder = output.parent
     result.twin.save(folder / "twin.npz")
-    columns = {name: result.history[name] for name in ("loss", "gradient_norm", "learning_rate")}
+    columns = {name: result.history[name] for name in ("loss", "tail_loss", "gradient_norm", "learning_rate")}
     write_table(_history(result.history["epoch"], columns), folder / "history.parquet")
     facts = {
         "best_epoch": result.best_epoch,
-        "best_loss": float(result.history.loc[result.history["epoch"] == result.best_epoch, "loss"].iloc[0]),
+        "best_loss": result.best_loss,
         "epochs": len(result.history),
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
@@ -138,30 +150,83 @@ def fit(observations_path: Path, search_record: Path, settings: Config, device: 
     partial.unlink(missing_ok=True)
 
 
-def rollout(observations_path: Path, twin_record: Path, device: str, output: Path) -> None:
-    """Twin + controllers of all frames -> trajectory.npz, rollout.json. Divergence is recorded as a failure."""
+def rollout(observations_path: Path, twin_records: Sequence[Path], carry: bool, device: str, output: Path) -> None:
+    """Twin + controllers of all frames -> trajectory.npz, rollout.json. Divergence is recorded as a failure.
+
+    Several records: the mean of their trajectories. `carry` carries the residual of the last training frame into the
+    prediction, where training frames say that it helps.
+    """
+    from neuspring.carry import carry_over
+    from neuspring.motion import initial_velocity
     from neuspring.physics.solver import resolve_device
-    from neuspring.rollout import roll_out
+    from neuspring.rollout import mean_trajectory, roll_out
 
     clock = Stopwatch()
-    observations, before = Observations.load(observations_path), StageRecord.load(twin_record)
-    device = resolve_device(device)
+    observations, device = Observations.load(observations_path), resolve_device(device)
+    before = {path: StageRecord.load(path) for path in twin_records}
     common: dict[str, Any] = {
-        "inputs": {"observations": digest_file(observations_path), before.stage: digest_file(twin_record)},
+        "inputs": {"observations": digest_file(observations_path)}
+        | {f"{record.stage}{index or ''}": digest_file(path) for index, (path, record) in enumerate(before.items())},
+        "settings": {"carry_over": carry},
         "device": device,
     }
-    if before.status == "failed":
-        clock.stage("rollout", "failed", reason=f"{before.stage}: {before.reason}", **common).save(output)
+    broken = next((record for record in before.values() if record.status == "failed"), None)
+    if broken:
+        clock.stage("rollout", "failed", reason=f"{broken.stage}: {broken.reason}", **common).save(output)
         return
-    trajectory = roll_out(Twin.load(before.file("twin", twin_record)), observations.controller_points, device)
+    trajectories = []
+    for path, record in before.items():
+        twin = Twin.load(record.file("twin", path))
+        velocity = initial_velocity(observations, twin.simulation.initial_velocity)
+        trajectories.append(roll_out(twin, observations.controller_points, device, velocity=velocity))
+    # A diverged rollout ends earlier; the mean would hide that.
+    trajectory = next((one for one in trajectories if one.diverged_frame is not None), None) or mean_trajectory(trajectories)
+    facts: dict[str, Any] = {"frames": len(trajectory.positions), "averaged": len(trajectories)}
+    if carry:
+        trajectory, carried = carry_over(trajectory, observations)
+        facts |= {f"carry_over_{name}": value for name, value in carried.items()}
     path = output.with_name("trajectory.npz")
     trajectory.save(path)
     if trajectory.collision_overflow:
         print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")
     failed = trajectory.diverged_frame is not None
-    facts = {"collision_overflow": trajectory.collision_overflow, "frames": len(trajectory.positions)}
+    facts["collision_overflow"] = trajectory.collision_overflow
     reason = f"rollout: {trajectory.reason}" if failed else ""
     clock.stage("rollout", "failed" if failed else "ok", {"trajectory": path}, reason=reason, facts=facts, **common).save(output)
+
+
+def transfer(
+    targets: Sequence[Path], twin_record: Path, method: str, seed: int, settings: Config, device: str, output: Path
+) -> None:
+    """Twin of one recording -> scores on other recordings of the same object (transfer.parquet), transfer.json.
+
+    All frames after the first of a target count (task `transfer`). A rollout that diverges leaves out its target.
+    """
+    from neuspring.motion import initial_velocity
+    from neuspring.physics.solver import resolve_device
+    from neuspring.rollout import roll_out
+    from neuspring.transfer import rebase
+
+    clock = Stopwatch()
+    before, device = StageRecord.load(twin_record), resolve_device(device)
+    inputs = {before.stage: digest_file(twin_record)} | {f"target{i}": digest_file(path) for i, path in enumerate(targets)}
+    tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    twin = Twin.load(before.file("twin", twin_record)) if before.status == "ok" else None
+    for path in targets if twin else ():
+        observations = Observations.load(path)
+        assert twin is not None
+        moved = rebase(twin, observations, settings.simulation.safety)
+        velocity = initial_velocity(observations, moved.simulation.initial_velocity)
+        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity)
+        frames = range(1, observations.scenario.frame_count)
+        if trajectory.diverged_frame is not None:
+            diverged.append(observations.scenario.name)
+        tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
+    path = write_table(pd.concat([table for table in tables if len(table)] or tables), output.with_name("transfer.parquet"))
+    facts = {"diverged": diverged, "targets": len(targets)}
+    clock.stage("transfer", before.status, {"scores": path}, reason=before.reason, facts=facts, inputs=inputs, device=device).save(
+        output
+    )
 
 
 def score(
@@ -181,13 +246,21 @@ def score(
         table = metrics.score(trajectory, observations, method, seed)
     write_table(table, folder / "scores.parquet")
     histories = {name: records[name].parent / "history.parquet" for name in ("search", "fit") if "history" in _files(stages, name)}
-    plots = figures.run_figures(
-        observations, trajectory, {n: pd.read_parquet(p) for n, p in histories.items()}, method, folder / "plots"
-    )
     twin_stage = "fit" if "fit" in stages else "search"
-    artefacts = {"plots": plots, "records": list(records.values())}
-    if "twin" in stages[twin_stage].files:
+    artefacts = {"records": list(records.values())}
+    twin, searched = (_twin(stages, records, name) for name in (twin_stage, "search"))
+    if twin is not None:
         artefacts["twin"] = [stages[twin_stage].file("twin", records[twin_stage])]
+    artefacts["plots"] = figures.run_figures(
+        observations,
+        trajectory,
+        {name: pd.read_parquet(path) for name, path in histories.items()},
+        method,
+        folder / "plots",
+        twin=twin,
+        # The search gives every spring the same stiffness.
+        searched=None if searched is None else float(np.median(searched.material.stiffness)),
+    )
     content = {
         "scenario": observations.scenario.name,
         "method": method,
@@ -238,6 +311,11 @@ def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
 
 def _files(stages: Mapping[str, StageRecord], name: str) -> dict[str, list[str]]:
     return stages[name].files if name in stages else {}
+
+
+def _twin(stages: Mapping[str, StageRecord], records: Mapping[str, Path], name: str) -> Twin | None:
+    """The twin that a stage made, if it made one."""
+    return Twin.load(stages[name].file("twin", records[name])) if "twin" in _files(stages, name) else None
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -5,7 +5,7 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ import numpy as np
 import pandas as pd
 
 from neuspring.artifacts import write_atomically, write_text
+from neuspring.figures_clusters import NAME as CLUSTERS
+from neuspring.figures_clusters import cluster_methods, clusters_figure
 from neuspring.metrics import COLUMNS, averages
-from neuspring.records import RECORD_FORMAT, read_json
+from neuspring.records import RECORD_FORMAT, StageRecord, read_json
 
 RESAMPLES = 10_000
 MM = 1e3
@@ -25,6 +27,8 @@ HEADINGS = {
     ("future", "chamfer"): "Future CD",
     ("future", "track_error"): "Future TE",
 }
+TRANSFER_HEADINGS = {("transfer", "chamfer"): "Transfer CD", ("transfer", "track_error"): "Transfer TE"}
+Headings = Mapping[tuple[str, str], str]
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,30 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
     return Collected(scores, pd.DataFrame(rows))
 
 
+def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
+    """Transferred twins as runs: `scenario` is the source, whose score is the mean over its targets."""
+    methods, seeds = list(methods), list(seeds)
+    tables, rows = [], []
+    for source in sources:
+        for method in methods:
+            for seed in seeds:
+                path = Path(results) / source / method / str(seed) / "transfer.json"
+                if not path.is_file():
+                    continue
+                record = StageRecord.load(path)
+                diverged = record.facts.get("diverged", [])
+                reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
+                status = "ok" if record.status == "ok" and not diverged else "failed"
+                rows.append({"scenario": source, "method": method, "seed": seed, "status": status, "reason": reason, "notes": ""})
+                table = pd.read_parquet(record.file("scores", path))
+                keys = ["category", "method", "seed", "task", "metric", "unit"]
+                mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
+                tables.append(mean.assign(scenario=source)[list(COLUMNS)])
+    filled = [table for table in tables if len(table)]
+    scores = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
+    return Collected(scores, pd.DataFrame(rows))
+
+
 def comparable(collected: Collected) -> pd.DataFrame:
     """Scores of the (scenario, seed) pairs that every method finished, so that averages compare like with like."""
     good = collected.runs[collected.runs["status"] == "ok"]
@@ -77,9 +105,9 @@ def comparable(collected: Collected) -> pd.DataFrame:
 
 
 def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
-    """Method minus baseline on the same scenario and seed: mean, and a 95 % bootstrap interval.
+    """Method minus baseline on the same scenario and seed: mean, and a 95 % bootstrap interval over scenarios and seeds.
 
-    Seeds are averaged within a scenario and scenarios are resampled, since runs of one scenario are not independent.
+    Scenarios are resampled, and within each the seeds, since runs of one scenario are not independent.
     """
     rows = []
     rng = np.random.default_rng(0)
@@ -88,10 +116,13 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
         for method in wide.columns.drop(baseline, errors="ignore"):
             if baseline not in wide:
                 continue
-            delta = (wide[method] - wide[baseline]).dropna().groupby("scenario").mean().to_numpy()
-            if not len(delta):
+            runs = [part.to_numpy() for _, part in (wide[method] - wide[baseline]).dropna().groupby("scenario")]
+            if not runs:
                 continue
-            draws = rng.choice(delta, (RESAMPLES, len(delta))).mean(axis=1)
+            delta = np.array([part.mean() for part in runs])
+            # Means over resampled seeds [scenario, draw], of which every draw takes a resampled set of scenarios.
+            means = np.stack([rng.choice(part, (RESAMPLES, len(part))).mean(axis=1) for part in runs])
+            draws = means[rng.integers(len(runs), size=(len(runs), RESAMPLES)), np.arange(RESAMPLES)].mean(axis=0)
             low, high = np.quantile(draws, [0.025, 0.975]) if len(delta) > 1 else (np.nan, np.nan)
             base = wide[baseline].mean()
             row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": delta.mean()}
@@ -112,7 +143,11 @@ def summary_text(collected: Collected, baseline: str) -> str:
     lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, seeds)
     differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
-        lines += ["", f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios], same scenario and seed:", ""]
+        lines += [
+            "",
+            f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios and seeds], same scenario and seed:",
+            "",
+        ]
         lines += _difference_table(differences)
     bad = collected.runs[collected.runs["status"] != "ok"]
     if len(bad):
@@ -125,11 +160,13 @@ def summary_text(collected: Collected, baseline: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _method_table(methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int) -> list[str]:
+def _method_table(
+    methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int, headings: Headings = HEADINGS
+) -> list[str]:
     rows = []
     for method in methods:
         cells = [method]
-        for task, metric in HEADINGS:
+        for task, metric in headings:
             found = (
                 means[(means["method"] == method) & (means["task"] == task) & (means["metric"] == metric)] if len(means) else means
             )
@@ -143,18 +180,18 @@ def _method_table(methods: list[str], means: pd.DataFrame, counts: pd.DataFrame,
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
         cells.append(f"{status.get('ok', 0)}/{sum(status.values())}{failed}")
         rows.append(cells)
-    return _markdown(["Method", *HEADINGS.values(), "Runs"], rows)
+    return _markdown(["Method", *headings.values(), "Runs"], rows)
 
 
-def _difference_table(differences: pd.DataFrame) -> list[str]:
+def _difference_table(differences: pd.DataFrame, headings: Headings = HEADINGS) -> list[str]:
     rows = []
     for method, part in differences.groupby("method", sort=False):
         cells = [str(method)]
-        for task, metric in HEADINGS:
+        for task, metric in headings:
             found = part[(part["task"] == task) & (part["metric"] == metric)]
             cells.append("–" if not len(found) else _interval(found.iloc[0]))
         rows.append(cells)
-    return _markdown(["Method", *HEADINGS.values()], rows)
+    return _markdown(["Method", *headings.values()], rows)
 
 
 def _interval(row: Any) -> str:
@@ -188,6 +225,41 @@ def timing_text(runs: pd.DataFrame) -> str:
     return "\n".join(_markdown(["Method", *stages], rows)) + "\n"
 
 
+def write_clusters(collected: Collected, folder: Path) -> str:
+    """Draw clusters.png if at least two methods clusters_<K> have scores; returns the section that names it, else nothing.
+
+    Only pairs of scenario and seed count that every such method finished, as in the tables; one that finished none is left out.
+    """
+    runs = collected.runs[collected.runs["method"].isin(list(cluster_methods(collected.runs["method"])))]
+    finished = list(cluster_methods(runs.loc[runs["status"] == "ok", "method"]))
+    scores = collected.scores[collected.scores["method"].isin(finished)]
+    part = Collected(scores, runs[runs["method"].isin(finished)])
+    usable = comparable(part) if len(scores) else scores
+    pairs, kept = (len(table[["scenario", "seed"]].drop_duplicates()) for table in (runs, usable))
+    note = f"; {kept} of {pairs} pairs of scenario\nand seed, those that every K finished" if kept < pairs else ""
+    if clusters_figure(usable, folder / CLUSTERS, note) is None:
+        return ""
+    return f"\n## Number of regions\n\n![Chamfer distance against the number of regions K]({CLUSTERS})\n"
+
+
+def transfer_text(collected: Collected, baseline: str) -> str:
+    """The section on transferred twins; nothing if there are none."""
+    if not len(collected.runs):
+        return ""
+    methods, seeds = list(dict.fromkeys(collected.runs["method"])), collected.runs["seed"].nunique()
+    scores = comparable(collected)
+    counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
+    what = "Each twin on other recordings of the same object, all frames after the first: mean over targets, then over sources"
+    lines = ["", "## Transfer", "", f"{what} (in brackets weighted by frames). A run is one source and seed.", ""]
+    means = averages(scores) if len(scores) else pd.DataFrame()
+    lines += _method_table(methods, means, counts, seeds, TRANSFER_HEADINGS)
+    differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
+    if len(differences):
+        lines += ["", f"Paired difference to {baseline}, mm [95 % bootstrap interval over sources and seeds]:", ""]
+        lines += _difference_table(differences, TRANSFER_HEADINGS)
+    return "\n".join(lines) + "\n"
+
+
 def _markdown(header: list[str], rows: list[list[str]]) -> list[str]:
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
 
@@ -197,8 +269,11 @@ def _markdown(header: list[str], rows: list[list[str]]) -> list[str]:
     return [line(header), "|" + "|".join("-" * (width + 2) for width in widths) + "|", *map(line, rows)]
 
 
-def write(collected: Collected, baseline: str, folder: Path) -> str:
-    """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv and summary.md; returns the summary."""
+def write(collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None) -> str:
+    """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, transfers.csv and summary.md; returns the summary.
+
+    With methods clusters_<K>, also clusters.png, which summary.md then shows.
+    """
     scores = collected.scores
     usable = comparable(collected)
     averaged = averages(usable) if len(usable) else pd.DataFrame()
@@ -211,6 +286,10 @@ def write(collected: Collected, baseline: str, folder: Path) -> str:
     finished = scores.merge(collected.runs.loc[collected.runs["status"] == "ok", ["scenario", "method", "seed"]])
     details = per_scenario_text(finished) if len(finished) else "No run has finished.\n"
     timings = timing_text(collected.runs)
-    text = f"# Scores\n\n{summary}\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
+    transferred = transfer_text(transfers, baseline) if transfers else ""
+    transfer_scores = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
+    write_text(folder / "transfers.csv", transfer_scores.to_csv(index=False))
+    text = f"# Scores\n\n{summary}{transferred}{write_clusters(collected, folder)}"
+    text += f"\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
     write_text(folder / "summary.md", text)
     return summary

@@ -1,19 +1,75 @@
-"""From points to a spring graph (dataset facts, section 5.1).
+"""From points to a spring graph (dataset facts, section 5.1), uniform or piecewise (the paper's piecewise topology).
 
 Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. The spring
-set is the union of all answers: a pair is kept if either side asks for it.
+set is the union of all answers: a pair is kept if either side asks for it. In a piecewise topology each region of nodes has
+its own radius and number of neighbours; a node asks among all nodes, with its own region's values, so regions stay joined.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import cKDTree
+from sklearn.cluster import AgglomerativeClustering
+from sklearn.neighbors import kneighbors_graph
 
 from neuspring.artifacts import Topology
+from neuspring.config import Clusters
 from neuspring.errors import InputError
 
 MIN_LENGTH = 1e-4
 """Shorter object springs are not made, m."""
+REPAIR_SPRINGS = 3
+"""Springs given to a node that has none: the fewest that can hold a point in space."""
+
+
+def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
+    """Region of each node [N], 0 .. count - 1, by agglomerative clustering of nodes [N, 3], m.
+
+    Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter.
+    Raises InputError if there are fewer nodes than regions, or than the connectivity graph needs.
+    """
+    if count < 1:
+        raise InputError("search.clusters", "at least one region is required", count)
+    if count == 1:
+        return np.zeros(len(nodes), np.int32)
+    least = max(count, settings.connectivity + 1)
+    if len(nodes) < least:
+        rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
+        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbours.")
+    points = np.asarray(nodes, np.float64)
+    graph = None
+    if settings.connectivity:
+        asked = kneighbors_graph(points, settings.connectivity)
+        graph = asked.maximum(asked.T)
+    found = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
+    # Micrometres: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
+    centroids = np.round([points[found == label].mean(axis=0) for label in range(count)], 6)
+    number = np.empty(count, np.int32)
+    number[np.lexsort(centroids.T[::-1])] = np.arange(count)
+    labels: np.ndarray = number[found]
+    return labels
+
+
+def join(nodes: np.ndarray, springs: np.ndarray, lonely: np.ndarray) -> np.ndarray:
+    """The springs [S, 2], and behind them springs from each of the nodes `lonely` to its nearest nodes."""
+    if not len(lonely):
+        return springs
+    tree = cKDTree(nodes)
+    # Nodes at the same place, the lonely node among them, are no partners.
+    same = max(tree.query_ball_point(nodes[lonely], MIN_LENGTH, return_length=True))
+    k = min(REPAIR_SPRINGS + same, len(nodes))
+    distance, partner = tree.query(nodes[lonely], k=k)
+    usable = distance.reshape(len(lonely), k) > MIN_LENGTH
+    row, column = np.nonzero(usable & (usable.cumsum(axis=1) <= REPAIR_SPRINGS))
+    added = np.stack([lonely[row], partner.reshape(len(lonely), k)[row, column]], axis=1)
+    return _first_of_each(np.concatenate([springs, added]), len(nodes))
+
+
+def isolated(count: int, springs: np.ndarray) -> np.ndarray:
+    """Indices of nodes below `count` that no spring holds."""
+    return np.flatnonzero(np.bincount(springs.ravel(), minlength=count)[:count] == 0)
 
 
 def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
@@ -71,6 +127,30 @@ def build(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, label
     )
 
 
+def piecewise_topology(
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    labels: np.ndarray,
+    object_radius: Sequence[float],
+    object_neighbours: Sequence[int],
+    controller_radius: float,
+    controller_neighbours: int,
+    *,
+    repair: bool = False,
+) -> Topology:
+    """A radius [m] and a neighbour count (self included) per region; `labels` [N] says which region a node belongs to.
+
+    `repair` joins nodes without any spring, controllers' included, to their nearest nodes. Raises InputError if a controller
+    coincides with a node.
+    """
+    points, hands = np.asarray(nodes, np.float64), np.asarray(controllers, np.float64)
+    inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbours)[labels])
+    outer = controller_springs(points, hands, controller_radius, controller_neighbours)
+    if repair:
+        inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
+    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]), labels)
+
+
 def uniform_topology(
     nodes: np.ndarray,
     controllers: np.ndarray,
@@ -83,8 +163,7 @@ def uniform_topology(
 
     Raises InputError if a controller coincides with a node.
     """
-    points, hands = np.asarray(nodes, np.float64), np.asarray(controllers, np.float64)
-    count = len(points)
-    inner = object_springs(points, np.full(count, object_radius), np.full(count, object_neighbours))
-    outer = controller_springs(points, hands, controller_radius, controller_neighbours)
-    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]))
+    one = np.zeros(len(nodes), np.int32)
+    return piecewise_topology(
+        nodes, controllers, one, [object_radius], [object_neighbours], controller_radius, controller_neighbours
+    )

@@ -1,7 +1,15 @@
 """Writes config/README.md from the configuration's own declarations: python -m tests.config_readme"""
 
 import ast
+import dataclasses
+import types
+import typing
 from pathlib import Path
+from typing import Any
+
+from pydantic.fields import FieldInfo
+
+from neuspring import config
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -15,53 +23,123 @@ snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
 ```
 
 Everything is checked before the first job: unknown keys, wrong types (YAML reads `5e-5` as text: write `5.0e-5`), unknown
-scenarios and methods, missing data, a results folder that cannot be written. Values are never cast.
+scenarios, methods and searches, missing data, a results folder that cannot be written. Values are never cast.
 
 - `scenarios.tsv`: one row per capture (toy scenes, motion capture, the 22 PhysTwin scenarios).
 - `methods.yaml`: one row per method: the search it starts from, the stage that follows, its own `fit` settings.
+- `searches.yaml`: one row per search: into how many regions the topology is divided, its own `search` settings.
 - Threads, cores and executors are not configuration: they live on the command line and in `workflow/profiles/`.
 
 This page is written from `neuspring/config.py` by `python -m tests.config_readme`; a test keeps them equal.
-
-## Keys
 """
-SECTIONS = {
-    "(top level)": "Config",
-    "simulation": "Simulation",
-    "losses": "Losses",
-    "search": "Search",
-    "search.ranges": "SearchRanges",
-    "search.start": "SearchStart",
-    "fit": "Fit",
-    "released_quirks": "ReleasedQuirks",
-    "toy": "Toy",
-    "mocap": "Mocap",
-    "tracking": "Tracking",
+KEYS = {
+    "(top level)": config.Config,
+    "simulation": config.Simulation,
+    "losses": config.Losses,
+    "search": config.Search,
+    "search.clusters": config.Clusters,
+    "search.ranges": config.SearchRanges,
+    "search.start": config.SearchStart,
+    "fit": config.Fit,
+    "fit.field": config.SpringField,
+    "released_quirks": config.ReleasedQuirks,
+    "toy": config.Toy,
+    "mocap": config.Mocap,
+    "tracking": config.Tracking,
 }
+ROWS = {"rows of methods.yaml": config.Method, "rows of searches.yaml": config.SearchRow}
+MEANINGS = {"description": "What the row is, for people."}
+"""Of keys that explain themselves in the code."""
+BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+PLAIN = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
 
 
 def text() -> str:
     """The page."""
-    tree = ast.parse((ROOT / "neuspring" / "config.py").read_text())
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    parts = [INTRODUCTION]
-    for title, name in SECTIONS.items():
-        summary = (ast.get_docstring(classes[name]) or "").partition("\n")[0]
-        rows = [f"| `{key}` | {default} | {meaning} |" for key, default, meaning in fields(classes[name])]
-        parts.append("\n".join([f"### {title}", "", summary, "", "| key | default | meaning |", "|---|---|---|", *rows, ""]))
+    parts = [INTRODUCTION, "## Keys\n"]
+    parts += [section(title, kind) for title, kind in KEYS.items()]
+    parts += ["## Tables\n"]
+    parts += [section(title, kind) for title, kind in ROWS.items()]
     return "\n".join(parts)
 
 
-def fields(node: ast.ClassDef) -> list[tuple[str, str, str]]:
-    """(key, default, meaning) of every declared field; the meaning is the text below it."""
+def section(title: str, kind: type) -> str:
+    """A heading, what the section is, and a table of its keys."""
+    summary = (kind.__doc__ or "").partition("\n")[0]
+    rows = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
+    rows += [f"| `{key}` | {allowed} | {default} | {meaning} |" for key, allowed, default, meaning in fields(kind)]
+    return "\n".join([f"### {title}", "", summary, "", *rows, ""])
+
+
+def fields(kind: type) -> list[tuple[str, str, str, str]]:
+    """(key, allowed, default, meaning) of every field; the meaning is the text below its declaration."""
+    hints, meanings = typing.get_type_hints(kind, include_extras=True), declared_meanings(kind.__name__)
     found = []
+    for spec in dataclasses.fields(kind):
+        is_section = dataclasses.is_dataclass(hints[spec.name])
+        default = "" if is_section else shown_default(spec)
+        meaning = meanings.get(spec.name) or MEANINGS.get(spec.name, "")
+        found.append((spec.name, "section" if is_section else allowed(hints[spec.name]), default, meaning))
+    return found
+
+
+def declared_meanings(name: str) -> dict[str, str]:
+    """Key -> the text below its declaration, of a class of `neuspring.config`."""
+    tree = ast.parse((ROOT / "neuspring" / "config.py").read_text())
+    node = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    found = {}
     for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            default = "required" if statement.value is None else ast.unparse(statement.value)
-            shown = "" if default.startswith("field(") else f"`{default}`"
             is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-            found.append((statement.target.id, shown, " ".join(str(after.value.value).split()) if is_text else ""))
+            found[statement.target.id] = " ".join(str(after.value.value).split()) if is_text else ""
     return found
+
+
+def shown_default(spec: dataclasses.Field) -> str:
+    """As one would write it in YAML."""
+    if spec.default_factory is not dataclasses.MISSING:
+        return f"`{yaml_text(spec.default_factory())}`"
+    return "required" if spec.default is dataclasses.MISSING else f"`{yaml_text(spec.default)}`"
+
+
+def yaml_text(value: Any) -> str:
+    """A plain value in YAML's flow style; floats with a point, as the strict reader wants them."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(yaml_text, value))}]"
+    # Six digits: 1/6 is meant, not its last bit.
+    return repr(float(f"{value:.6g}")) if isinstance(value, float) else str(value)
+
+
+def allowed(hint: Any) -> str:
+    """Type and range of a key in words."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        limits = " and ".join(filter(None, map(limit, bounds(hint))))
+        return f"{allowed(arguments[0])} {limits}".rstrip()
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(allowed, arguments))
+    if origin is typing.Literal:
+        return ", ".join(f"`{word}`" for word in arguments)
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return f"list of {allowed(arguments[0])}"
+        return f"[{', '.join(map(allowed, arguments))}]"
+    return "mapping" if origin is dict else PLAIN[hint]
+
+
+def bounds(hint: Any) -> list[Any]:
+    """Single constraints of an annotated type."""
+    found = []
+    for item in hint.__metadata__:
+        found += item.metadata if isinstance(item, FieldInfo) else [item]
+    return found
+
+
+def limit(constraint: Any) -> str:
+    """One constraint in words; empty for those that say nothing to a reader (patterns, finiteness)."""
+    return " and ".join(f"{sign} {getattr(constraint, name):g}" for name, sign in BOUNDS.items() if hasattr(constraint, name))
 
 
 if __name__ == "__main__":

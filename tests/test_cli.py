@@ -9,6 +9,7 @@ from neuspring.artifacts import Observations
 from neuspring.cli import main
 from neuspring.errors import InputError
 from neuspring.physics.solver import resolve_device
+from neuspring.records import StageRecord
 from tests.data.phystwin_case import write_case
 
 
@@ -19,6 +20,56 @@ def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
     arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/config.yaml,{settings}"]
     assert main([*arguments, "--output", str(output)]) == 0
     assert Observations.load(output).scenario.frame_count == 4
+
+
+TINY = {
+    "toy": {"frames": 4},
+    "search": {"rollouts": 2, "start": {"object_radius": 0.045, "stiffness": 1e4}},
+    "fit": {"epochs": 1, "field": {"channels": 2, "hidden": 4}},
+}
+
+
+def observed(folder):
+    """Observations of a tiny scene."""
+    row = {"scenario": "tiny", "source": "toy", "category": "rope", "path": "rope/lift/smooth"}
+    row |= {"self_collision": False, "ground": True}
+    path = folder / "observations.npz"
+    assert main(["observe", "--row", json.dumps(row), "--settings", json.dumps(TINY), "--output", str(path)]) == 0
+    return path
+
+
+def test_regions_and_fields_by_hand(tmp_path):
+    """Options reach the stages; without them a search is uniform, and a fit trains single springs."""
+    common = ["--observations", str(observed(tmp_path)), "--settings", json.dumps(TINY), "--device", "cpu"]
+    for name, options, kind, regions in (("plain", [], [], 1), ("ours", ["--clusters", "2"], ["--kind", "field"], 2)):
+        found, fitted = tmp_path / name / "search.json", tmp_path / name / "fit.json"
+        assert main(["search", *common, *options, "--seed", "3", "--output", str(found)]) == 0
+        assert main(["fit", *common, *kind, "--search", str(found), "--output", str(fitted)]) == 0
+        search, fit = StageRecord.load(found), StageRecord.load(fitted)
+        assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
+        assert ("object_radius.1" in search.facts) == (regions == 2)
+        assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
+
+
+@pytest.mark.parametrize("clusters", ["0", "1000"])
+def test_a_number_of_regions_that_cannot_be_is_bad_input(clusters, tmp_path, capsys):
+    arguments = ["--observations", str(observed(tmp_path)), "--clusters", clusters, "--output", str(tmp_path / "search.json")]
+    assert main(["search", *arguments, "--device", "cpu"]) == 2
+    assert "search.clusters" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fit", "--kind", "network", "--observations", "x.npz", "--search", "x.json", "--output", "y.json"],
+        ["search", "--clusters", "two", "--observations", "x.npz", "--output", "y.json"],
+    ],
+)
+def test_words_that_are_no_option_end_with_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert arguments[1] in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuspring import artifacts, config
-from neuspring.config import Benchmark, Config, Method, parse, plain
+from neuspring.config import Benchmark, Config, Method, SearchRow, parse, plain
 from neuspring.errors import InputError
 
 MINIMAL = "scenarios: [rope]\nmethods: [ours]\n"
@@ -90,6 +90,24 @@ MISTAKES = {
     "start outside": ("search: {start: {drag: 50}}", "start.drag = 50.0 lies outside ranges.drag = [0.0, 20.0]"),
     "clamp reversed": ("fit: {stiffness_range: [5, 1]}", "stiffness_range", "received [5.0, 1.0]"),
     "betas": ("fit: {betas: [0.9, 1.5]}", "fit.betas", "less than 1"),
+    "log scale from zero": (
+        "search: {stiffness_scale: log}",
+        "stiffness_scale: log needs a positive lower bound of ranges.stiffness, received [0.0, 100000.0]",
+    ),
+    "linkage": ("search: {clusters: {linkage: nearest}}", "search.clusters.linkage", "received 'nearest'"),
+    "connectivity": ("search: {clusters: {connectivity: -1}}", "search.clusters.connectivity", "received -1"),
+    "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
+    "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
+    "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
+    "unknown field key": ("fit: {field: {layers: 3}}", "fit.field.layers: unknown key"),
+    "nothing to feed the network": (
+        "fit: {field: {triplane: false, fourier: feature}}",
+        "field.fourier: coordinates is required without the tri-plane, received feature",
+    ),
+    "rest length bound": ("fit: {rest_length_bound: 1}", "fit.rest_length_bound", "less than 1"),
+    "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
+    "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
+    "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),
     "device": ("device: gpu", "device", "received 'gpu'"),
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
     "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
@@ -142,6 +160,14 @@ long:
   fit: springs
   description: through all frames
   settings: {horizon: 0, epochs: 7}
+ours: {search: pieces, fit: field, description: x, settings: {output_bound: 1.5, field: {triplane: false}}}
+"""
+SEARCHES = """
+uniform: {clusters: 1, description: one region}
+pieces:
+  clusters: 5
+  description: five regions
+  settings: {rollouts: 33, clusters: {linkage: single}}
 """
 
 
@@ -152,17 +178,55 @@ def write(path: Path, text: str) -> Path:
 
 def test_methods(tmp_path: Path) -> None:
     found = config.read_methods(write(tmp_path / "methods.yaml", METHODS))
-    assert list(found) == ["full", "coarse", "long"]
-    assert (found["full"].fit, found["coarse"].fit) == ("springs", None)
+    assert list(found) == ["full", "coarse", "long", "ours"]
+    assert [method.fit for method in found.values()] == ["springs", None, "springs", "field"]
     made = load("fit: {epochs: 3, learning_rate: 0.5}")
     merged = config.fit_of(made, found["long"], "long")
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
     assert config.fit_of(made, found["full"], "full") == made.fit
     assert made.fit.epochs == 3
+    ours = config.fit_of(load("fit: {epochs: 3, field: {hidden: 8}}"), found["ours"], "ours")
+    assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
+
+
+def test_searches(tmp_path: Path) -> None:
+    found = config.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
+    assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
+    made = load("search: {rollouts: 44, sigma: 0.25, clusters: {connectivity: 4}}")
+    merged = config.search_of(made, found["pieces"], "pieces")
+    assert (merged.rollouts, merged.sigma) == (33, 0.25)
+    assert (merged.clusters.linkage, merged.clusters.connectivity) == ("single", 4)
+    assert config.search_of(made, found["uniform"], "uniform") == made.search
+
+
+BAD_SEARCHES = {
+    "no regions": ("a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
+    "missing": ("a: {description: x}", "search a.*clusters: required, but missing"),
+    "unknown": ("a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
+    "not a mapping": ("a: 3", "search a"),
+    "empty": ("", "must hold a YAML mapping; received NoneType"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SEARCHES)
+def test_bad_search_tables(name: str, tmp_path: Path) -> None:
+    text, message = BAD_SEARCHES[name]
+    path = write(tmp_path / "searches.yaml", text)
+    with pytest.raises(InputError, match="(?s)" + message) as caught:
+        config.read_searches(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"ranges": {"drag": [2, 1]}}])
+def test_bad_search_settings(settings: dict[str, Any]) -> None:
+    row = SearchRow(clusters=2, description="x", settings=settings)
+    with pytest.raises(InputError, match="search pieces, settings: "):
+        config.search_of(load(""), row, "pieces")
 
 
 BAD_METHODS = {
-    "search": ("a: {search: random, fit: null, description: x}", "method a.*search.*'uniform', received 'random'"),
+    "search": ("a: {search: ../up, fit: null, description: x}", r"method a.*search.*received '\.\./up'"),
+    "fit": ("a: {search: uniform, fit: network, description: x}", "method a.*fit.*'springs' or 'field', received 'network'"),
     "missing": ("a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
     "unknown": ("a: {search: uniform, fit: null, description: x, lr: 1}", "method a.*lr: unknown key"),
     "not a mapping": ("a: 3", "method a"),
@@ -192,7 +256,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     """Missing, a folder, and not UTF-8."""
     latin = tmp_path / "latin"
     latin.write_bytes("# Größe\n".encode("latin-1"))
-    for read in (config.read_methods, config.read_scenarios):
+    for read in (config.read_methods, config.read_searches, config.read_scenarios):
         for path in (tmp_path / "missing", tmp_path, latin):
             with pytest.raises(InputError, match="must be readable") as caught:
                 read(path)
@@ -240,13 +304,16 @@ def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
 def benchmark(root: Path, **values: Any) -> Benchmark:
     write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n")
     write(root / "methods.yaml", METHODS)
-    tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml"}
+    write(root / "searches.yaml", SEARCHES)
+    tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml", "search_table": "searches.yaml"}
     return Benchmark.of({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
 
 
 def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
     made = benchmark(tmp_path, methods=["long", "full"])
     assert (list(made.scenarios), list(made.methods)) == (["rope"], ["long", "full"])
+    assert list(made.searches) == ["uniform"], "shared by both, and no other"
+    assert list(benchmark(tmp_path, methods=["ours", "coarse"]).searches) == ["pieces", "uniform"]
     assert made.data_path("rope") is None
     (tmp_path / "cable.csv").touch()
     found = benchmark(tmp_path, scenarios=["cable"], data_root=str(tmp_path))
@@ -264,6 +331,7 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
         ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
         ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
         ({"method_table": "missing.yaml"}, "must be readable"),
+        ({"search_table": "missing.yaml"}, "must be readable"),
         ({"device": "gpu"}, "device"),
     ],
 )
@@ -278,3 +346,43 @@ def test_settings_of_chosen_methods_are_checked_too(settings: str, tmp_path: Pat
     write(tmp_path / "bad.yaml", text)
     with pytest.raises(InputError, match="method full, settings"):
         benchmark(tmp_path, method_table="bad.yaml")
+
+
+def test_the_search_of_a_chosen_method_must_be_known(tmp_path: Path) -> None:
+    write(tmp_path / "bad.yaml", "full: {search: unifrom, fit: springs, description: x}\n")
+    message = r"every entry must be a row of searches\.yaml; received 'unifrom' \(did you mean 'uniform'\?\)"
+    with pytest.raises(InputError, match=message):
+        benchmark(tmp_path, method_table="bad.yaml")
+
+
+def test_settings_of_chosen_searches_are_checked_too(tmp_path: Path) -> None:
+    text = "uniform: {clusters: 1, description: x, settings: {rollout: 3}}\npieces: {clusters: 5, description: x}\n"
+    write(tmp_path / "bad.yaml", text)
+    with pytest.raises(InputError, match="search uniform, settings"):
+        benchmark(tmp_path, search_table="bad.yaml")
+    assert benchmark(tmp_path, search_table="bad.yaml", methods=["ours"]).methods, "rows that nobody names are not"
+
+
+def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
+    """A search's own bounds count, and a method without a second stage has no clamp."""
+    narrow = {"fit": {"stiffness_range": [0.0, 5e4]}}
+    with pytest.raises(InputError, match=r"method full, fit\.stiffness_range: must reach .* 100000\.0.*; received 50000\.0"):
+        benchmark(tmp_path, **narrow)
+    benchmark(tmp_path, methods=["coarse"], **narrow)
+    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [0.0, 4.0e+4]}}}\n"
+    write(tmp_path / "soft.yaml", text)
+    benchmark(tmp_path, search_table="soft.yaml", **narrow)
+
+
+def test_the_tables_of_the_project_are_valid_together() -> None:
+    """Every row of the method table, with the search that it names."""
+    root = Path(config.__file__).parents[1]
+    methods = tuple(config.read_methods(root / "config" / "methods.yaml"))
+    values = config.read_yaml(root / "config" / "config.yaml")
+    made = Benchmark.of(values | {"methods": list(methods)}, root)
+    for name, method in made.methods.items():
+        config.fit_of(made.config, method, name)
+        config.search_of(made.config, made.searches[method.search], method.search)
+    for name in methods:
+        if name.startswith("clusters_"):
+            assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))

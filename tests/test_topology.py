@@ -7,8 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuspring.config import Clusters
 from neuspring.errors import InputError
-from neuspring.topology import MIN_LENGTH, build, controller_springs, object_springs, uniform_topology
+from neuspring.topology import (
+    MIN_LENGTH,
+    REPAIR_SPRINGS,
+    build,
+    controller_springs,
+    isolated,
+    join,
+    object_springs,
+    piecewise_topology,
+    regions,
+    uniform_topology,
+)
 
 from .physics.golden import NAMES, clip
 
@@ -164,3 +176,156 @@ def test_labels_and_rest_lengths() -> None:
     np.testing.assert_array_equal(made.labels, np.arange(25) % 4)
     np.testing.assert_allclose(made.rest_lengths, np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1), rtol=LENGTH)
     assert not build(nodes, np.zeros((0, 3)), springs).labels.any()
+
+
+# Regions --------------------------------------------------------------------------------------------------------------
+
+CLUSTERINGS = [Clusters(linkage=linkage) for linkage in ("ward", "complete", "average", "single")]
+CLUSTERINGS += [Clusters(connectivity=5), Clusters(linkage="single", connectivity=3)]
+
+
+def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
+    """Tight groups of nodes along x, 1 m apart: what any clustering must find; the group at the largest x comes first."""
+    rng = np.random.default_rng(0)
+    groups = [rng.uniform(0, 0.1, (count, 3)) + np.array([place, 0, 0]) for place, count in enumerate(counts)]
+    return np.concatenate(groups[::-1])
+
+
+@pytest.mark.parametrize("settings", CLUSTERINGS, ids=str)
+@pytest.mark.filterwarnings("ignore:the number of connected components")  # the groups are far apart
+def test_regions_are_found_and_numbered_by_centroid(settings: Clusters) -> None:
+    labels = regions(blocks(), 3, settings)
+    assert labels.tolist() == [2] * 4 + [1] * 9 + [0] * 6
+
+
+@pytest.mark.parametrize("settings", CLUSTERINGS, ids=str)
+@pytest.mark.parametrize("count", [1, 2, 5, 25])
+def test_every_region_has_a_node_and_numbers_have_no_gaps(settings: Clusters, count: int) -> None:
+    labels = regions(cloud(1), count, settings)
+    assert (labels.shape, labels.dtype) == ((25,), np.int32)
+    assert np.unique(labels).tolist() == list(range(count))
+
+
+def test_equal_coordinates_of_centroids_are_ties() -> None:
+    """Groups whose centroids differ in x by rounding alone are ordered by y, then by z."""
+    corner = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
+    places = np.array([[0.1, 1, 0], [0.1 + 1e-9, 0, 1], [0.1, 0, 0]])
+    labels = regions(np.concatenate([corner + place for place in places]), 3, Clusters())
+    assert labels.tolist() == [2] * 3 + [1] * 3 + [0] * 3
+
+
+def test_a_connectivity_graph_keeps_regions_from_jumping_over_a_gap() -> None:
+    """A hairpin: the ends of its arms are near in space and far along the body."""
+    along = np.linspace(0, 1, 21)
+    arms = [np.stack([x, np.full(21, y), 0 * x], axis=1) for x, y in ((along[::-1], 0.0), (along, 0.2))]
+    bend = np.array([[0, 0.05, 0], [0, 0.1, 0], [0, 0.15, 0]])
+    # A little noise, so that the clustering meets no ties.
+    path = np.concatenate([arms[0], bend, arms[1]]) + np.random.default_rng(0).normal(0, 1e-3, (45, 3))
+    without, joined = (regions(path, 2, Clusters(connectivity=count)) for count in (0, 2))
+    assert without[0] == without[-1]
+    assert np.count_nonzero(np.diff(joined)) == 1, "each region is one piece of the path"
+
+
+@pytest.mark.parametrize(("count", "settings"), [(5, Clusters()), (2, Clusters(connectivity=4))])
+def test_more_regions_or_neighbours_than_nodes_are_refused(count: int, settings: Clusters) -> None:
+    with pytest.raises(InputError, match=r"search\.clusters: .* need at least 5 nodes; received 4 nodes"):
+        regions(cloud(0, 4), count, settings)
+    regions(cloud(0, 5), count, settings)
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_less_than_one_region_is_refused(count: int) -> None:
+    with pytest.raises(InputError, match=r"search\.clusters"):
+        regions(cloud(0), count, Clusters())
+
+
+# Piecewise ------------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds, count=st.integers(2, 5))
+def test_equal_regions_are_the_uniform_topology(seed: int, count: int) -> None:
+    nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
+    labels = regions(nodes, count, Clusters())
+    pieces = piecewise_topology(nodes, hands, labels, [0.3] * count, [6] * count, 0.5, 4)
+    whole = uniform_topology(nodes, hands, 0.3, 6, 0.5, 4)
+    np.testing.assert_array_equal(pieces.springs, whole.springs)
+    np.testing.assert_array_equal(pieces.rest_lengths, whole.rest_lengths)
+    np.testing.assert_array_equal(pieces.labels, labels)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds, settings=st.sampled_from([Clusters(), Clusters(linkage="average", connectivity=6)]), repair=st.booleans())
+@pytest.mark.filterwarnings("ignore:the number of connected components")
+def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, settings: Clusters, repair: bool) -> None:
+    nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
+    order = np.random.default_rng(seed + 2).permutation(25)
+    # The last region asks for so little that some nodes are left alone, which `repair` then joins.
+    values = [0.35, 0.3, 0.05], [7, 4, 3], 0.4, 3
+
+    def made(points: np.ndarray) -> tuple[np.ndarray, dict[tuple[int, int], float], int]:
+        labels = regions(points, 3, settings)
+        topology = piecewise_topology(points, hands, labels, *values, repair=repair)
+        pairs = [tuple(sorted(pair)) for pair in topology.springs.tolist()]
+        return labels, dict(zip(pairs, topology.rest_lengths.tolist(), strict=True)), topology.object_spring_count
+
+    labels, springs, inner = made(nodes)
+    shuffled_labels, shuffled, shuffled_inner = made(nodes[order])
+    np.testing.assert_array_equal(shuffled_labels, labels[order])
+    # Controllers keep their numbers behind the nodes.
+    name = np.concatenate([order, 25 + np.arange(2)])
+    renamed = {tuple(sorted((int(name[i]), int(name[j])))): length for (i, j), length in shuffled.items()}
+    assert (renamed.keys(), shuffled_inner) == (springs.keys(), inner)
+    assert [renamed[pair] for pair in springs] == pytest.approx(list(springs.values()), rel=LENGTH)
+
+
+def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
+    nodes, nobody = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]), np.array([[0.0, 9, 0]])
+    labels = np.array([0, 0, 1, 1], np.int32)
+
+    def found(radius: list[float], neighbours: list[int]) -> set[tuple[int, int]]:
+        return undirected(piecewise_topology(nodes, nobody, labels, radius, neighbours, 0.1, 1).springs)
+
+    assert found([0.15, 0.01], [5, 5]) == {(0, 1), (1, 2)}, "the left region asks"
+    assert found([0.01, 0.15], [5, 5]) == {(1, 2), (2, 3)}, "the right region asks"
+    assert found([0.01, 0.01], [5, 5]) == set()
+    # A node's own values decide whom it asks, whichever region the other is in.
+    assert found([0.25, 0.01], [5, 1]) == {(0, 1), (0, 2), (1, 2), (1, 3)}
+
+
+# Isolated nodes -------------------------------------------------------------------------------------------------------
+
+
+def test_isolated_nodes_are_those_without_any_spring() -> None:
+    assert isolated(5, np.array([[0, 1], [6, 3]])).tolist() == [2, 4]
+    assert isolated(3, np.zeros((0, 2), np.int32)).tolist() == [0, 1, 2]
+
+
+def test_join_gives_lonely_nodes_their_nearest_nodes_behind_the_springs_that_are_there() -> None:
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.1, 0, 0], [3.3, 0, 0], [4.6, 0, 0], [0, 0, MIN_LENGTH / 2]])
+    springs = np.array([[0, 1], [2, 1]])
+    joined = join(nodes, springs, np.array([4]))
+    assert joined.tolist() == [[0, 1], [2, 1], [4, 3], [4, 2], [4, 1]]
+    assert len(joined) - len(springs) == REPAIR_SPRINGS
+    # Two lonely nodes that ask for each other get one spring, and a node at the same place is no partner.
+    undirected(join(nodes, springs, np.array([3, 4])))
+    assert (0, 5) not in undirected(join(nodes, springs, np.array([5])))
+    np.testing.assert_array_equal(join(nodes, springs, np.zeros(0, int)), springs)
+
+
+def test_repair_joins_only_nodes_that_nothing_holds() -> None:
+    nodes, hands = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[2.0, 0.05, 0]])
+    one, values = np.zeros(4, np.int32), ([0.2], [5], 0.1, 5)
+    broken = piecewise_topology(nodes, hands, one, *values)
+    assert undirected(broken.springs) == {(0, 1), (3, 4)}
+    mended = piecewise_topology(nodes, hands, one, *values, repair=True)
+    # Node 3 hangs on the controller, so it is left as it is; node 2 asks for its three nearest.
+    assert undirected(mended.springs) == {(0, 1), (3, 4), (1, 2), (2, 3), (0, 2)}
+    assert mended.object_spring_count == 4
+    assert len(isolated(4, mended.springs)) == 0
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5])
+def test_join_looks_past_nodes_at_the_same_place(copies: int) -> None:
+    nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3)])
+    assert undirected(join(nodes, np.zeros((0, 2), int), np.array([0]))) == {(0, copies + i) for i in range(REPAIR_SPRINGS)}

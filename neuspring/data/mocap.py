@@ -57,7 +57,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
-    body = rings(markers[0], settings.spacing, settings.radius, settings.ring)
+    body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
     _require_distance(file, markers[0], body)
     motion_valid = np.ones(observed.shape[:2], dtype=bool)
     motion_valid[-1] = False
@@ -97,14 +97,14 @@ def _require_distance(file: Path, markers: np.ndarray, body: np.ndarray) -> None
         raise InputError(file, rule, f"{distance.min():.2g} m", "Choose a larger radius or spacing.")
 
 
-def rings(markers: np.ndarray, spacing: float, radius: float, count: int) -> np.ndarray:
+def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number: int | None = None) -> np.ndarray:
     """Nodes [R * count, 3], m, on R circles around the centreline through `markers` [n, 3], ring after ring.
 
     The first and last ring lie at the first and last marker; between them rings are equally spaced along the arc, as near to
-    `spacing` as divides it evenly. Each circle lies in the plane normal to the tangent. Its first node follows a
-    parallel-transported frame, so node k of one ring is nearest to node k of the next.
+    `spacing` as divides it evenly, or as many as `number` says. Each circle lies in the plane normal to the tangent. Its first
+    node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
     """
-    centres, tangents = centreline(markers, spacing)
+    centres, tangents = centreline(markers, spacing, number)
     normals = _transported_normals(tangents)
     binormals = np.cross(tangents, normals)
     angle = 2 * np.pi * np.arange(count) / count
@@ -113,13 +113,13 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int) -> np.
     return nodes
 
 
-def centreline(markers: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def centreline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit tangents [R, 3] of a natural cubic spline through `markers`, equally spaced along its arc."""
     chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
     spline = CubicSpline(chords, markers, bc_type="natural")
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(chords)]))
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
-    number = max(round(arc[-1] / spacing), 1) + 1
+    number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number
     at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
     tangents = spline(at, 1)
     return spline(at), tangents / np.linalg.norm(tangents, axis=1, keepdims=True)

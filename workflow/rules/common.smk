@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 from neuspring import config as settings
 from neuspring.errors import InputError
@@ -49,9 +50,9 @@ ENVIRONMENT = str(ROOT / "workflow" / "envs" / "neuspring.yaml")
 
 
 wildcard_constraints:
-    scenario="|".join(map(re.escape, CONFIG.scenarios)),
-    method="|".join(map(re.escape, CONFIG.methods)),
-    search="|".join(sorted({method.search for method in BENCHMARK.methods.values()})),
+    scenario="|".join(map(re.escape, BENCHMARK.scenarios)),
+    method="|".join(map(re.escape, BENCHMARK.methods | BENCHMARK.fits)),
+    search="|".join(map(re.escape, BENCHMARK.searches)),
     seed="|".join(map(str, CONFIG.seeds)),
 
 
@@ -95,32 +96,40 @@ def scenario_files(wildcards):
     ]
 
 
+def search_settings(wildcards):
+    """The search's sections, with the search row's own settings on top."""
+    chosen = common_settings()
+    row = BENCHMARK.searches[wildcards.search]
+    chosen["search"] = settings.plain(settings.search_of(CONFIG, row, wildcards.search))
+    return json.dumps(chosen, sort_keys=True)
+
+
+def common_settings():
+    """What search and fit share."""
+    values = settings.plain(CONFIG)
+    return {name: values[name] for name in ("simulation", "losses", "released_quirks")}
+
+
 def fit_settings(wildcards):
     """The fit's sections, with the method's own settings on top."""
-    values = settings.plain(CONFIG)
-    chosen = {
-        name: values[name] for name in ("simulation", "losses", "released_quirks")
-    }
+    chosen = common_settings()
     chosen["fit"] = settings.plain(
-        settings.fit_of(CONFIG, BENCHMARK.methods[wildcards.method], wildcards.method)
+        settings.fit_of(CONFIG, BENCHMARK.fits[wildcards.method], wildcards.method)
     )
     return json.dumps(chosen, sort_keys=True)
 
 
-def search_folder(wildcards):
-    return f"{RESULTS}/{wildcards.scenario}/search-{BENCHMARK.methods[wildcards.method].search}/{wildcards.seed}"
-
-
 def search_record(wildcards):
-    return f"{search_folder(wildcards)}/search.json"
+    method = (BENCHMARK.methods | BENCHMARK.fits)[wildcards.method]
+    return f"{RESULTS}/{wildcards.scenario}/search-{method.search}/{wildcards.seed}/search.json"
 
 
 def fit_records(wildcards):
-    """The fit's record if the method has that stage, else nothing."""
-    has_fit = BENCHMARK.methods[wildcards.method].fit is not None
+    """The fit's record if the method has that stage, else nothing. Methods with the same fit share it."""
+    owner = BENCHMARK.fit_of_method.get(wildcards.method)
     return (
-        [f"{RESULTS}/{wildcards.scenario}/{wildcards.method}/{wildcards.seed}/fit.json"]
-        if has_fit
+        [f"{RESULTS}/{wildcards.scenario}/{owner}/{wildcards.seed}/fit.json"]
+        if owner
         else []
     )
 
@@ -130,15 +139,64 @@ def twin_record(wildcards):
     return (fit_records(wildcards) or [search_record(wildcards)])[0]
 
 
+def rollout_twins(wildcards):
+    """The records whose trajectories a prediction is made of: one, or those of all seeds."""
+    if not BENCHMARK.methods[wildcards.method].average_seeds:
+        return [twin_record(wildcards)]
+    return [
+        twin_record(
+            SimpleNamespace(
+                scenario=wildcards.scenario, method=wildcards.method, seed=seed
+            )
+        )
+        for seed in CONFIG.seeds
+    ]
+
+
 def fit_option(wildcards, input):
     return ["--fit", str(input.fit)] if input.get("fit") else []
 
 
+def carry_option(wildcards):
+    return "--carry-over" if BENCHMARK.methods[wildcards.method].carry_over else ""
+
+
 def variant(wildcards):
-    row = settings.plain(BENCHMARK.methods[wildcards.method])
+    method = BENCHMARK.methods[wildcards.method]
+    row = settings.plain(method)
     return json.dumps(
-        {"search": row["search"], "fit": row["fit"] or "none", **row["settings"]},
+        {
+            "search": method.search,
+            "clusters": BENCHMARK.searches[method.search].clusters,
+            "fit": method.fit or "none",
+            "carry_over": method.carry_over,
+            "average_seeds": method.average_seeds,
+            **row["settings"],
+        },
         sort_keys=True,
+    )
+
+
+def transfer_targets(wildcards):
+    return [
+        f"{RESULTS}/{target}/observations.npz"
+        for target in BENCHMARK.transfers[wildcards.scenario]
+    ]
+
+
+def transfer_records():
+    """One per source, method and seed. Carrying over and averaging concern the same recording's future, not another one."""
+    methods = [
+        name
+        for name, method in BENCHMARK.methods.items()
+        if not (method.carry_over or method.average_seeds)
+    ]
+    return expand(
+        "{results}/{scenario}/{method}/{seed}/transfer.json",
+        results=RESULTS,
+        scenario=BENCHMARK.transfers,
+        method=methods,
+        seed=CONFIG.seeds,
     )
 
 
@@ -171,6 +229,9 @@ def table_arguments():
             *CONFIG.scenarios,
         ),
         *("--methods", *CONFIG.methods, "--seeds", *map(str, CONFIG.seeds)),
+        *(["--transfers", *BENCHMARK.transfers] if BENCHMARK.transfers else []),
+        "--baseline",
+        BENCHMARK.compared_with,
     ]
 
 

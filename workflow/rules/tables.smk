@@ -1,6 +1,7 @@
 rule tables:
     input:
-        run_records(),
+        runs=run_records(),
+        transfers=transfer_records(),
     output:
         TABLES,
     log:

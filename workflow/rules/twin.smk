@@ -17,11 +17,12 @@ rule search:
         mem_mb=8000,
         runtime=240,
     params:
-        settings=section("search", "simulation", "losses", "released_quirks"),
+        settings=search_settings,
+        clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
         code=code_digest("neuspring.search"),
     shell:
-        "python -m neuspring search --observations {input.observations:q} --settings {params.settings:q} --seed {wildcards.seed}"
-        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        "python -m neuspring search --observations {input.observations:q} --settings {params.settings:q}"
+        " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
 
 
 rule fit:
@@ -45,16 +46,17 @@ rule fit:
         runtime=480,
     params:
         settings=fit_settings,
+        kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
         code=code_digest("neuspring.fit"),
     shell:
         "python -m neuspring fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
 
 
 rule rollout:
     input:
         observations=rules.observe.output,
-        twin=twin_record,
+        twin=rollout_twins,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:
@@ -71,7 +73,36 @@ rule rollout:
         mem_mb=4000,
         runtime=60,
     params:
-        code=code_digest("neuspring.rollout"),
+        carry=carry_option,
+        code=code_digest("neuspring.rollout", "neuspring.carry"),
     shell:
-        "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q}"
+        "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
         " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+
+
+rule transfer:
+    input:
+        targets=transfer_targets,
+        twin=twin_record,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/transfer.json",
+    log:
+        f"{RESULTS}/logs/transfer/{{scenario}}/{{method}}/{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/transfer/{{scenario}}/{{method}}/{{seed}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        device=DEVICE,
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=4000,
+        runtime=60,
+    params:
+        settings=section("simulation"),
+        code=code_digest("neuspring.rollout", "neuspring.transfer", "neuspring.metrics"),
+    shell:
+        "python -m neuspring transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
+        " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+        " --output {output:q} 2>&1 | tee -a {log:q}"

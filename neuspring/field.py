@@ -1,0 +1,174 @@
+"""Neural spring field: a physical quantity of each spring as a function of its canonical midpoint (the paper's NSF).
+
+S(e) = S0 + F(x_mid(e)), x_mid = (x_i + x_j) / 2. F reads three N x N planes of C channels (xy, yz, xz) spanning the bounding
+cube of all midpoints, bilinearly, sums the three features, and passes them through a Fourier feature transform and an MLP of
+three layers. The last layer starts at zero, so F = 0 at the start. This module returns F; what it is added to, and on which
+scale, is the business of `parameters`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.functional import embedding_bag
+
+from neuspring.config import SpringField as Settings
+
+AXES = ((0, 1), (1, 2), (0, 2))
+"""Coordinates that span the planes xy, yz, xz."""
+RESOLUTION_FACTOR = 0.85
+FEWEST_TEXELS = 2
+"""Bilinear interpolation needs two texels per side."""
+
+
+def midpoints(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """Canonical midpoints [S, 3], m, of springs [S, 2] that index nodes, then controllers."""
+    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
+    middle: np.ndarray = ends.mean(axis=1)
+    return middle
+
+
+def in_cube(points: np.ndarray) -> np.ndarray:
+    """Points [S, 3] mapped to [-1, 1]^3 by their bounding cube: same centre, the longest side of the bounding box."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = max(float((high - low).max()) / 2, 1e-12)
+    mapped: np.ndarray = (points - (low + high) / 2) / half
+    return mapped
+
+
+def adaptive_resolution(springs: int) -> int:
+    """N = round(0.85 sqrt(|E|)), at least 2."""
+    return max(round(RESOLUTION_FACTOR * math.sqrt(springs)), FEWEST_TEXELS)
+
+
+def fourier(values: torch.Tensor, bands: int) -> torch.Tensor:
+    """[sin(2^k pi u), cos(2^k pi u)] for k < bands: [..., D] -> [..., 2 D bands]."""
+    angle = (values[..., None] * (torch.pi * 2.0 ** torch.arange(bands, device=values.device))).flatten(-2)
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
+
+
+class TriPlane(nn.Module):
+    """Three feature planes, read at fixed points.
+
+    The points never move, so only the texels around them can ever receive a gradient: `texels` [A, C] holds those, out of the
+    3 N^2 of the full planes; the others would keep their first values. Memory and time depend on the springs, not on N^2.
+    """
+
+    indices: torch.Tensor
+    weights: torch.Tensor
+    neighbours: torch.Tensor
+
+    def __init__(self, points: np.ndarray, resolution: int, channels: int, scale: float, generator: torch.Generator) -> None:
+        """`points` [S, 3] in [-1, 1]^3; texels start as N(0, scale^2), drawn for the full planes."""
+        super().__init__()
+        cells, weights = bilinear(points, resolution)
+        active, inverse = np.unique(cells, return_inverse=True)
+        full = scale * torch.randn(3 * resolution**2, channels, generator=generator)
+        self.texels = nn.Parameter(full[torch.from_numpy(active)])
+        self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
+        self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
+        self.register_buffer("neighbours", torch.from_numpy(_neighbours(active, resolution)), persistent=False)
+
+    def forward(self) -> torch.Tensor:
+        """Summed features [S, C]."""
+        return embedding_bag(self.indices, self.texels, per_sample_weights=self.weights, mode="sum")
+
+    def roughness(self) -> torch.Tensor:
+        """Mean squared difference of neighbouring texels in use; every point uses 2 x 2 of each plane."""
+        first, second = self.neighbours.unbind(dim=1)
+        return (self.texels[first] - self.texels[second]).square().mean()
+
+
+def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texels (numbered plane N^2 + row N + column) and bilinear weights [S, 12] of points [S, 3] in [-1, 1]^3.
+
+    Texel centres lie on a regular grid whose outermost ones are the cube's sides. The column follows a plane's first axis.
+    """
+    grid = (np.clip(points, -1, 1) + 1) / 2 * (resolution - 1)
+    low = np.minimum(np.floor(grid).astype(np.int64), resolution - 2)
+    part = grid - low
+    cells, weights = [], []
+    for plane, (a, b) in enumerate(AXES):
+        for row in (0, 1):
+            for column in (0, 1):
+                cells.append(plane * resolution**2 + (low[:, b] + row) * resolution + low[:, a] + column)
+                along, up = (part[:, a], part[:, b])
+                weights.append((along if column else 1 - along) * (up if row else 1 - up))
+    return np.stack(cells, axis=1), np.stack(weights, axis=1)
+
+
+def _neighbours(active: np.ndarray, resolution: int) -> np.ndarray:
+    """Pairs [P, 2] of positions in the sorted `active` whose texels adjoin in the same plane."""
+    pairs = []
+    for step, inside in (
+        (1, active % resolution < resolution - 1),
+        (resolution, active % resolution**2 < resolution**2 - resolution),
+    ):
+        wanted = active + step
+        place = np.minimum(np.searchsorted(active, wanted), len(active) - 1)
+        found = inside & (active[place] == wanted)
+        pairs.append(np.stack([np.flatnonzero(found), place[found]], axis=1))
+    return np.concatenate(pairs)
+
+
+class SpringField(nn.Module):
+    """F at the canonical midpoints of a fixed set of springs: forward() gives [S, outputs], zero at the start."""
+
+    coordinates: torch.Tensor
+
+    def __init__(self, points: np.ndarray, settings: Settings, outputs: int, seed: int) -> None:
+        """`points` [S, 3], m: midpoints. Weights depend on `seed`, the settings and S alone, not on the order of springs."""
+        super().__init__()
+        self.settings = settings
+        mapped = in_cube(points)
+        self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
+        self.resolution = adaptive_resolution(len(points)) if settings.resolution == "adaptive" else settings.resolution
+        generator = torch.Generator().manual_seed(seed)
+        self.planes = None
+        if settings.triplane:
+            self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.plane_scale, generator)
+        widths = [self._encoded_width(), settings.hidden, settings.hidden, outputs]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+        with torch.no_grad():
+            for layer in self.layers:
+                assert isinstance(layer, nn.Linear)
+                bound = layer.in_features**-0.5
+                for tensor in (layer.weight, layer.bias):
+                    tensor.uniform_(-bound, bound, generator=generator)
+            for tensor in self.layers[-1].parameters():
+                tensor.zero_()
+
+    def _encoded_width(self) -> int:
+        s = self.settings
+        width = 0
+        if s.triplane:
+            width += s.channels * (2 * s.bands if s.fourier in ("feature", "both") else 1)
+        if s.fourier in ("coordinates", "both"):
+            width += 3 * 2 * s.bands
+        return width
+
+    def encoded(self) -> torch.Tensor:
+        """Inputs of the MLP [S, width]: the plane feature and the coordinates, each transformed as the settings say."""
+        s, parts = self.settings, []
+        if self.planes is not None:
+            feature = self.planes()
+            parts.append(fourier(feature, s.bands) if s.fourier in ("feature", "both") else feature)
+        if s.fourier in ("coordinates", "both"):
+            parts.append(fourier(self.coordinates, s.bands))
+        return torch.cat(parts, dim=1)
+
+    def forward(self) -> torch.Tensor:
+        """F [S, outputs]."""
+        x = self.encoded()
+        for layer in self.layers[:-1]:
+            x = torch.relu(layer(x))
+        result: torch.Tensor = self.layers[-1](x)
+        return result
+
+    def roughness(self) -> torch.Tensor:
+        """Mean squared difference of neighbouring texels; 0 without planes."""
+        return self.planes.roughness() if self.planes is not None else self.coordinates.sum() * 0.0

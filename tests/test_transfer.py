@@ -1,0 +1,58 @@
+"""Twins on other recordings of the same object."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.errors import InputError
+from neuspring.rollout import mean_trajectory, roll_out
+from neuspring.transfer import rebase
+from tests import small
+
+# Rest lengths are float32.
+SINGLE = 1e-6
+
+
+def test_the_same_recording_gives_the_same_twin():
+    problem = small.fit_problem()
+    moved = rebase(problem.twin, problem.observations)
+    np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths, rtol=SINGLE)
+    assert moved.simulation == problem.twin.simulation
+    assert np.array_equal(moved.material.stiffness, problem.twin.material.stiffness)
+
+
+def test_rest_lengths_follow_the_new_first_frame_and_keep_what_was_learned():
+    problem = small.fit_problem()
+    learned = replace(problem.twin.topology, rest_lengths=problem.twin.topology.rest_lengths * 1.03)
+    seen = problem.observations
+    larger = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
+    moved = rebase(replace(problem.twin, topology=learned), larger)
+    np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths * 2.06, rtol=1e-5)
+    assert np.array_equal(moved.topology.nodes, larger.nodes)
+
+
+def test_more_substeps_where_the_new_distances_need_them():
+    problem = small.fit_problem()
+    seen = problem.observations
+    smaller = replace(seen, **{name: getattr(seen, name) / 4 for name in ("object_points", "surface_points", "controller_points")})
+    moved = rebase(problem.twin, smaller)
+    assert moved.simulation.substeps > problem.twin.simulation.substeps
+    assert roll_out(moved, smaller.controller_points).diverged_frame is None
+
+
+def test_another_number_of_nodes_is_refused():
+    problem = small.fit_problem()
+    seen = problem.observations
+    with pytest.raises(InputError, match=r"as many nodes: \d+; received \d+.*mocap\.rings"):
+        rebase(problem.twin, replace(seen, surface_points=seen.surface_points[1:]))
+
+
+def test_the_mean_of_rollouts():
+    problem = small.fit_problem()
+    one = roll_out(problem.twin, problem.observations.controller_points)
+    other = replace(one, positions=one.positions + np.float32(0.02), collision_overflow=3)
+    mean = mean_trajectory([one, other])
+    np.testing.assert_allclose(mean.positions, one.positions + 0.01, atol=SINGLE)
+    assert mean.collision_overflow == 3
+    assert mean_trajectory([one]) is one
