@@ -21,7 +21,7 @@ from neuspring.errors import InputError
 ROOT = Path(__file__).parents[2]
 TINY = {
     "scenarios": ["toy_rope_lift_smooth"],
-    "methods": ["search_only", "phystwin"],
+    "methods": ["search_only", "baseline"],
     "seeds": [0],
     "search": {"rollouts": 11},
     "fit": {"epochs": 3, "checkpoint_every": 1},
@@ -77,7 +77,7 @@ def finished(tmp_path_factory):
 def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(finished):
     project, result = finished
     results = project / "results"
-    assert "| phystwin " in result.stdout + result.stderr
+    assert "| baseline " in result.stdout + result.stderr
     assert "neuspring ui --results results" in result.stdout + result.stderr
     scores = pd.read_parquet(results / "tables" / "scores.parquet")
     assert len(scores) == 8
@@ -104,6 +104,48 @@ def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(finished)
     assert planned == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "all": 1}
 
 
+def test_methods_share_searches_and_fits(finished):
+    project, _ = finished
+    names = ["search_only", "baseline", "phystwin", "model_a", "model_b", "neuspring", "pt_only", "clusters_1", "clusters_5"]
+    changes = {"methods": [*names, "plus_carry_over", "plus_average"], "seeds": [0, 1], "results": "variants"}
+    planned = jobs(run(project, changes, "--dry-run"))
+    # Uniform and five regions; baseline, model_a, model_b and neuspring; two seeds each.
+    assert (planned["search"], planned["fit"]) == (2 * 2, 4 * 2)
+    assert planned["rollout"] == planned["score"] == 11 * 2
+
+
+def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(place):
+    changes = {
+        "methods": ["neuspring", "plus_carry_over", "plus_average"],
+        "seeds": [0, 1],
+        "fit": {"epochs": 1},
+        "transfers": {SCENE: ["toy_rope_shake_smooth"], "toy_rope_shake_smooth": [SCENE]},
+        "tracking": {"enabled": False},
+    }
+    result = run(place, changes)
+    text = result.stdout + result.stderr
+    assert result.returncode == 0, text
+    results = place / "results"
+    summary = (results / "tables" / "summary.md").read_text()
+    assert all(f"| {name} " in summary for name in changes["methods"])
+    assert "## Transfer" in summary
+    transfers = pd.read_csv(results / "tables" / "transfers.csv")
+    # Averaging and carrying over concern a recording's own future; the other recording is no source, since it is not chosen.
+    assert set(transfers["method"]) == {"neuspring"}
+    assert set(transfers["scenario"]) == {SCENE}
+    averaged = [pd.read_parquet(results / SCENE / "plus_average" / seed / "scores.parquet")["value"] for seed in "01"]
+    np.testing.assert_array_equal(*averaged)
+    record = json.loads((results / SCENE / "neuspring" / "0" / "run.json").read_text())
+    assert record["variant"]["clusters"] == 5
+    assert {Path(name).name for name in record["artifacts"]["plots"]} >= {"topology.png", "stiffness.png", "motion.png"}
+
+    more = run(place, changes | {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}})
+    text = more.stdout + more.stderr
+    assert more.returncode == 0, text
+    assert "continuing the search after 11 rollouts" in text
+    assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
+
+
 def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
     lines = (result.stdout + result.stderr).split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
     return {name: int(count) for name, count in (line.split() for line in lines) if name != "total"}
@@ -111,7 +153,7 @@ def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
 
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, place):
     project, _ = finished
-    changes = {"methods": ["phystwin"], "fit": {"epochs": 60}, "tracking": {"enabled": False}}
+    changes = {"methods": ["baseline"], "fit": {"epochs": 60}, "tracking": {"enabled": False}}
     whole = run(project, changes)
     assert whole.returncode == 0, whole.stdout + whole.stderr
 
@@ -123,7 +165,7 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    folder = place / "results" / SCENE / "phystwin" / "0"
+    folder = place / "results" / SCENE / "baseline" / "0"
     deadline = time.monotonic() + 120
     while not (folder / "fit.partial.npz").exists():
         assert process.poll() is None, "the run ended before its first checkpoint"
@@ -138,7 +180,7 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
     assert continued.returncode == 0, continued.stdout + continued.stderr
     assert "continuing the fit after epoch" in continued.stdout + continued.stderr
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
-    expected = Twin.load(project / "results" / SCENE / "phystwin" / "0" / "twin.npz")
+    expected = Twin.load(project / "results" / SCENE / "baseline" / "0" / "twin.npz")
     np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)
 
 
