@@ -19,9 +19,10 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 
 demo: $(INSTALLED)
 	$(SNAKEMAKE) --cores $(CORES) --quiet rules
+	@echo "The table once more: cat results/tables/summary.md"
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

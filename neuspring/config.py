@@ -352,6 +352,8 @@ class Config:
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen."""
     results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
     """Folder that everything is written to."""
+    tables: Name = "tables"
+    """Folder for tables in the results folder; another name keeps the tables of another choice of methods apart."""
     data_root: str | None = None
     """Folder that relative scenario paths start from."""
     scenario_table: str = "config/scenarios.tsv"
@@ -574,8 +576,8 @@ class Benchmark:
             transfers,
         )
         for name in [*chosen.scenarios, *chosen.methods]:
-            if name in RESERVED or name.startswith("search-"):
-                rule = f"{', '.join(RESERVED)} and search-... are folders of the results"
+            if name in (*RESERVED, config.tables) or name.startswith("search-"):
+                rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in chosen.methods.items():
             high = search_of(config, searches[method.search], method.search).ranges.stiffness[1]

@@ -339,7 +339,7 @@ def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "") -> F
     earlier, overflow = state.seconds, state.overflow
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
-    progress = Progress(f"fit {problem.observations.scenario.name}", problem.fit.epochs)
+    progress = Progress(f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}", problem.fit.epochs)
     while state.epoch < problem.fit.epochs and len(state.rollbacks) < MAX_ROLLBACKS:
         _advance(run, state, problem)
         state.overflow = overflow + run.collision_overflow

@@ -209,7 +209,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     strategy = _strategy(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.rollouts
-    progress = Progress(f"search {problem.observations.scenario.name} seed {seed}", budget)
+    progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
     done = 0
     # The last generation may be cut short, so that searches of any population size use exactly the same budget.
     while done < budget:

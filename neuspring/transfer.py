@@ -11,11 +11,11 @@ from neuspring.errors import InputError
 from neuspring.physics import stability
 
 
-def rebase(twin: Twin, observations: Observations, safety: float = 0.8) -> Twin:
+def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False, safety: float = 0.8) -> Twin:
     """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its first frame.
 
-    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in frame 0 (1
-    unless rest lengths were trained). Frame time, up and ground follow the recording; more substeps are taken if the new
+    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in frame 0. With
+    `keep_lengths` it keeps the length itself: for trained ones, which belong to the body and not to a first frame. Frame time, up and ground follow the recording; more substeps are taken if the new
     distances need them. Raises InputError if the node or controller counts differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
@@ -26,7 +26,7 @@ def rebase(twin: Twin, observations: Observations, safety: float = 0.8) -> Twin:
             raise InputError(f"transfer to {scenario.name}", rule, len(new), "Sample both alike (mocap.rings).")
     before = _distances(topology.nodes, topology.controllers, topology.springs)
     after = _distances(nodes, hands, topology.springs)
-    lengths = topology.rest_lengths.astype(np.float64) / before * after
+    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else after / before)
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         raise InputError(f"transfer to {scenario.name}", "the ends of a spring may not coincide in frame 0", f"spring {pair}")

@@ -15,6 +15,8 @@ from neuspring import artifacts, config
 from neuspring.config import Benchmark, Config, Method, SearchRow, parse, plain
 from neuspring.errors import InputError
 
+ROOT = Path(__file__).parents[1]
+
 MINIMAL = "scenarios: [rope]\nmethods: [ours]\n"
 
 
@@ -386,3 +388,44 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     for name in methods:
         if name.startswith("clusters_"):
             assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))
+
+
+@pytest.mark.parametrize(
+    "overlays",
+    [
+        [],
+        ["clusters"],
+        ["mocap"],
+        ["mocap", "clusters"],
+        ["mocap", "mocap_fine"],
+        ["mocap", "mocap_eval"],
+        ["mocap", "mocap_pieces"],
+    ],
+)
+def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
+    values = {}
+    for name in ["config", *overlays]:
+        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
+    for row in config.read_scenarios(ROOT / "config" / "scenarios.tsv").values():
+        (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / row.path).touch()
+    benchmark = config.Benchmark.of(values | {"data_root": str(tmp_path)}, ROOT)
+    assert benchmark.compared_with in benchmark.methods
+    assert set(benchmark.fits) <= set(config.read_methods(ROOT / "config" / "methods.yaml"))
+
+
+def test_every_method_that_is_shipped_is_valid():
+    methods = config.read_methods(ROOT / "config" / "methods.yaml")
+    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": list(methods)}
+    benchmark = config.Benchmark.of(values, ROOT)
+    # Rows that differ in the prediction alone, or in the name, share the fit.
+    shared = {name: owner for name, owner in benchmark.fit_of_method.items() if name != owner}
+    assert shared == {
+        "phystwin": "baseline",
+        "clusters_1": "model_b",
+        "clusters_5": "neuspring",
+        "plus_carry_over": "neuspring",
+        "plus_average": "neuspring",
+        "neuspring_plus_carry_over": "neuspring_plus",
+        "neuspring_plus_average": "neuspring_plus",
+    }

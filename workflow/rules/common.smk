@@ -42,7 +42,7 @@ BENCHMARK = checked_benchmark()
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 DEVICE = CONFIG.device
-TABLES = f"{RESULTS}/tables/summary.md"
+TABLES = f"{RESULTS}/{CONFIG.tables}/summary.md"
 
 
 # Only for `--software-deployment-method conda`; without it the running environment is used.
@@ -224,7 +224,7 @@ def table_arguments():
             "--results",
             RESULTS,
             "--output",
-            f"{RESULTS}/tables",
+            f"{RESULTS}/{CONFIG.tables}",
             "--scenarios",
             *CONFIG.scenarios,
         ),
@@ -252,7 +252,7 @@ def report_end(failed):
         return
     print(f"\n{Path(TABLES).read_text()}")
     print(
-        f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/tables/"
+        f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/{CONFIG.tables}/"
     )
     tell_tracking()
 

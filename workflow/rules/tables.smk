@@ -5,9 +5,9 @@ rule tables:
     output:
         TABLES,
     log:
-        f"{RESULTS}/logs/tables.log",
+        f"{RESULTS}/logs/{CONFIG.tables}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/tables.tsv"
+        f"{RESULTS}/benchmarks/{CONFIG.tables}.tsv"
     retries: 1
     conda:
         ENVIRONMENT
