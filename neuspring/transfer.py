@@ -15,8 +15,9 @@ def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False
     """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its first frame.
 
     A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in frame 0. With
-    `keep_lengths` it keeps the length itself: for trained ones, which belong to the body and not to a first frame. Frame time, up and ground follow the recording; more substeps are taken if the new
-    distances need them. Raises InputError if the node or controller counts differ, or a spring would have no length.
+    `keep_lengths` it keeps the length itself: for trained ones, which belong to the body and not to a first frame. Frame
+    time, up and ground follow the recording; more substeps are taken if the new distances need them. Raises InputError if the
+    node or controller counts differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
     nodes, hands = observations.nodes, observations.controller_points[0]
