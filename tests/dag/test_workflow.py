@@ -209,6 +209,9 @@ def test_a_job_that_breaks_is_retried_and_does_not_stop_the_others(place):
     assert (place / "results" / SCENE / "search_only" / "0" / "run.json").exists()
     assert "DLO1_train_48 / search_only / seed 0: missing" in text
     assert "1/2" in text
+    # What the interrupted run printed does not pass for the table: the next one goes on.
+    planned = jobs(run(place, changes, "--dry-run"))
+    assert planned == {"observe": 1, "search": 1, "rollout": 1, "score": 1, "tables": 1, "all": 1}
 
 
 def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(place, tmp_path):

@@ -218,13 +218,13 @@ def tracked_runs():
     )
 
 
-def table_arguments():
+def table_arguments(folder=""):
     return [
         *(
             "--results",
             RESULTS,
             "--output",
-            f"{RESULTS}/{CONFIG.tables}",
+            f"{RESULTS}/{CONFIG.tables}{folder}",
             "--scenarios",
             *CONFIG.scenarios,
         ),
@@ -239,10 +239,9 @@ def report_end(failed):
     """Print the table of what is finished and what to do next, also after an interruption."""
     if failed:
         print("\nThe run did not finish. What is done so far:", flush=True)
-        subprocess.run(
-            [sys.executable, "-m", "neuspring", "tables", *table_arguments()],
-            check=False,
-        )
+        # Not where the rule writes: with its output in place, the next run would find nothing to be done.
+        command = [sys.executable, "-m", "neuspring", "tables"]
+        subprocess.run([*command, *table_arguments("/so_far")], check=False)
         print(
             "The logs of failed jobs are named above. The same command continues where this one stopped.",
             flush=True,
