@@ -174,3 +174,13 @@ def test_released_recordings() -> None:
         assert seen.object_points.shape[1] == (9 if cable == "DLO1" else 8)
         assert 300 < len(seen.nodes) < 380
         assert_no_twist(seen.surface_points, settings.ring)
+
+
+def test_a_given_number_of_rings_spaces_them_equally_from_end_to_end() -> None:
+    nodes = mocap.rings(helix(), 0.012, 0.006, 3, number=9).reshape(-1, 3, 3)
+    centres = nodes.mean(axis=1)
+    assert len(centres) == 9
+    np.testing.assert_allclose(centres[[0, -1]], helix()[[0, -1]], atol=1e-9)
+    # Chords of equal arcs of a helix are equal; 2 % allows for the spline and the arc's integration.
+    chords = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    np.testing.assert_allclose(chords, chords.mean(), rtol=0.02)
