@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from neuspring.artifacts import Topology, Twin
 from neuspring.figures_views import (
@@ -208,3 +209,8 @@ def _histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float
     text += f"; {low} springs below the axis" if low else ""
     axis.set(xscale="log", xlabel=f"stiffness [N]\n{text}", ylabel="springs")
     axis.tick_params(labelsize=8, which="both")
+    # Matplotlib labels the ticks between powers of ten when few powers are in view; over half a decade they would overlap.
+    if edges[-1] / edges[0] > 3:
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
