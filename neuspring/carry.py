@@ -33,8 +33,9 @@ def carry_over(trajectory: Trajectory, observations: Observations) -> tuple[Traj
     last = scenario.train_end - 1
     if len(trajectory.positions) <= last:
         return trajectory, {"time_constant": 0.0, "gain": 0.0}
-    tau, gain = choose(_residuals(trajectory, observations), scenario.frame_count - scenario.train_end, scenario.frame_rate)
-    residual = _residuals(trajectory, observations)[last]
+    residuals = _residuals(trajectory, observations)
+    tau, gain = choose(residuals, scenario.frame_count - scenario.train_end, scenario.frame_rate)
+    residual = residuals[last]
     known = ~np.isnan(residual).any(axis=1)
     if tau == 0 or not known.any():
         return trajectory, {"time_constant": 0.0, "gain": gain}

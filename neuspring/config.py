@@ -30,6 +30,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published")
 Range = tuple[Finite, Finite]
 Beta = Annotated[float, Field(ge=0, lt=1)]
+Kind = Literal["springs", "field"]
+"""What a first-order stage trains: each spring by itself, or the neural spring field."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,7 +409,7 @@ class Method:
     __pydantic_config__ = STRICT
     search: Name
     """A row of the search table; methods that name the same row share the search."""
-    fit: Literal["springs", "field"] | None
+    fit: Kind | None
     """What the first-order stage trains: each spring by itself, or the neural spring field."""
     description: str
     settings: dict[str, Any] = field(default_factory=dict)
@@ -555,17 +557,15 @@ class Benchmark:
         scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
         _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
         _require_known("methods", config.methods, methods, config.method_table)
-        searches, wanted = (
-            read_searches(root / config.search_table),
-            tuple(dict.fromkeys(methods[n].search for n in config.methods)),
-        )
+        searches = read_searches(root / config.search_table)
+        wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
         _require_known("methods' search", wanted, searches, config.search_table)
         _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
         everyone = tuple(name for source, names in config.transfers.items() for name in (source, *names))
         _require_known("transfers", everyone, scenarios, config.scenario_table)
         transfers = {source: names for source, names in config.transfers.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
-        owners = {n: _first_alike(config, methods, n) for n in config.methods if methods[n].fit}
+        owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
             {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets)},
@@ -615,14 +615,11 @@ class Benchmark:
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
 
 
-def _first_alike(config: Config, methods: Mapping[str, Method], name: str) -> str:
-    """The first row of the table whose fit is that of `name`: same search, same stage, same settings."""
-
-    def fit(other: str) -> tuple[Any, ...]:
-        return methods[other].search, methods[other].fit, fit_of(config, methods[other], other)
-
-    wanted = fit(name)
-    return next(other for other in methods if methods[other].fit and fit(other) == wanted)
+def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
+    """Method with a fit -> the first row of the table with the same search, stage and settings."""
+    first: dict[tuple[Any, ...], str] = {}
+    fitted = {name: method for name, method in methods.items() if method.fit}
+    return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
 
 
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:

@@ -24,10 +24,11 @@ import torch
 
 from neuspring import config
 from neuspring.artifacts import Observations, Twin, write_atomically
+from neuspring.config import Kind
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.losses import FrameLoss
 from neuspring.motion import initial_velocity
-from neuspring.parameters import Kind, TwinParameters
+from neuspring.parameters import TwinParameters
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame
 from neuspring.physics.solver import FrameSolver, Parameters

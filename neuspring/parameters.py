@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,12 +22,12 @@ from torch import nn
 
 from neuspring import config
 from neuspring.artifacts import Twin
+from neuspring.config import Kind
 from neuspring.errors import InputError
 from neuspring.field import SpringField, midpoints
 from neuspring.physics.autograd import ELASTICITY_RANGE, FRICTION_RANGE, pack, twin_tensors
 from neuspring.physics.solver import Parameters
 
-Kind = Literal["springs", "field"]
 CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
 LOWEST_STIFFNESS = 1e-3
 """Stiffness below this is raised to it before taking the logarithm, N."""

@@ -11,18 +11,17 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from neuspring import config, figures, metrics, provenance
 from neuspring.artifacts import Observations, Trajectory, Twin, write_atomically, write_text
-from neuspring.config import Config, ScenarioRow
+from neuspring.config import Config, Kind, ScenarioRow
 from neuspring.errors import NumericalFailure
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
-Kind = Literal["springs", "field"]
 RESULT_ROLES = ("twin", "trajectory")
 """Files of a stage that are its result, as opposed to how it got there."""
 

@@ -5,8 +5,9 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,57 +42,50 @@ class Collected:
 
 def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
     """Read the records of every (scenario, method, seed); a run without a record is listed as missing."""
-    methods, seeds = list(methods), list(seeds)
     tables, rows = [], []
-    for scenario in scenarios:
-        for method in methods:
-            for seed in seeds:
-                path = Path(results) / scenario / method / str(seed) / "run.json"
-                identity: dict[str, Any] = {"scenario": scenario, "method": method, "seed": seed}
-                if not path.is_file():
-                    rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished", "notes": ""})
-                    continue
-                record = read_json(path, RECORD_FORMAT)
-                timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
-                memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
-                rows.append(
-                    identity
-                    | {
-                        "status": record["status"],
-                        "reason": record["reason"],
-                        "notes": "; ".join(record["notes"]),
-                        **timings,
-                        **memory,
-                    }
-                )
-                tables.append(pd.read_parquet(path.parent / record["scores_file"]))
-    filled = [table for table in tables if len(table)]
-    scores = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
-    return Collected(scores, pd.DataFrame(rows))
+    for identity, path in _records(results, scenarios, methods, seeds, "run.json"):
+        if not path.is_file():
+            rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished", "notes": ""})
+            continue
+        record = read_json(path, RECORD_FORMAT)
+        outcome = {"status": record["status"], "reason": record["reason"], "notes": "; ".join(record["notes"])}
+        timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
+        memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
+        rows.append(identity | outcome | timings | memory)
+        tables.append(pd.read_parquet(path.parent / record["scores_file"]))
+    return Collected(_stacked(tables), pd.DataFrame(rows))
 
 
 def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
     """Transferred twins as runs: `scenario` is the source, whose score is the mean over its targets."""
-    methods, seeds = list(methods), list(seeds)
     tables, rows = [], []
-    for source in sources:
-        for method in methods:
-            for seed in seeds:
-                path = Path(results) / source / method / str(seed) / "transfer.json"
-                if not path.is_file():
-                    continue
-                record = StageRecord.load(path)
-                diverged = record.facts.get("diverged", [])
-                reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
-                status = "ok" if record.status == "ok" and not diverged else "failed"
-                rows.append({"scenario": source, "method": method, "seed": seed, "status": status, "reason": reason, "notes": ""})
-                table = pd.read_parquet(record.file("scores", path))
-                keys = ["category", "method", "seed", "task", "metric", "unit"]
-                mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
-                tables.append(mean.assign(scenario=source)[list(COLUMNS)])
+    for identity, path in _records(results, sources, methods, seeds, "transfer.json"):
+        if not path.is_file():
+            continue
+        record = StageRecord.load(path)
+        diverged = record.facts.get("diverged", [])
+        reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
+        status = "ok" if record.status == "ok" and not diverged else "failed"
+        rows.append(identity | {"status": status, "reason": reason, "notes": ""})
+        table = pd.read_parquet(record.file("scores", path))
+        keys = ["category", "method", "seed", "task", "metric", "unit"]
+        mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
+        tables.append(mean.assign(scenario=identity["scenario"])[list(COLUMNS)])
+    return Collected(_stacked(tables), pd.DataFrame(rows))
+
+
+def _records(
+    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], name: str
+) -> Iterator[tuple[dict[str, Any], Path]]:
+    """(scenario, method and seed; path of its record `name`) for every combination."""
+    for scenario, method, seed in product(scenarios, methods, seeds):
+        yield {"scenario": scenario, "method": method, "seed": seed}, Path(results) / scenario / method / str(seed) / name
+
+
+def _stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """One table of scores; empty ones are left out, since they carry no column types."""
     filled = [table for table in tables if len(table)]
-    scores = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
-    return Collected(scores, pd.DataFrame(rows))
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
 
 
 def comparable(collected: Collected) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -210,15 +211,6 @@ BAD_SEARCHES = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_SEARCHES)
-def test_bad_search_tables(name: str, tmp_path: Path) -> None:
-    text, message = BAD_SEARCHES[name]
-    path = write(tmp_path / "searches.yaml", text)
-    with pytest.raises(InputError, match="(?s)" + message) as caught:
-        config.read_searches(path)
-    assert str(path) in str(caught.value)
-
-
 @pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"ranges": {"drag": [2, 1]}}])
 def test_bad_search_settings(settings: dict[str, Any]) -> None:
     row = SearchRow(clusters=2, description="x", settings=settings)
@@ -238,12 +230,15 @@ BAD_METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_METHODS)
-def test_bad_method_tables(name: str, tmp_path: Path) -> None:
-    text, message = BAD_METHODS[name]
-    path = write(tmp_path / "methods.yaml", text)
+BAD_ROWS = [(config.read_searches, *case) for case in BAD_SEARCHES.values()]
+BAD_ROWS += [(config.read_methods, *case) for case in BAD_METHODS.values()]
+
+
+@pytest.mark.parametrize(("read", "text", "message"), BAD_ROWS, ids=[*map("search: {}".format, BAD_SEARCHES), *BAD_METHODS])
+def test_bad_tables_of_searches_and_methods(read: Callable[[Path], Any], text: str, message: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "rows.yaml", text)
     with pytest.raises(InputError, match="(?s)" + message) as caught:
-        config.read_methods(path)
+        read(path)
     assert str(path) in str(caught.value)
 
 

@@ -74,7 +74,7 @@ rule rollout:
         runtime=60,
     params:
         carry=carry_option,
-        code=code_digest("neuspring.rollout", "neuspring.carry"),
+        code=code_digest("neuspring.rollout", "neuspring.motion", "neuspring.carry"),
     shell:
         "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
         " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
@@ -101,7 +101,12 @@ rule transfer:
         runtime=60,
     params:
         settings=section("simulation"),
-        code=code_digest("neuspring.rollout", "neuspring.transfer", "neuspring.metrics"),
+        code=code_digest(
+            "neuspring.rollout",
+            "neuspring.transfer",
+            "neuspring.motion",
+            "neuspring.metrics",
+        ),
     shell:
         "python -m neuspring transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
         " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
