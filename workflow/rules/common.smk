@@ -218,13 +218,13 @@ def tracked_runs():
     )
 
 
-def table_arguments(folder=""):
+def table_arguments(output=f"{RESULTS}/{CONFIG.tables}"):
     return [
         *(
             "--results",
             RESULTS,
             "--output",
-            f"{RESULTS}/{CONFIG.tables}{folder}",
+            output,
             "--scenarios",
             *CONFIG.scenarios,
         ),
@@ -239,9 +239,10 @@ def report_end(failed):
     """Print the table of what is finished and what to do next, also after an interruption."""
     if failed:
         print("\nThe run did not finish. What is done so far:", flush=True)
-        # Not where the rule writes: with its output in place, the next run would find nothing to be done.
+        # In a folder of its own: had the tables a file in place, the next run would find nothing to be done.
         command = [sys.executable, "-m", "neuspring", "tables"]
-        subprocess.run([*command, *table_arguments("/so_far")], check=False)
+        so_far = f"{RESULTS}/{CONFIG.tables}/so_far"
+        subprocess.run([*command, *table_arguments(so_far)], check=False)
         print(
             "The logs of failed jobs are named above. The same command continues where this one stopped.",
             flush=True,
