@@ -350,8 +350,8 @@ class Config:
     """The method that tables compare the others with; the first where it is null or not among `methods`."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
     """Of the search and of a field's first weights; every method runs with the same ones."""
-    transfers: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
-    """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen."""
+    transfers: dict[Name, tuple[Name, ...]] | None = None
+    """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen; null: none."""
     results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
     """Folder that everything is written to."""
     tables: Name = "tables"
@@ -561,9 +561,10 @@ class Benchmark:
         wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
         _require_known("methods' search", wanted, searches, config.search_table)
         _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
-        everyone = tuple(name for source, names in config.transfers.items() for name in (source, *names))
+        pairs = config.transfers or {}
+        everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
         _require_known("transfers", everyone, scenarios, config.scenario_table)
-        transfers = {source: names for source, names in config.transfers.items() if source in config.scenarios}
+        transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
