@@ -31,9 +31,17 @@ SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 
 
-def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False) -> Any:
-    """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning."""
-    return field(metadata={"shape": tuple(shape.split(",")), "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan})
+def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False) -> Any:
+    """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
+
+    An optional one is empty where it is not given.
+    """
+    sizes = tuple(shape.split(","))
+    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan}
+    if not optional:
+        return field(metadata=metadata)
+    empty = tuple(int(size) if size.isdigit() else 0 for size in sizes)
+    return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -173,7 +181,9 @@ class Artifact:
         values: dict[str, Any] = {}
         for spec in dataclasses.fields(cls):
             if "shape" in spec.metadata:
-                values[spec.name] = arrays[prefix + spec.name]
+                optional = spec.default_factory is not dataclasses.MISSING
+                if not optional or prefix + spec.name in arrays:
+                    values[spec.name] = arrays[prefix + spec.name]
                 continue
             kind, value = hints[spec.name], plain[spec.name]
             if isinstance(kind, type) and issubclass(kind, Artifact):
@@ -247,6 +257,9 @@ class Observations(Artifact):
     surface_points: np.ndarray = array("Ns,3", np.float32, "m", "further surface nodes of frame 0")
     interior_points: np.ndarray = array("Ni,3", np.float32, "m", "interior nodes of frame 0")
     tracks: np.ndarray = array("T,K,3", np.float32, "m", "annotated tracks for scoring only; NaN where not annotated", nan=True)
+    rest_shape: np.ndarray = array(
+        "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
+    )
 
     def check(self) -> None:
         name = f"observations of {self.scenario.name}"
@@ -260,13 +273,19 @@ class Observations(Artifact):
         if not self.object_visibility[0].all():
             count = int((~self.object_visibility[0]).sum())
             raise InputError(
-                name, "every tracked point must be visible in frame 0, which is the rest state", f"{count} of {points} are not"
+                name, "every tracked point must be visible in frame 0, where every rollout starts", f"{count} of {points} are not"
             )
+        _require_rest_shape(name, self.rest_shape, len(self.nodes) + self.controller_points.shape[1])
 
     @property
     def nodes(self) -> np.ndarray:
-        """Canonical rest nodes [N, 3], metres."""
+        """Nodes of frame 0 [N, 3], metres."""
         return np.concatenate([self.object_points[0], self.surface_points, self.interior_points])
+
+    @property
+    def canonical(self) -> np.ndarray:
+        """Nodes, then controllers [N + C, 3], m, in the shape that topology, regions and the field are defined on."""
+        return self.rest_shape if len(self.rest_shape) else np.concatenate([self.nodes, self.controller_points[0]])
 
     @property
     def surface_count(self) -> int:
@@ -274,19 +293,28 @@ class Observations(Artifact):
         return len(self.object_points[0]) + len(self.surface_points)
 
 
+def _require_rest_shape(name: str, rest_shape: np.ndarray, points: int) -> None:
+    if len(rest_shape) not in (0, points):
+        raise InputError(f"{name}.rest_shape", f"one position per node and controller ({points}), or none", len(rest_shape))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Topology(Artifact):
-    """The spring graph at rest. Spring end points index nodes; an index i >= N means controller i - N."""
+    """The spring graph. Spring end points index nodes; an index i >= N means controller i - N."""
 
     kind: ClassVar[str] = "topology"
-    nodes: np.ndarray = array("N,3", np.float32, "m", "rest positions")
+    nodes: np.ndarray = array("N,3", np.float32, "m", "positions of frame 0")
     controllers: np.ndarray = array("C,3", np.float32, "m", "controller positions of frame 0")
     springs: np.ndarray = array("S,2", np.int32, "1", "end points; object springs first, then controller springs")
     rest_lengths: np.ndarray = array("S", np.float32, "m", "lengths without force")
     labels: np.ndarray = array("N", np.int32, "1", "cluster of each node; all zero when the topology is uniform")
+    rest_shape: np.ndarray = array(
+        "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
+    )
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
+        _require_rest_shape("topology", self.rest_shape, total)
         if len(self.springs) and (self.springs.min() < 0 or self.springs.max() >= total):
             raise InputError(
                 "topology.springs", f"indices must lie in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]"
@@ -304,6 +332,11 @@ class Topology(Artifact):
                 f"{self.rest_lengths[short[0]]} m for spring {short[0]} between {self.springs[short[0]].tolist()}",
                 "Remove duplicate points before building the springs.",
             )
+
+    @property
+    def canonical(self) -> np.ndarray:
+        """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
+        return self.rest_shape if len(self.rest_shape) else np.concatenate([self.nodes, self.controllers])
 
     @property
     def object_spring_count(self) -> int:

@@ -320,6 +320,8 @@ class Mocap:
     """Ring radius, m."""
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
+    rest_shape: Literal["first_frame", "straight"] = "first_frame"
+    """Shape without forces: that of frame 0, as in the paper, or a straight cable with the arc lengths of frame 0."""
     train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
     """Frames before this fraction are for training."""
 

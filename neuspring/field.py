@@ -25,10 +25,9 @@ FEWEST_TEXELS = 2
 """Bilinear interpolation needs two texels per side."""
 
 
-def midpoints(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray) -> np.ndarray:
-    """Canonical midpoints [S, 3], m, of springs [S, 2] that index nodes, then controllers."""
-    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
-    middle: np.ndarray = ends.mean(axis=1)
+def midpoints(canonical: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """Canonical midpoints [S, 3], m, of springs [S, 2] that index the points `canonical` [N + C, 3], nodes, then controllers."""
+    middle: np.ndarray = canonical.astype(np.float64)[springs].mean(axis=1)
     return middle
 
 

@@ -84,7 +84,7 @@ class TwinParameters(nn.Module):
             if not self.covered:
                 rule = "a field that leaves out controllers needs springs between object nodes"
                 raise InputError("fit.field.controllers", rule, "none", "Let it cover controllers, or widen the search's radii.")
-            points = midpoints(topology.nodes, topology.controllers, topology.springs)[: self.covered]
+            points = midpoints(topology.canonical, topology.springs)[: self.covered]
             self.field = SpringField(points, settings.field, len(self.channels), seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict()

@@ -55,7 +55,8 @@ class SearchProblem:
     """Velocity of each node in frame 0 [N, 3], m/s."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "labels", regions(self.observations.nodes, self.clusters, self.search.clusters))
+        nodes = self.observations.canonical[: len(self.observations.nodes)]
+        object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
 
     @property
@@ -144,6 +145,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         values["controller_radius"],
         int(values["controller_neighbours"]),
         repair=rule == "repair",
+        rest_shape=observations.rest_shape,
     )
     count = len(topology.springs)
     if count == 0:

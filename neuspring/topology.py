@@ -106,10 +106,23 @@ def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float
     return np.stack([len(nodes) + controller, partner[controller, column]], axis=1)
 
 
-def build(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, labels: np.ndarray | None = None) -> Topology:
-    """A Topology whose rest lengths are the frame-0 distances (in double precision, then rounded to float32)."""
-    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs.reshape(-1, 2)]
-    lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """Distance of the ends of each spring [S], m, in double precision."""
+    ends = points.astype(np.float64)[springs.reshape(-1, 2)]
+    found: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    return found
+
+
+def build(
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    springs: np.ndarray,
+    labels: np.ndarray | None = None,
+    rest_shape: np.ndarray | None = None,
+) -> Topology:
+    """A Topology whose rest lengths are the distances in the rest shape [N + C, 3], m, or in frame 0 (rounded to float32)."""
+    shape = np.zeros((0, 3)) if rest_shape is None else rest_shape
+    lengths = distances(shape if len(shape) else np.concatenate([nodes, controllers]), springs)
     if (lengths <= 0).any():
         pair = springs[int(np.argmin(lengths))].tolist()
         raise InputError(
@@ -124,6 +137,7 @@ def build(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, label
         springs=springs.reshape(-1, 2).astype(np.int32),
         rest_lengths=lengths,
         labels=np.zeros(len(nodes), np.int32) if labels is None else labels,
+        rest_shape=shape,
     )
 
 
@@ -137,18 +151,21 @@ def piecewise_topology(
     controller_neighbours: int,
     *,
     repair: bool = False,
+    rest_shape: np.ndarray | None = None,
 ) -> Topology:
     """A radius [m] and a neighbour count (self included) per region; `labels` [N] says which region a node belongs to.
 
-    `repair` joins nodes without any spring, controllers' included, to their nearest nodes. Raises InputError if a controller
-    coincides with a node.
+    Neighbours are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
+    any spring, controllers' included, to their nearest nodes. Raises InputError if a controller coincides with a node.
     """
-    points, hands = np.asarray(nodes, np.float64), np.asarray(controllers, np.float64)
+    given = rest_shape is not None and len(rest_shape) > 0
+    canonical = np.asarray(rest_shape if given else np.concatenate([nodes, controllers]), np.float64)
+    points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
     inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbours)[labels])
     outer = controller_springs(points, hands, controller_radius, controller_neighbours)
     if repair:
         inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
-    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]), labels)
+    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]), labels, rest_shape)
 
 
 def uniform_topology(

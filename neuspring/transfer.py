@@ -9,15 +9,16 @@ import numpy as np
 from neuspring.artifacts import Observations, Twin
 from neuspring.errors import InputError
 from neuspring.physics import stability
+from neuspring.topology import distances
 
 
 def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False, safety: float = 0.8) -> Twin:
-    """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its first frame.
+    """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its rest shape.
 
-    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in frame 0. With
-    `keep_lengths` it keeps the length itself: for trained ones, which belong to the body and not to a first frame. Frame
-    time, up and ground follow the recording; more substeps are taken if the new distances need them. Raises InputError if the
-    node or controller counts differ, or a spring would have no length.
+    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape,
+    which is frame 0 unless the observations say otherwise. With `keep_lengths` it keeps the length itself: for trained ones,
+    which belong to the body and not to a first frame. Frame time, up and ground follow the recording; more substeps are taken
+    if the new distances need them. Raises InputError if the node or controller counts differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
     nodes, hands = observations.nodes, observations.controller_points[0]
@@ -25,12 +26,13 @@ def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False
         if len(old) != len(new):
             rule = f"a twin moves only to a recording of the same object with as many {name}: {len(old)}"
             raise InputError(f"transfer to {scenario.name}", rule, len(new), "Sample both alike (mocap.rings).")
-    before = _distances(topology.nodes, topology.controllers, topology.springs)
-    after = _distances(nodes, hands, topology.springs)
-    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else after / before)
+    ratio = distances(observations.canonical, topology.springs) / distances(topology.canonical, topology.springs)
+    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else ratio)
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
-        raise InputError(f"transfer to {scenario.name}", "the ends of a spring may not coincide in frame 0", f"spring {pair}")
+        raise InputError(
+            f"transfer to {scenario.name}", "the ends of a spring may not coincide in the rest shape", f"spring {pair}"
+        )
     simulation = replace(
         twin.simulation,
         frame_time=1.0 / scenario.frame_rate,
@@ -39,15 +41,9 @@ def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False
         self_collision=scenario.self_collision,
     )
     moved = Twin(
-        topology=replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths),
+        topology=replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape),
         material=twin.material,
         simulation=simulation,
     )
     count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
     return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
-
-
-def _distances(nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray) -> np.ndarray:
-    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
-    distances: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return distances

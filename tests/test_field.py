@@ -122,7 +122,7 @@ def test_the_fourier_transform_by_hand():
 
 def test_midpoints_lie_between_nodes_and_controllers():
     nodes, hands = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 4, 2]])
-    np.testing.assert_array_equal(midpoints(nodes, hands, np.array([[0, 1], [2, 1]])), [[0.5, 0, 0], [0.5, 2, 1]])
+    np.testing.assert_array_equal(midpoints(np.concatenate([nodes, hands]), np.array([[0, 1], [2, 1]])), [[0.5, 0, 0], [0.5, 2, 1]])
 
 
 def test_the_bounding_cube_has_the_longest_side_and_one_scale_for_all_axes():

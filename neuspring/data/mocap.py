@@ -59,6 +59,10 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     observed = markers[:, 2:-2]
     body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
     _require_distance(file, markers[0], body)
+    rest_shape = np.zeros((0, 3))
+    if settings.rest_shape == "straight":
+        line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
+        rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
     motion_valid = np.ones(observed.shape[:2], dtype=bool)
     motion_valid[-1] = False
     return Observations(
@@ -81,6 +85,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         surface_points=body,
         interior_points=np.zeros((0, 3)),
         tracks=observed,
+        rest_shape=rest_shape,
     )
 
 
@@ -113,16 +118,36 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number
     return nodes
 
 
+def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same cable straight and without twist: its markers [n, 3] and the nodes of its rings [number * count, 3], m, along x.
+
+    Arc lengths along the centreline are kept; the body is that of `rings` with as many circles.
+    """
+    _, knots, dense, arc = _arc(markers)
+    line = np.zeros((len(markers), 3))
+    line[:, 0] = np.interp(knots, dense, arc)
+    angle = 2 * np.pi * np.arange(count) / count
+    circle = radius * np.stack([np.zeros(count), np.cos(angle), np.sin(angle)], axis=1)
+    centres = np.linspace(0.0, arc[-1], number)[:, None, None] * np.array([1.0, 0.0, 0.0])
+    return line, (centres + circle).reshape(-1, 3)
+
+
 def centreline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit tangents [R, 3] of a natural cubic spline through `markers`, equally spaced along its arc."""
-    chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
-    spline = CubicSpline(chords, markers, bc_type="natural")
-    dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(chords)]))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
+    spline, _, dense, arc = _arc(markers)
     number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number
     at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
     tangents = spline(at, 1)
     return spline(at), tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+
+
+def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.ndarray]:
+    """Spline through the markers, its parameters at the markers, many parameters, and the arc length [m] at each of these."""
+    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
+    spline = CubicSpline(knots, markers, bc_type="natural")
+    dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
+    return spline, knots, dense, arc
 
 
 def _transported_normals(tangents: np.ndarray) -> np.ndarray:
