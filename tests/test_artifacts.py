@@ -242,6 +242,22 @@ def test_another_kind_or_version(tmp_path: Path) -> None:
     refuses(Twin, path, r"reads format 1; received 99\. Re-run")
 
 
+def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "old.npz"
+    topology().save(path)
+    with np.load(path) as stored:
+        np.savez(path, **{name: stored[name] for name in stored.files if name != "rest_shape"})
+    assert_same(Topology.load(path), topology())
+
+
+def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
+    made = topology()
+    points = len(made.nodes) + len(made.controllers)
+    assert len(topology(rest_shape=np.ones((points, 3))).canonical) == points
+    with pytest.raises(InputError, match=rf"topology\.rest_shape: one position per node and controller \({points}\)"):
+        topology(rest_shape=np.ones((points - 1, 3)))
+
+
 def test_missing_fields(tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
     trajectory().save(path)

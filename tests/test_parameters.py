@@ -8,6 +8,7 @@ import torch
 
 from neuspring import config
 from neuspring.artifacts import Twin
+from neuspring.field import in_cube, midpoints
 from neuspring.fit import TwinFit
 from neuspring.parameters import CONTACT_SCALARS, TwinParameters, bounded, inward_clamp
 from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
@@ -254,6 +255,14 @@ def test_rest_lengths_are_free_per_spring_or_an_output_of_the_field():
     assert (ratio == 1).sum() == len(ratio) - 1
     assert shared.rest_offsets is None
     assert parameters(rest_lengths_by="field").rest_offsets is None, "no bound: not trained"
+
+
+def test_the_field_lives_on_the_rest_shape():
+    made = twin()
+    points = len(made.topology.nodes) + len(made.topology.controllers)
+    shape = np.random.default_rng(0).uniform(0, 1, (points, 3)).astype(np.float32)
+    trained = parameters(start=replace(made, topology=replace(made.topology, rest_shape=shape)))
+    np.testing.assert_allclose(trained.field.coordinates, in_cube(midpoints(shape, made.topology.springs)), atol=SINGLE)
 
 
 def test_springs_are_covered_whatever_the_field_s_settings():

@@ -14,7 +14,7 @@ from neuspring import search as module
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.losses import FrameLoss
 from neuspring.search import PENALTY, SearchProblem, candidate, cost, search
-from neuspring.topology import isolated, uniform_topology
+from neuspring.topology import distances, isolated, regions, uniform_topology
 from tests import small
 
 RELEASED = {
@@ -118,6 +118,20 @@ def test_a_region_s_values_reach_its_own_nodes():
     assert longest[0] < 0.03 < longest[1] < 0.045
     degree = np.bincount(inner.ravel(), minlength=len(problem.labels))
     assert degree[problem.labels == 0].mean() < degree[problem.labels == 1].mean() / 2
+
+
+def test_regions_and_candidates_are_made_on_the_rest_shape():
+    seen = small.observations()
+    # A rope whose second half was compressed in frame 0 to half its length; a rollout still starts there.
+    shape = seen.canonical.astype(np.float64)
+    shape[:, 0] += np.maximum(shape[:, 0] - shape[:, 0].mean(), 0)
+    problem = small.search_problem(replace(seen, rest_shape=shape), clusters=3)
+    np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3, config.Clusters()))
+    assert (problem.labels != small.search_problem(clusters=3).labels).any()
+    regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbours") for r in range(3)}
+    topology = candidate(problem, small.start_values() | regional).topology
+    np.testing.assert_array_equal(topology.nodes, seen.nodes)
+    np.testing.assert_allclose(topology.rest_lengths, distances(shape, topology.springs), rtol=1e-6)
 
 
 def loosely(**changes: object) -> SearchProblem:

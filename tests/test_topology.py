@@ -44,6 +44,20 @@ def same(nodes: np.ndarray, radius: float, neighbours: int) -> np.ndarray:
     return object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbours))
 
 
+def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
+    nodes, hands = cloud(1, 12), cloud(2, 2) + 2
+    shape = np.concatenate([cloud(3, 12), cloud(4, 2)])
+    labels = (np.arange(12) % 2).astype(np.int32)
+    asked = (labels, [0.4, 0.6], [4, 5], 0.5, 3)
+    given = piecewise_topology(nodes, hands, *asked, rest_shape=shape)
+    other = piecewise_topology(shape[:12], shape[12:], *asked)
+    np.testing.assert_array_equal(given.springs, other.springs)
+    np.testing.assert_array_equal(given.rest_lengths, other.rest_lengths)
+    np.testing.assert_array_equal(given.canonical, other.canonical)
+    np.testing.assert_array_equal(given.nodes, nodes.astype(np.float32))
+    np.testing.assert_array_equal(given.controllers, hands.astype(np.float32))
+
+
 # The released simulator -----------------------------------------------------------------------------------------------
 
 

@@ -34,6 +34,20 @@ def test_rest_lengths_follow_the_new_first_frame_and_keep_what_was_learned():
     np.testing.assert_array_equal(kept.topology.rest_lengths, learned.rest_lengths)
 
 
+def test_rest_lengths_follow_the_rest_shape_where_there_is_one():
+    problem = small.fit_problem()
+    seen, topology = problem.observations, problem.twin.topology
+    straight = replace(seen, rest_shape=seen.canonical * 2)
+    bent = replace(straight, object_points=seen.object_points * 4, surface_points=seen.surface_points * 4)
+    moved = rebase(problem.twin, bent)
+    np.testing.assert_allclose(moved.topology.rest_lengths, topology.rest_lengths * 2, rtol=SINGLE)
+    assert np.array_equal(moved.topology.canonical, bent.rest_shape)
+    assert np.array_equal(moved.topology.nodes, bent.nodes)
+    # Another pose of a body in the same rest shape changes nothing.
+    again = rebase(moved, replace(bent, object_points=seen.object_points * 3))
+    np.testing.assert_array_equal(again.topology.rest_lengths, moved.topology.rest_lengths)
+
+
 def test_more_substeps_where_the_new_distances_need_them():
     problem = small.fit_problem()
     seen = problem.observations

@@ -32,6 +32,39 @@ def helix(count: int = 12) -> np.ndarray:
     return np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.3 + 0.3 * angle / angle[-1]], axis=1)
 
 
+def test_a_straightened_cable_keeps_its_arc_lengths() -> None:
+    markers, nodes = mocap.straightened(helix(), number=20, radius=0.006, count=4)
+    length = np.hypot(0.2 * 1.6 * np.pi, 0.3)
+    np.testing.assert_allclose(markers[:, 0], np.linspace(0, length, 12), rtol=0, atol=SPLINE * length)
+    assert (markers[:, 1:] == 0).all()
+    circles = nodes.reshape(20, 4, 3)
+    np.testing.assert_allclose(circles[:, 0, 0], np.linspace(0, markers[-1, 0], 20), atol=EDGE)
+    np.testing.assert_allclose(np.linalg.norm(circles[:, :, 1:], axis=2), 0.006, atol=EDGE)
+    assert (circles[:, :, 1:] == circles[0, :, 1:]).all(), "without twist"
+
+
+def test_a_straight_cable_is_its_own_rest_shape(tmp_path: Path) -> None:
+    markers = np.linspace([0.1, 0.2, 0.3], [0.5, 0.9, 0.4], 12)
+    path = write(tmp_path, np.repeat(markers.T[None], 40, axis=0))
+    seen = mocap.read(ROW, path, Mocap(rest_shape="straight"))
+    frame0 = np.concatenate([seen.nodes, seen.controller_points[0]])
+    distances = [np.linalg.norm(points[:, None] - points[None], axis=2) for points in (seen.canonical, frame0)]
+    np.testing.assert_allclose(*distances, atol=1e-6)
+
+
+def test_the_rest_shape_is_that_of_the_first_frame_unless_it_is_said_to_be_straight(tmp_path: Path) -> None:
+    path = write(tmp_path, recording())
+    plain, straight = mocap.read(ROW, path, Mocap()), mocap.read(ROW, path, Mocap(rest_shape="straight"))
+    assert len(plain.rest_shape) == 0
+    np.testing.assert_array_equal(plain.canonical, np.concatenate([plain.nodes, plain.controller_points[0]]))
+    assert straight.canonical.shape == plain.canonical.shape
+    np.testing.assert_array_equal(straight.nodes, plain.nodes)
+    assert "rest_shape=straight" in straight.scenario.provenance["options"]
+    # Held markers come last, in the order of the controllers.
+    assert (np.diff(straight.canonical[-4:, 0]) > 0).all()
+    assert straight.canonical[-4, 0] == 0
+
+
 def recording(samples: int = 40, count: int = 12) -> np.ndarray:
     """[T, 3, n] as released: the helix swinging rigidly along x."""
     swing = 0.05 * np.sin(np.linspace(0, 3, samples))[:, None, None] * np.array([1.0, 0.0, 0.0])
