@@ -119,7 +119,7 @@ def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
         (scenario.train_end + last) // 2: "middle of the future",
         last: "last frame",
         scenario.train_end - 1: "end of training",
-        0: "rest",
+        0: "start",
     }
     shown = {frame: name for frame, name in named.items() if frame < frames}
     if frames <= last:

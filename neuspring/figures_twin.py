@@ -1,4 +1,4 @@
-"""Pictures of a twin at rest: its regions and springs, and its stiffness."""
+"""Pictures of a twin in frame 0: its regions and springs, and its stiffness."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def topology_figure(twin: Twin, title: str) -> Figure:
     readable(figure.legend(handles, names, loc="upper left", bbox_to_anchor=(right, top), frameon=False, fontsize=8))
     regions, springs = len(np.unique(topology.labels)), len(topology.springs)
     counts = f"{len(topology.nodes)} nodes in {regions} region{'s' * (regions > 1)}, {springs} springs{sample_note(springs)}"
-    headline(figure, f"{title}: topology at rest", counts)
+    headline(figure, f"{title}: topology in frame 0", counts)
     return figure
 
 
@@ -134,7 +134,7 @@ def widened(low: float, high: float) -> tuple[float, float]:
 
 
 def stiffness_figure(twin: Twin, searched: float | None, title: str) -> Figure:
-    """Object springs at rest coloured by stiffness in two views, and their histogram with the searched stiffness [N] marked.
+    """Object springs in frame 0 coloured by stiffness in two views, and their histogram with the searched stiffness [N] marked.
 
     The twin must have an object spring.
     """

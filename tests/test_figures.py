@@ -122,12 +122,12 @@ def test_a_diverged_rollout_is_drawn_as_far_as_it_went(tmp_path):
 @pytest.mark.parametrize(
     ("train_end", "frames", "expected"),
     [
-        (70, 100, {0: "rest", 69: "end of training", 84: "middle of the future", 99: "last frame"}),
-        (99, 100, {0: "rest", 98: "end of training", 99: "last frame"}),
-        (100, 100, {0: "rest", 99: "end of training"}),
-        (70, 40, {0: "rest", 39: "last before divergence"}),
-        (70, 70, {0: "rest", 69: "end of training"}),
-        (70, 1, {0: "rest"}),
+        (70, 100, {0: "start", 69: "end of training", 84: "middle of the future", 99: "last frame"}),
+        (99, 100, {0: "start", 98: "end of training", 99: "last frame"}),
+        (100, 100, {0: "start", 99: "end of training"}),
+        (70, 40, {0: "start", 39: "last before divergence"}),
+        (70, 70, {0: "start", 69: "end of training"}),
+        (70, 1, {0: "start"}),
     ],
 )
 def test_the_frames_of_the_motion_picture(train_end, frames, expected):
