@@ -11,8 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
-from sklearn.cluster import AgglomerativeClustering
-from sklearn.neighbors import kneighbors_graph
 
 from neuspring.artifacts import Topology
 from neuspring.config import Clusters
@@ -38,6 +36,10 @@ def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
     if len(nodes) < least:
         rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
         raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbours.")
+    # Here, since it takes longer to import than most commands that need a topology take to run.
+    from sklearn.cluster import AgglomerativeClustering
+    from sklearn.neighbors import kneighbors_graph
+
     points = np.asarray(nodes, np.float64)
     graph = None
     if settings.connectivity:

@@ -392,6 +392,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["clusters"],
         ["mocap"],
         ["mocap", "clusters"],
+        ["mocap", "mocap_first_frame"],
         ["mocap", "mocap_fine"],
         ["mocap", "mocap_eval"],
         ["mocap", "mocap_pieces"],
