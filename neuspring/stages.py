@@ -265,7 +265,7 @@ def score(
     content = {
         "scenario": observations.scenario.name,
         "method": method,
-        "variant": dict(variant),
+        "variant": _flat(variant),
         "seed": seed,
         "status": last.status,
         "reason": last.reason,
@@ -349,16 +349,15 @@ def _twin_facts(twin: Twin) -> dict[str, Any]:
 
 def _parameters(stages: Mapping[str, StageRecord], variant: Mapping[str, Any]) -> dict[str, Any]:
     """Flat parameters for MLflow: settings and facts of each stage."""
-    flat: dict[str, Any] = {f"method.{name}": value for name, value in variant.items()}
-
-    def add(prefix: str, values: Mapping[str, Any]) -> None:
-        for name, value in values.items():
-            if isinstance(value, Mapping):
-                add(f"{prefix}.{name}", value)
-            else:
-                flat[f"{prefix}.{name}"] = value
-
+    nested: dict[str, Any] = {"method": variant}
     for name, record in stages.items():
-        add(name, record.settings)
-        add(f"{name}.result", record.facts)
+        nested |= {name: record.settings, f"{name}.result": record.facts}
+    return _flat(nested)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values under dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat

@@ -120,7 +120,6 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(plac
         "seeds": [0, 1],
         "fit": {"epochs": 1},
         "transfers": {SCENE: ["toy_rope_shake_smooth"], "toy_rope_shake_smooth": [SCENE]},
-        "tracking": {"enabled": False},
     }
     result = run(place, changes)
     text = result.stdout + result.stderr
@@ -137,6 +136,8 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(plac
     np.testing.assert_array_equal(*averaged)
     record = json.loads((results / SCENE / "neuspring" / "0" / "run.json").read_text())
     assert record["variant"]["clusters"] == 5
+    assert record["variant"]["field.plane_learning_rate"] == 0.01
+    assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
     assert {Path(name).name for name in record["artifacts"]["plots"]} >= {"topology.png", "stiffness.png", "motion.png"}
 
     more = run(place, changes | {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}})
@@ -204,6 +205,7 @@ def test_a_job_that_breaks_is_retried_and_does_not_stop_the_others(place):
     text = result.stdout + result.stderr
     assert result.returncode == 1
     assert f"neuspring: error: {broken}" in text
+    assert "MissingOutputException" not in text, "the command fails by its status"
     assert "Trying to restart job" in text
     # The healthy scenario is finished and in the table; the broken one is listed as missing.
     assert (place / "results" / SCENE / "search_only" / "0" / "run.json").exists()

@@ -11,9 +11,11 @@ from neuspring import config as settings
 from neuspring.errors import InputError
 from neuspring.provenance import code_digest
 
-# Jobs call `python -m neuspring`: with the interpreter that runs Snakemake, unless conda provides one.
+# Jobs call `python -m neuspring`: with the interpreter that runs Snakemake, unless conda provides one. A prefix replaces
+# Snakemake's own, without which a command that fails before a pipe would count as one that succeeded.
 if not workflow.deployment_settings.deployment_method:
-    shell.prefix(f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH; ")
+    folder = shlex.quote(str(Path(sys.executable).parent))
+    shell.prefix(f"set -euo pipefail; export PATH={folder}:$PATH; ")
 
 ROOT = Path(workflow.basedir)
 
