@@ -393,6 +393,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap"],
         ["mocap", "clusters"],
         ["mocap", "mocap_first_frame"],
+        ["mocap", "mocap_short"],
         ["mocap", "mocap_fine"],
         ["mocap", "mocap_eval"],
         ["mocap", "mocap_pieces"],
