@@ -29,6 +29,8 @@ Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
+NO_REST_SHAPE = np.zeros((0, 3))
+"""The rest shape that stands for: as in frame 0."""
 
 
 def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False) -> Any:
@@ -285,12 +287,17 @@ class Observations(Artifact):
     @property
     def canonical(self) -> np.ndarray:
         """Nodes, then controllers [N + C, 3], m, in the shape that topology, regions and the field are defined on."""
-        return self.rest_shape if len(self.rest_shape) else np.concatenate([self.nodes, self.controller_points[0]])
+        return canonical_shape(self.nodes, self.controller_points[0], self.rest_shape)
 
     @property
     def surface_count(self) -> int:
         """How many of the first nodes count as surface: No + Ns."""
         return len(self.object_points[0]) + len(self.surface_points)
+
+
+def canonical_shape(nodes: np.ndarray, controllers: np.ndarray, rest_shape: np.ndarray) -> np.ndarray:
+    """The rest shape [N + C, 3], m, or, where it is empty, nodes [N, 3] and controllers [C, 3] of frame 0."""
+    return rest_shape if len(rest_shape) else np.concatenate([nodes, controllers])
 
 
 def _require_rest_shape(name: str, rest_shape: np.ndarray, points: int) -> None:
@@ -336,7 +343,7 @@ class Topology(Artifact):
     @property
     def canonical(self) -> np.ndarray:
         """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
-        return self.rest_shape if len(self.rest_shape) else np.concatenate([self.nodes, self.controllers])
+        return canonical_shape(self.nodes, self.controllers, self.rest_shape)
 
     @property
     def object_spring_count(self) -> int:

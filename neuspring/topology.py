@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.artifacts import Topology
+from neuspring.artifacts import NO_REST_SHAPE, Topology, canonical_shape
 from neuspring.config import Clusters
 from neuspring.errors import InputError
 
@@ -120,11 +120,10 @@ def build(
     controllers: np.ndarray,
     springs: np.ndarray,
     labels: np.ndarray | None = None,
-    rest_shape: np.ndarray | None = None,
+    rest_shape: np.ndarray = NO_REST_SHAPE,
 ) -> Topology:
     """A Topology whose rest lengths are the distances in the rest shape [N + C, 3], m, or in frame 0 (rounded to float32)."""
-    shape = np.zeros((0, 3)) if rest_shape is None else rest_shape
-    lengths = distances(shape if len(shape) else np.concatenate([nodes, controllers]), springs)
+    lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
     if (lengths <= 0).any():
         pair = springs[int(np.argmin(lengths))].tolist()
         raise InputError(
@@ -139,7 +138,7 @@ def build(
         springs=springs.reshape(-1, 2).astype(np.int32),
         rest_lengths=lengths,
         labels=np.zeros(len(nodes), np.int32) if labels is None else labels,
-        rest_shape=shape,
+        rest_shape=rest_shape,
     )
 
 
@@ -153,15 +152,14 @@ def piecewise_topology(
     controller_neighbours: int,
     *,
     repair: bool = False,
-    rest_shape: np.ndarray | None = None,
+    rest_shape: np.ndarray = NO_REST_SHAPE,
 ) -> Topology:
     """A radius [m] and a neighbour count (self included) per region; `labels` [N] says which region a node belongs to.
 
     Neighbours are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
     any spring, controllers' included, to their nearest nodes. Raises InputError if a controller coincides with a node.
     """
-    given = rest_shape is not None and len(rest_shape) > 0
-    canonical = np.asarray(rest_shape if given else np.concatenate([nodes, controllers]), np.float64)
+    canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
     inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbours)[labels])
     outer = controller_springs(points, hands, controller_radius, controller_neighbours)

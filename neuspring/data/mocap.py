@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from neuspring.artifacts import Observations, Scenario
+from neuspring.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.config import Mocap, ScenarioRow
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.unpickle import load_pickle
@@ -59,7 +59,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     observed = markers[:, 2:-2]
     body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
     _require_distance(file, markers[0], body)
-    rest_shape = np.zeros((0, 3))
+    rest_shape = NO_REST_SHAPE
     if settings.rest_shape == "straight":
         line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
         rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
