@@ -163,6 +163,10 @@ class Search:
     """Budget in candidate rollouts; every method compared gets the same. The last generation may be cut short."""
     sigma: Positive = 1 / 6
     """Initial step in normalised variables."""
+    tied_rollouts: Annotated[int, Field(ge=0)] = 0
+    """Rollouts, of the budget, in which all regions share their values; then each region is freed around the best candidate."""
+    freed_sigma: Positive = 0.06
+    """Step in normalised variables when the regions are freed."""
     stiffness_scale: Literal["linear", "log"] = "linear"
     """Scale on which stiffness is normalised; log needs a positive lower bound."""
     isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
@@ -183,6 +187,8 @@ class Search:
         if self.stiffness_scale == "log" and self.ranges.stiffness[0] <= 0:
             rule = "stiffness_scale: log needs a positive lower bound of ranges.stiffness"
             raise ValueError(f"{rule}, received {list(self.ranges.stiffness)}")
+        if self.tied_rollouts >= self.rollouts:
+            raise ValueError(f"tied_rollouts must be below rollouts ({self.rollouts}), received {self.tied_rollouts}")
 
 
 @dataclass(frozen=True, kw_only=True)

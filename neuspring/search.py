@@ -2,8 +2,9 @@
 
 Variables are normalised to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
 whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
-evaluated candidate wins. Every candidate is kept in a trace, from which a killed search continues, or a finished one with
-a larger budget: CMA-ES is replayed with the recorded costs.
+evaluated candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform
+topology, and the regions are freed around the best candidate found. Every candidate is kept in a trace, from which a killed
+search continues, or a finished one with a larger budget: CMA-ES is replayed with the recorded costs.
 """
 
 from __future__ import annotations
@@ -208,25 +209,24 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     clock = time.perf_counter()
     trace, attempts, earlier = _recorded(record, key)
     known = len(trace)
-    strategy = _strategy(problem, seed)
+    proposals = _Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.rollouts
     progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
     done = 0
     # The last generation may be cut short, so that searches of any population size use exactly the same budget.
     while done < budget:
-        population = strategy.ask()[: budget - done]
+        population = proposals.ask()[: budget - done]
         if not _replays(trace[done : done + len(population)], population, problem.variables):
             print(f"{record}: does not replay on this machine; the search continues afresh from rollout {done}")
             trace, known = trace[:done], done
             if not done:
                 attempts, earlier = 1, 0.0
         for normalised in population[max(len(trace) - done, 0) :]:
-            trace.append(_evaluate(problem, np.asarray(normalised), loss, len(trace), strategy.countiter))
+            trace.append(_evaluate(problem, normalised, loss, len(trace), proposals.generation))
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
         done += len(population)
-        if len(population) == strategy.popsize:
-            strategy.tell(population, [row["cost"] for row in trace[done - len(population) : done]])
+        proposals.tell([row["cost"] for row in trace[done - len(population) : done]])
         if record is not None and len(trace) > known:
             _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
     table = pd.DataFrame(trace[:budget])
@@ -242,7 +242,51 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
 
 
-def _strategy(problem: SearchProblem, seed: int) -> cma.CMAEvolutionStrategy:
+class _Proposals:
+    """The candidates that CMA-ES asks for, in all 2K + 10 normalised variables.
+
+    In the first `tied_rollouts` it moves in the 12 variables of the uniform topology; then it starts again in all of them, from
+    the best candidate so far. Free from the start, K regions are too many variables for a few hundred rollouts: on cables the
+    piecewise search then ended above the uniform one on training frames, although its space contains the other's.
+    """
+
+    def __init__(self, problem: SearchProblem, seed: int) -> None:
+        self._problem, self._seed = problem, seed
+        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
+        self._columns = np.arange(len(problem.variables))
+        """Which of the searched variables each variable takes its value from."""
+        searched = problem
+        if self._tied:
+            searched = replace(problem, clusters=1)
+            self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
+        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
+        self._asked: list[np.ndarray] = []
+        self._best = (np.inf, problem.encode())
+        self._done = 0
+        self.generation = -1
+
+    def ask(self) -> list[np.ndarray]:
+        """The next generation; the last one with tied regions may be cut short."""
+        if self._tied and self._done == self._tied:
+            self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
+            self._columns = np.arange(len(self._problem.variables))
+        self._asked = self._strategy.ask()
+        if self._done < self._tied:
+            self._asked = self._asked[: self._tied - self._done]
+        self.generation += 1
+        return [np.asarray(searched)[self._columns] for searched in self._asked]
+
+    def tell(self, costs: list[float]) -> None:
+        """Costs of the first candidates asked for last; CMA-ES learns from whole generations only."""
+        least = int(np.argmin(costs))
+        if costs[least] < self._best[0]:
+            self._best = (costs[least], np.asarray(self._asked[least])[self._columns])
+        self._done += len(costs)
+        if len(costs) == self._strategy.popsize:
+            self._strategy.tell(self._asked, costs)
+
+
+def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
     # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
     options = {
         "bounds": [0, 1],
@@ -253,7 +297,7 @@ def _strategy(problem: SearchProblem, seed: int) -> cma.CMAEvolutionStrategy:
         "tolx": 0,
         "tolstagnation": np.inf,
     }
-    return cma.CMAEvolutionStrategy(problem.encode(), problem.search.sigma, options)
+    return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
 def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -205,23 +206,28 @@ def test_seeds_decide_the_candidates():
     assert not np.array_equal(runs[0], runs[2])
 
 
-def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
-    record = tmp_path / "trace.parquet"
-    whole = search(small.search_problem(), seed=5)
+def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt a search while it evaluates one more candidate."""
     calls = 0
     evaluate = module._evaluate
 
     def dying(*arguments):
         nonlocal calls
         calls += 1
-        if calls == 15:  # in the middle of the second generation
+        if calls > evaluated:
             raise KeyboardInterrupt
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(module, "_evaluate", dying)
         with pytest.raises(KeyboardInterrupt):
-            search(small.search_problem(), seed=5, record=record, key="k")
+            search(problem, seed, record=record, key="k")
+
+
+def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
+    record = tmp_path / "trace.parquet"
+    whole = search(small.search_problem(), seed=5)
+    die_after(14, small.search_problem(), 5, record, monkeypatch)  # in the middle of the second generation
     assert len(pd.read_parquet(record)) == 11
     continued = search(small.search_problem(), seed=5, record=record, key="k")
     assert (whole.attempts, continued.attempts) == (1, 2)
@@ -275,6 +281,46 @@ def test_a_smaller_budget_is_a_prefix_of_the_record_and_leaves_it(tmp_path, monk
     assert_same_trace(less.trace, whole.trace[:13])
     assert less.cost == whole.trace["cost"][:13].min()
     assert record.read_bytes() == before
+
+
+def tied(rollouts: int, clusters: int = 3, tied_rollouts: int = 15) -> SearchProblem:
+    """A search whose regions share their values in its first rollouts; 15 end in the middle of a generation of 11."""
+    problem = small.search_problem(clusters=clusters)
+    return replace(problem, search=replace(problem.search, rollouts=rollouts, tied_rollouts=tied_rollouts))
+
+
+def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best():
+    trace = search(tied(30), seed=0).trace
+    uniform = search(budget(15), seed=0).trace
+    assert len(trace) == 30
+    np.testing.assert_array_equal(trace["cost"][:15], uniform["cost"])
+    for name in RELEASED:
+        regional = name in module.REGIONAL
+        for column in [f"normalised.{name}.{region}" for region in range(3)] if regional else [f"normalised.{name}"]:
+            np.testing.assert_array_equal(trace[column][:15], uniform[f"normalised.{name}"])
+    radii = trace[[f"normalised.object_radius.{region}" for region in range(3)]][15:]
+    assert (radii.nunique(axis=1) == 3).all()
+    # 12 candidates for 16 variables, drawn around the best of the uniform ones: their mean is within four standard errors.
+    start = uniform.loc[uniform["cost"].idxmin()]
+    sigma = config.Search().freed_sigma
+    names = [column for column in trace if column.startswith("normalised.")]
+    inside = [n for n in names if 0.2 < start[re.sub(r"\.\d$", "", n)] < 0.8]  # away from the bounds, where steps are folded back
+    assert len(inside) > 8
+    for name in inside:
+        assert trace[name][15:27].mean() == pytest.approx(start[re.sub(r"\.\d$", "", name)], abs=4 * sigma / np.sqrt(12))
+
+
+def test_one_region_has_nothing_to_tie():
+    assert_same_trace(search(tied(22, clusters=1), seed=0).trace, search(budget(22), seed=0).trace)
+
+
+@pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15), (29, 27)])
+def test_a_search_with_tied_regions_continues_exactly(tmp_path, monkeypatch, evaluated, kept):
+    """Killed while the regions are tied, in the first generation after it, and in the second."""
+    record = tmp_path / "trace.parquet"
+    die_after(evaluated, tied(30), 1, record, monkeypatch)
+    assert len(pd.read_parquet(record)) == kept
+    assert_same_trace(search(tied(30), seed=1, record=record, key="k").trace, search(tied(30), seed=1).trace)
 
 
 def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_path, capsys):
