@@ -316,6 +316,8 @@ class Mocap:
     __pydantic_config__ = STRICT
     stride: Count = 2
     """Use every n-th sample of the 100 Hz record."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Samples of the record left out at its beginning."""
     frames: Annotated[int, Field(ge=4)] | None = None
     """Keep only the first frames (after the stride); null keeps all."""
     spacing: Positive = 0.012

@@ -44,12 +44,12 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     file = Path(file)
     raw = load_pickle(file)
     refuse(recording_departures(file, raw))
-    samples = np.asarray(raw)[:: settings.stride].transpose(0, 2, 1)
+    samples = np.asarray(raw)[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape
     if frames < MIN_FRAMES:
-        rule = f"at least {MIN_FRAMES} frames must remain after mocap.stride = {settings.stride}"
-        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller stride.")
+        rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
+        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller start or stride.")
     train_end = int(settings.train_fraction * frames)
     if train_end < 2:
         rule = f"mocap.train_fraction = {settings.train_fraction} must leave a frame after frame 0 for training"

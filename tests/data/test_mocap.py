@@ -102,6 +102,13 @@ def test_frames_are_cut_after_the_stride(tmp_path: Path) -> None:
     np.testing.assert_array_equal(seen.object_points[9], recording()[27, :, 2:-2].T.astype(np.float32))
 
 
+def test_the_beginning_can_be_left_out(tmp_path: Path) -> None:
+    path = write(tmp_path, recording())
+    whole, seen = mocap.read(ROW, path, Mocap(stride=3)), mocap.read(ROW, path, Mocap(stride=3, start=6))
+    np.testing.assert_array_equal(seen.object_points, whole.object_points[2:])
+    np.testing.assert_array_equal(seen.controller_points, whole.controller_points[2:])
+
+
 @pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
 def test_ring_geometry(spacing: float, radius: float, ring: int) -> None:
     centres, tangents = mocap.centreline(helix(), spacing)
@@ -162,6 +169,7 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) ->
     ("settings", "message"),
     [
         (Mocap(stride=20), "stride = 20"),
+        (Mocap(start=37), "mocap.start = 37"),
         (Mocap(train_fraction=0.05), "train_fraction"),
         (Mocap(radius=1e-5), "mocap.radius"),
     ],
