@@ -197,7 +197,7 @@ def _parser() -> argparse.ArgumentParser:
     rollout = add("rollout", _rollout, "twin -> trajectory over all frames", "observations", "compute", "output")
     twins = "search.json or fit.json that names the twin; of several, the mean of the trajectories"
     rollout.add_argument("--twin", type=Path, nargs="+", required=True, help=twins)
-    carry = "carry the residual of the last training frame into the prediction, where training frames say that it helps"
+    carry = "correct the state at the last training frame by what was observed there, where training frames say that it helps"
     rollout.add_argument("--carry-over", action="store_true", help=carry)
 
     transfer = add("transfer", _transfer, "twin -> scores on other recordings of the object", "settings", "compute", "output")

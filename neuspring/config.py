@@ -425,7 +425,7 @@ class Method:
     settings: dict[str, Any] = field(default_factory=dict)
     """Fit settings of this method alone (keys of `fit`, for example `horizon: 0`), on top of the configuration's."""
     carry_over: bool = False
-    """Carry the residual of the last training frame into the prediction, where training frames say that it helps."""
+    """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
     average_seeds: bool = False
     """Predict the mean of the trajectories of all seeds; costs as many fits as there are seeds."""
 

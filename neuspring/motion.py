@@ -43,3 +43,15 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
         v[twice] = (-3 * x[0] + 4 * x[1] - x[2])[twice] * scenario.frame_rate / 2
         v_hands = (-3 * hands[0] + 4 * hands[1] - hands[2]) * scenario.frame_rate / 2
     return spread(np.concatenate([x[0][once], hands[0]]), np.concatenate([v[once], v_hands]), nodes)
+
+
+def recent_velocity(observations: Observations, frame: int) -> np.ndarray:
+    """Velocity of each tracked point in `frame` >= 2 [No, 3], m/s, from it and the two frames before; NaN where not known.
+
+    (3 x(t) - 4 x(t-1) + x(t-2)) / (2 dt), exact for constant acceleration.
+    """
+    x = observations.object_points[frame - 2 : frame + 1].astype(np.float64)
+    velocity: np.ndarray = (3 * x[2] - 4 * x[1] + x[0]) * observations.scenario.frame_rate / 2
+    known = observations.object_visibility[frame - 2 : frame + 1].all(axis=0)
+    velocity[~(known & observations.object_motion_valid[frame - 2 : frame].all(axis=0))] = np.nan
+    return velocity

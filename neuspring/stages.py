@@ -152,8 +152,8 @@ def fit(observations_path: Path, search_record: Path, settings: Config, kind: Ki
 def rollout(observations_path: Path, twin_records: Sequence[Path], carry: bool, device: str, output: Path) -> None:
     """Twin + controllers of all frames -> trajectory.npz, rollout.json. Divergence is recorded as a failure.
 
-    Several records: the mean of their trajectories. `carry` carries the residual of the last training frame into the
-    prediction, where training frames say that it helps.
+    Several records: the mean of their trajectories. `carry` corrects the state at the last training frame by what was observed
+    there, where training frames say that it helps.
     """
     from neuspring.carry import carry_over
     from neuspring.motion import initial_velocity
@@ -173,17 +173,20 @@ def rollout(observations_path: Path, twin_records: Sequence[Path], carry: bool, 
     if broken:
         clock.stage("rollout", "failed", reason=f"{broken.stage}: {broken.reason}", **common).save(output)
         return
-    trajectories = []
+    trajectories, carried = [], []
     for path, record in before.items():
         twin = Twin.load(record.file("twin", path))
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
-        trajectories.append(roll_out(twin, observations.controller_points, device, velocity=velocity))
+        trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity)
+        if carry:
+            trajectory, found = carry_over(trajectory, twin, observations, velocity, device)
+            carried.append(found)
+        trajectories.append(trajectory)
     # A diverged rollout ends earlier; the mean would hide that.
     trajectory = next((one for one in trajectories if one.diverged_frame is not None), None) or mean_trajectory(trajectories)
     facts: dict[str, Any] = {"frames": len(trajectory.positions), "averaged": len(trajectories)}
-    if carry:
-        trajectory, carried = carry_over(trajectory, observations)
-        facts |= {f"carry_over_{name}": value for name, value in carried.items()}
+    if carried:
+        facts |= {f"carry_over_{name}": float(np.mean([found[name] for found in carried])) for name in carried[0]}
     path = output.with_name("trajectory.npz")
     trajectory.save(path)
     if trajectory.collision_overflow:

@@ -1,71 +1,106 @@
-"""The residual of the last training frame in the prediction, and its guard."""
+"""The state of the last training frame, corrected by what was observed there, and the guard."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from neuspring.artifacts import Trajectory
-from neuspring.carry import TIME_CONSTANTS, carry_over, choose
+from neuspring import carry
+from neuspring.artifacts import Observations, Trajectory, Twin
+from neuspring.carry import carry_over
+from neuspring.rollout import frames, roll_out, solver_for
 from tests import small
 
-RATE = 25.0
+FRAMES = 30
+KICK = np.array([0.0, 0.4, 0.0])
+"""Of all nodes in frame 0, m/s, where truly nothing moves: an error that dies out slowly."""
 
 
-def fading(tau: float, frames: int = 60, points: int = 5, seed: int = 0) -> np.ndarray:
-    """Residuals [F, P, 3] of an Ornstein-Uhlenbeck process with correlation time tau, s."""
-    rng = np.random.default_rng(seed)
-    keep = np.exp(-1 / (tau * RATE))
-    values = [rng.normal(size=(points, 3))]
-    for _ in range(frames - 1):
-        values.append(keep * values[-1] + np.sqrt(1 - keep**2) * rng.normal(size=(points, 3)))
-    return 0.01 * np.stack(values)
+def kicked(noise: float = 0.0, wrong: bool = True) -> tuple[Trajectory, Twin, Observations, np.ndarray]:
+    """The true twin of the small scene, rolled out from a wrong velocity or the right one."""
+    scene = small.scene(frames=FRAMES, noise=noise)
+    velocity = np.tile(KICK * wrong, (len(scene.observations.nodes), 1))
+    trajectory = roll_out(scene.truth, scene.observations.controller_points, velocity=velocity)
+    return trajectory, scene.truth, scene.observations, velocity
 
 
-def test_lasting_residuals_are_carried_and_white_noise_is_not():
-    assert choose(np.full((40, 5, 3), 0.01), 15, RATE)[0] == max(TIME_CONSTANTS)
-    assert choose(fading(1e-3), 15, RATE)[0] == 0.0
+def future_error(trajectory: Trajectory, seen: Observations) -> float:
+    """Mean distance of tracked points after the split, m."""
+    end, points = seen.scenario.train_end, seen.object_points
+    return float(np.linalg.norm(trajectory.positions[end:, : points.shape[1]] - points[end:], axis=2).mean())
 
 
-def test_the_time_constant_follows_the_residual():
-    times = [choose(fading(tau, 400, 40), 15, RATE)[0] for tau in (0.1, 1.0)]
-    assert 0 < times[0] < times[1]
-
-
-def test_too_few_frames_carry_nothing():
-    assert choose(np.full((3, 5, 3), 0.01), 15, RATE) == (0.0, 0.0)
-
-
-def shifted(frames: int | None = None) -> tuple[Trajectory, object]:
-    """A prediction that is 1 cm off everywhere, always, and the observations of the small scene."""
-    seen = replace(small.scene(frames=20).observations)
-    positions = small.scene(frames=20).motion + np.array([0.01, 0, 0])
-    kept = positions[:frames]
-    return Trajectory(positions=kept, frame_count=len(kept)), seen
-
-
-def test_a_constant_error_is_taken_off_the_future_alone():
-    trajectory, seen = shifted()
-    corrected, facts = carry_over(trajectory, seen)
+def test_the_future_goes_on_from_what_was_seen_last():
+    trajectory, twin, seen, velocity = kicked()
+    corrected, facts = carry_over(trajectory, twin, seen, velocity)
     end = seen.scenario.train_end
-    assert facts["time_constant"] > 0 and facts["gain"] > 0
-    assert np.array_equal(corrected.positions[:end], trajectory.positions[:end])
-    truth = small.scene(frames=20).motion
-    before, after = (np.abs(p[end:] - truth[end:]).mean() for p in (trajectory.positions, corrected.positions))
-    assert after < 0.5 * before
+    assert facts["carried"] == 1 and 0.02 < facts["gain"] < 1
+    np.testing.assert_array_equal(corrected.positions[:end], trajectory.positions[:end])
+    assert corrected.positions.shape == trajectory.positions.shape
+    assert future_error(corrected, seen) < 0.5 * future_error(trajectory, seen)
+
+
+def test_noise_is_not_carried_into_a_right_prediction():
+    trajectory, twin, seen, velocity = kicked(noise=0.01, wrong=False)
+    corrected, facts = carry_over(trajectory, twin, seen, velocity)
+    assert facts["carried"] == 0 and facts["gain"] < 0
+    assert corrected is trajectory
 
 
 def test_the_future_is_not_read():
-    trajectory, seen = shifted()
-    points = np.array(seen.object_points)
-    points[seen.scenario.train_end :] += 1.0
-    blind = replace(seen, object_points=points)
-    assert np.array_equal(carry_over(trajectory, seen)[0].positions, carry_over(trajectory, blind)[0].positions)
+    trajectory, twin, seen, velocity = kicked()
+    end = seen.scenario.train_end
+    points, visible, valid = (np.array(a) for a in (seen.object_points, seen.object_visibility, seen.object_motion_valid))
+    points[end:] += 1.0
+    visible[end:] ^= True
+    valid[end - 1 :] ^= True
+    blind = replace(seen, object_points=points, object_visibility=visible, object_motion_valid=valid, tracks=seen.tracks + 1.0)
+    found, facts = carry_over(trajectory, twin, blind, velocity)
+    expected, expected_facts = carry_over(trajectory, twin, seen, velocity)
+    np.testing.assert_array_equal(found.positions, expected.positions)
+    assert facts == expected_facts
 
 
-def test_a_rollout_that_ended_early_is_left_alone():
-    trajectory, seen = shifted()
-    short = Trajectory(positions=trajectory.positions[:5], frame_count=20, diverged_frame=5, reason="far")
-    corrected, facts = carry_over(short, seen)
-    assert corrected is short
-    assert facts["time_constant"] == pytest.approx(0.0)
+def test_a_rollout_goes_on_from_a_state_as_if_it_had_not_stopped():
+    trajectory, twin, seen, velocity = kicked()
+    solver, hands = solver_for(twin, "cpu"), torch.tensor(seen.controller_points)
+    states = {frame: (x, v) for frame, x, v in frames(twin, solver, hands, velocity)}
+    x, v = (values.numpy() for values in states[9])
+    later = [x.numpy() for _, x, _ in frames(twin, solver, hands[9:], v, positions=x)]
+    np.testing.assert_array_equal(later, trajectory.positions[10:])
+
+
+def test_hidden_points_do_not_speak():
+    trajectory, twin, seen, velocity = kicked()
+    last = seen.scenario.train_end - 1
+    visible, points = np.array(seen.object_visibility), np.array(seen.object_points)
+    visible[last, ::2] = False
+    lost = points.copy()
+    lost[last, ::2] += 1.0
+    found = [
+        carry_over(trajectory, twin, replace(seen, object_visibility=visible, object_points=p), velocity)[0] for p in (points, lost)
+    ]
+    np.testing.assert_array_equal(found[0].positions, found[1].positions)
+
+
+def test_a_continuation_that_diverges_is_not_used(monkeypatch):
+    trajectory, twin, seen, velocity = kicked()
+    monkeypatch.setattr(carry._Continuation, "corrected", lambda *_: None)
+    corrected, facts = carry_over(trajectory, twin, seen, velocity)
+    assert corrected is trajectory
+    assert facts == {"gain": -1.0, "carried": 0.0}
+
+
+@pytest.mark.parametrize("train_end", [2, 3])
+def test_too_few_training_frames_carry_nothing(train_end):
+    trajectory, twin, seen, velocity = kicked()
+    corrected, facts = carry_over(trajectory, twin, replace(seen, scenario=replace(seen.scenario, train_end=train_end)), velocity)
+    assert corrected is trajectory
+    assert facts["carried"] == 0
+
+
+def test_a_rollout_that_diverged_is_left_alone():
+    trajectory, twin, seen, velocity = kicked()
+    short = Trajectory(positions=trajectory.positions[:5], frame_count=FRAMES, diverged_frame=5, reason="far")
+    assert carry_over(short, twin, seen, velocity)[0] is short

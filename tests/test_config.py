@@ -399,7 +399,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_eval"],
         ["mocap", "mocap_pieces"],
         ["mocap", "mocap_field"],
-        ["mocap", "mocap_average"],
+        ["mocap", "mocap_prediction"],
     ],
 )
 def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
@@ -424,6 +424,8 @@ def test_every_method_that_is_shipped_is_valid():
         "phystwin": "baseline",
         "clusters_1": "model_b",
         "clusters_5": "neuspring",
+        "baseline_carry_over": "baseline",
+        "model_b_carry_over": "model_b",
         "plus_carry_over": "neuspring",
         "plus_average": "neuspring",
         "neuspring_plus_carry_over": "neuspring_plus",

@@ -8,7 +8,7 @@ import pytest
 from neuspring import config
 from neuspring.fit import fit
 from neuspring.losses import FrameLoss
-from neuspring.motion import initial_velocity, spread
+from neuspring.motion import initial_velocity, recent_velocity, spread
 from neuspring.rollout import roll_out
 from neuspring.search import candidate, cost
 from tests import small
@@ -49,6 +49,17 @@ def test_spread_takes_coinciding_points():
 def test_velocity_is_exact_under_constant_acceleration():
     seen = moving([0, 0, -9.8], [0.3, -0.2, 1.0])
     np.testing.assert_allclose(initial_velocity(seen, "observed"), np.tile([0.3, -0.2, 1.0], (len(seen.nodes), 1)), atol=ROUNDING)
+
+
+def test_recent_velocity_is_exact_under_constant_acceleration_and_known_where_three_frames_are():
+    seen = moving([0, 0, -9.8], [0.3, -0.2, 1.0])
+    visible, valid = np.array(seen.object_visibility), np.array(seen.object_motion_valid)
+    visible[3, 0] = visible[5, 1] = False
+    valid[4, 2] = False
+    velocity = recent_velocity(replace(seen, object_visibility=visible, object_motion_valid=valid), 5)
+    assert np.isnan(velocity[:3]).all()
+    expected = np.array([0.3, -0.2, 1.0]) + np.array([0, 0, -9.8]) * 5 / seen.scenario.frame_rate
+    np.testing.assert_allclose(velocity[3:], np.tile(expected, (len(velocity) - 3, 1)), atol=ROUNDING)
 
 
 def test_at_rest_nothing_is_read():
