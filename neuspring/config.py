@@ -57,7 +57,7 @@ class Simulation:
 
 @dataclass(frozen=True, kw_only=True)
 class Losses:
-    """Weights of the training losses (section 5.3 of the released method)."""
+    """Weights of the training losses; the defaults are those of the released PhysTwin code."""
 
     __pydantic_config__ = STRICT
     chamfer: NonNegative = 1.0
@@ -145,7 +145,7 @@ class SearchStart:
 
 @dataclass(frozen=True, kw_only=True)
 class Clusters:
-    """Regions of a piecewise topology: agglomerative clustering of the canonical nodes."""
+    """Regions of a piecewise topology: agglomerative clustering of the nodes in the rest shape; a search row says how many."""
 
     __pydantic_config__ = STRICT
     linkage: Literal["ward", "complete", "average", "single"] = "ward"
@@ -193,7 +193,7 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class SpringField:
-    """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over canonical spring midpoints."""
+    """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over spring midpoints in the rest shape."""
 
     __pydantic_config__ = STRICT
     triplane: bool = True
@@ -254,7 +254,7 @@ class Fit:
     damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
     """Train drag and one factor of all dashpots, or a dashpot per spring (by the field, where the method has one)."""
     rest_length_bound: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Train rest lengths within exp(+-bound) of the distances in frame 0; 0: fixed."""
+    """Train rest lengths within exp(+-bound) of the distances in the rest shape; 0: fixed."""
     rest_lengths_by: Literal["springs", "field"] = "springs"
     """Whether trained rest lengths are free per spring, or an output of the field (for methods that have one)."""
     selection: Literal["training_loss", "tail"] = "training_loss"
@@ -278,18 +278,18 @@ class Fit:
 class ReleasedQuirks:
     """Behaviours of the released PhysTwin code that differ from its description; all off by default.
 
-    Numbers refer to section 6 of the dataset facts (README, "Released quirks").
+    See the README, "Released quirks".
     """
 
     __pydantic_config__ = STRICT
     integer_damping: bool = False
-    """Truncate drag and dashpot to integers after the search (quirk 3)."""
+    """Truncate drag and dashpot to integers after the search."""
     frozen_loss_denominators: bool = False
-    """Divide every frame's losses by the valid counts of frame 1 (quirk 4)."""
+    """Divide every frame's losses by the valid counts of frame 1."""
     frame_time_667: bool = False
-    """A frame lasts 667 x 5e-5 s = 33.35 ms, whatever the frame rate, in 667 substeps (quirk 7)."""
+    """A frame lasts 667 x 5e-5 s = 33.35 ms, whatever the frame rate, in 667 substeps."""
     sparse_checkpoints: bool = False
-    """Consider the best epoch only every 20 epochs and at the last (section 5.5)."""
+    """Consider the best epoch only every 20 epochs and at the last."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation (section 5.5).
+"""First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
 An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training
 span) one optimiser step is made with the gradient through those frames; the state is detached there and goes on while

@@ -1,4 +1,4 @@
-"""Training losses (dataset facts, section 5.3), differentiable in the predicted nodes.
+"""Training losses (those of the released PhysTwin code), differentiable in the predicted nodes.
 
 Chamfer: mean over visible observed points of the squared Euclidean distance to the nearest surface node (assignment held
 fixed). Track: smooth-L1 (beta = 1 m) between node i and track i where the motion is valid, mean over points and axes.

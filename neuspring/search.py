@@ -1,4 +1,4 @@
-"""Zero-order stage: CMA-ES over topology and homogeneous material (dataset facts, section 5.4).
+"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
 
 Variables are normalised to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
 whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best

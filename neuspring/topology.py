@@ -1,4 +1,4 @@
-"""From points to a spring graph (dataset facts, section 5.1), uniform or piecewise (the paper's piecewise topology).
+"""From points to a spring graph (as the released PhysTwin code makes it), uniform or piecewise (the paper's piecewise topology).
 
 Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. The spring
 set is the union of all answers: a pair is kept if either side asks for it. In a piecewise topology each region of nodes has

@@ -22,12 +22,31 @@ snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
   --configfile config/mocap.yaml --config data_root=/path/to/data_set
 ```
 
+The "default" column below is the program's: what holds where neither `config.yaml` nor an overlay sets a key. `config.yaml` sets
+`search.rollouts`, `search.start` and `fit.epochs` for its toy scenes, so overlays for other data set them anew. `--config` on the
+command line is for single values and lists of names at the top level; Snakemake hands numbers in lists over as text, which is
+refused, so `seeds` and nested keys are set in an overlay.
+
+| overlays, in this order | what they measure |
+|---|---|
+| `mocap.yaml` | cables under motion capture, the ablations and `neuspring_plus`, three seeds, transfers |
+| `mocap.yaml`, `mocap_first_frame.yaml` | the same with the rest shape of frame 0, as in the paper, and 220 rollouts |
+| `mocap.yaml`, `mocap_free.yaml` | regions that are free from the search's first rollout, as in the paper |
+| `mocap.yaml`, `mocap_pieces.yaml` | each piece of `neuspring_plus` alone |
+| `mocap.yaml`, `mocap_field.yaml` | where the Fourier transform stands, how fast the planes learn |
+| `mocap.yaml`, `mocap_prediction.yaml` | correcting the state at the last training frame; averages over seeds |
+| `mocap.yaml`, `mocap_fine.yaml` | two recordings at 50 Hz with twice the rings |
+| `mocap.yaml`, `mocap_eval.yaml` | twins fitted on the six evaluation recordings |
+| `clusters.yaml`, alone or after `mocap.yaml` | 1 to 10 regions |
+| `phystwin.yaml` | the 22 released cases |
+| ..., `one_seed.yaml` | seed 0 of any of them, no transfers |
+
 Everything is checked before the first job: unknown keys, wrong types (YAML reads `5e-5` as text: write `5.0e-5`), unknown
 scenarios, methods and searches, missing data, a results folder that cannot be written. Values are never cast.
 
 - `scenarios.tsv`: one row per capture (toy scenes, motion capture, the 22 PhysTwin scenarios).
 - `methods.yaml`: one row per method: the search it starts from, the stage that follows, its own `fit` settings.
-- `searches.yaml`: one row per search: into how many regions the topology is divided, its own `search` settings.
+- `searches.yaml`: one row per search: into how many regions the topology is divided (`clusters`), its own `search` settings.
 - Threads, cores and executors are not configuration: they live on the command line and in `workflow/profiles/`.
 
 This page is written from `neuspring/config.py` by `python -m tests.config_readme`; a test keeps them equal.

@@ -401,6 +401,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_field"],
         ["mocap", "mocap_prediction"],
         ["mocap", "one_seed"],
+        ["phystwin"],
     ],
 )
 def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):

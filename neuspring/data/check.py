@@ -1,7 +1,6 @@
 """`neuspring check-data`: every departure of a data set from its described layout, and the conformance checks 1 to 4.
 
-Sections and numbers refer to the PhysTwin dataset facts: layout in 1.1 to 1.3, conformance checks in 7. Nothing here raises for
-bad content; a check that lacks its files says so in a note.
+Nothing here raises for bad content; a check that lacks its files says so in a note.
 """
 
 from __future__ import annotations

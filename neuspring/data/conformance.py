@@ -1,4 +1,4 @@
-"""Conformance checks 1 to 4 of the PhysTwin dataset facts (section 7): sizes, topology, evaluator, deprojection.
+"""Conformance checks 1 to 4 with the released PhysTwin data: sizes, topology, evaluator, deprojection.
 
 They compare a case with its released results where these are present; a check that lacks its files says so in a note.
 """
@@ -23,15 +23,15 @@ from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
 
 DEPTH_GATE = (0.2, 1.5)
-"""Camera depths that the released lifting keeps, m (section 2.5)."""
+"""Camera depths that the released lifting keeps, m."""
 DEPTH_SCALE = 1000.0
 """Depth units per metre."""
 PUBLISHED = {"chamfer": 0.011579, "track_error": 0.022019}
-"""Equal-case means over the future frames of the 22 released predictions, m (section 4)."""
+"""Equal-case means over the future frames of the 22 released predictions, m."""
 LARGEST = 1e30
 """No parameter comes near; also refuses infinity and NaN."""
 SELF_COLLIDING = ("cloth", "package")
-"""Released cases whose name holds one of these words use the cloth configuration (section 1.5)."""
+"""Released cases whose name holds one of these words use the cloth configuration."""
 OPTIMAL_KEYS = (
     "global_spring_Y",
     "object_radius",
@@ -70,7 +70,7 @@ def read_case(case: Case) -> Observations | None:
 
 @cache
 def released_cases() -> dict[str, dict[str, str]]:
-    """The table of the 22 released cases (section 1.5): case -> column -> text, empty where unknown."""
+    """The table of the 22 released cases: case -> column -> text, empty where unknown."""
     text = resources.files("neuspring.data").joinpath("phystwin22.csv").read_text(encoding="utf-8")
     return {row["case"]: row for row in csv.DictReader(text.splitlines())}
 

@@ -1,4 +1,4 @@
-"""Processed PhysTwin cases (`data/different_types/{case}/`) -> Observations. Layout: dataset facts, sections 1.1 and 1.2.
+"""Processed PhysTwin cases (`data/different_types/{case}/`) -> Observations. Layout: the released PhysTwin data.
 
 Each `*_departures` function lists everything in one file that the reader refuses (errors) or that departs from the released
 layout without harm (warnings); `read` raises the first error, `neuspring check-data` prints them all.
@@ -21,6 +21,8 @@ from neuspring.errors import InputError
 from neuspring.records import digest_file
 
 FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
+FILES = (FINAL_DATA, SPLIT, TRACKS, METADATA)
+"""All that the reader looks for in a case's folder."""
 RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 MAX_FRAME_RATE = 1e6

@@ -1,4 +1,4 @@
-"""A restricted unpickler: plain values and numeric NumPy arrays, nothing else (dataset facts, section 1.4).
+"""A restricted unpickler: plain values and numeric NumPy arrays, nothing else.
 
 A pickle is a program. This one can name eight globals, and even those are stand-ins: no NumPy code sees the file's bytes
 before we have checked dtype, shape and length, because `ndarray.__setstate__` and `dtype.__setstate__` trust their input.

@@ -1,4 +1,4 @@
-"""The specification: a slow, readable float64 NumPy simulation (dataset facts, section 5.2). The Warp solver must agree.
+"""The specification: a slow, readable float64 NumPy simulation, in the order of the released one. The Warp solver must agree.
 
 Everything is written one equation a line, unit masses, forward only; gradients are checked against its central differences.
 """

@@ -15,13 +15,14 @@ from neuspring.artifacts import Observations, Trajectory
 def main(results: Path) -> None:
     """Print the equal-scenario mean of every task and metric, mm."""
     tables = []
-    for path in sorted(results.glob("*/observations.npz")):
-        seen = Observations.load(path)
+    # Targets of transfers have observations and no runs: they are not part of the tables beside which this stands.
+    for folder in sorted({path.parents[2] for path in results.glob("*/*/*/scores.parquet")}):
+        seen = Observations.load(folder / "observations.npz")
         frames = seen.scenario.frame_count
         held = Trajectory(positions=np.repeat(seen.nodes[None], frames, axis=0), frame_count=frames)
         tables.append(metrics.score(held, seen, "static", 0))
     if not tables:
-        raise SystemExit(f"{results}: no */observations.npz here; run the workflow first")
+        raise SystemExit(f"{results}: no SCENARIO/METHOD/SEED/scores.parquet here; run the workflow first")
     means = metrics.averages(pd.concat(tables))
     for row in means.itertuples():
         print(f"{row.task:15} {row.metric:12} {1e3 * row.equal:8.2f} mm over {row.scenarios} scenarios")

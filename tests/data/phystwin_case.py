@@ -21,7 +21,7 @@ def dump(path: Path, value: Any, protocol: int = 4) -> None:
 
 
 def final_data(frames: int, points: int, surface: int, interior: int, controllers: int, seed: int) -> dict[str, np.ndarray]:
-    """The arrays of final_data.pkl (section 1.2), obeying every rule of the released processing."""
+    """The arrays of final_data.pkl, obeying every rule of the released processing."""
     rng = np.random.default_rng(seed)
     rest = np.unique(rng.uniform([-0.05, -0.05, -0.1], [0.05, 0.05, -0.02], (points, 3)), axis=0)
     motion = np.linspace(0, 1, frames)[:, None] * np.array([0.02, 0.0, -0.03])

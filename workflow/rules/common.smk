@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from neuspring import config as settings
+from neuspring.data import phystwin
 from neuspring.errors import InputError
 from neuspring.provenance import code_digest
 
@@ -91,11 +92,7 @@ def scenario_files(wildcards):
         return []
     if path.is_file():
         return [str(path)]
-    return [
-        str(path / name)
-        for name in ("final_data.pkl", "split.json")
-        if (path / name).exists()
-    ]
+    return [str(path / name) for name in phystwin.FILES if (path / name).exists()]
 
 
 def search_settings(wildcards):
@@ -254,7 +251,7 @@ def report_end(failed):
         return
     print(f"\n{Path(TABLES).read_text()}")
     print(
-        f"Scores, twins, trajectories and plots: {RESULTS}/<scenario>/<method>/<seed>/, tables: {RESULTS}/{CONFIG.tables}/"
+        f"Scores, trajectories, plots: {RESULTS}/<scenario>/<method>/<seed>/ (run.json names the twin), tables: {RESULTS}/{CONFIG.tables}/"
     )
     tell_tracking()
 
