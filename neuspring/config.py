@@ -41,7 +41,7 @@ class Simulation:
     __pydantic_config__ = STRICT
     substeps: Count | Literal["auto"] = "auto"
     """Integration steps per frame; `auto` takes the smallest count that the stability bound allows."""
-    safety: Annotated[float, Field(gt=0, le=1)] = 0.8
+    safety: Annotated[float, Field(gt=0, le=0.95)] = 0.8
     """Fraction of the stability bound that `auto` uses."""
     max_substeps: Count = 2000
     """`auto` never asks for more; a candidate that would need more is penalised by the search."""
@@ -248,7 +248,8 @@ class Fit:
     clip_gradient_norm: NonNegative = 0.0
     """0 disables clipping."""
     output_bound: NonNegative = 0.0
-    """Springs stay within exp(+-bound) of the searched stiffness (and dashpot), by bound tanh(./bound); 0: unbounded."""
+    """Springs stay within exp(+-bound) of the searched stiffness (and dashpot), by bound tanh(./bound), beside what common factors
+    change; 0: unbounded."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation."""
     damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
@@ -297,7 +298,7 @@ class Toy:
     """Analytic scenes simulated by the float64 reference, with known stiffness."""
 
     __pydantic_config__ = STRICT
-    frames: Annotated[int, Field(ge=4)] = 60
+    frames: Annotated[int, Field(ge=5)] = 60
     """Frames per scene; the first 70 % are for training."""
     frame_rate: Positive = 30.0
     """Frames per second."""
@@ -318,7 +319,7 @@ class Mocap:
     """Use every n-th sample of the 100 Hz record."""
     start: Annotated[int, Field(ge=0)] = 0
     """Samples of the record left out at its beginning."""
-    frames: Annotated[int, Field(ge=4)] | None = None
+    frames: Annotated[int, Field(ge=5)] | None = None
     """Keep only the first frames (after the stride); null keeps all."""
     spacing: Positive = 0.012
     """Distance of rings along the centreline, m."""
@@ -398,6 +399,10 @@ class Config:
             values = getattr(self, name)
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: entries must differ, received {list(values)}")
+        for source, targets in (self.transfers or {}).items():
+            if not targets or len(set(targets)) != len(targets) or source in targets:
+                rule = "at least one other scenario is required, each once; leave the entry out for no transfer"
+                raise ValueError(f"transfers.{source}: {rule}, received {list(targets)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -576,6 +581,7 @@ class Benchmark:
         _require_known("transfers", everyone, scenarios, config.scenario_table)
         transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
+        _require_alike(config, scenarios, transfers)
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
@@ -591,11 +597,11 @@ class Benchmark:
                 rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in chosen.methods.items():
-            high = search_of(config, searches[method.search], method.search).ranges.stiffness[1]
-            limit = fit_of(config, method, name).stiffness_range[1]
-            if method.fit and limit < high:
-                rule = f"must reach the search's upper bound of {high}, or springs start beyond their clamp"
-                raise InputError(f"method {name}, fit.stiffness_range", rule, limit)
+            wanted_low, wanted_high = search_of(config, searches[method.search], method.search).ranges.stiffness
+            low, high = fit_of(config, method, name).stiffness_range
+            if method.fit and not low <= wanted_low < wanted_high <= high:
+                rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
+                raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
         chosen._require_data()
         return chosen
 
@@ -631,6 +637,18 @@ def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]
     first: dict[tuple[Any, ...], str] = {}
     fitted = {name: method for name, method in methods.items() if method.fit}
     return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+
+
+def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:
+    """A twin moves only to a recording of the same object with as many nodes, which `mocap.spacing` does not promise."""
+    for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
+        here, there = scenarios[source], scenarios[target]
+        if (here.source, here.category) != (there.source, there.category):
+            rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
+            raise InputError("configuration, transfers", rule, f"source {there.source}, category {there.category}")
+        if here.source == "mocap" and config.mocap.rings is None:
+            rule = "must be set where twins are transferred, so that all recordings have as many nodes"
+            raise InputError("configuration, mocap.rings", rule, None)
 
 
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:

@@ -205,6 +205,8 @@ class TwinFit:
         """
         packed = self.parameters.pack(self.twin.simulation.substep)
         springs = packed.springs.detach().double().cpu().numpy()
+        if not np.isfinite(springs).all():
+            raise NonFinite("a spring's stiffness, rest length or dashpot is not finite")
         count = self._needed_substeps(springs[:, 0] * springs[:, 1], springs[:, 2])
         if count <= self.twin.simulation.substeps:
             return packed

@@ -101,17 +101,21 @@ def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metri
     """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
 
     The paper mixes the two (equal for Chamfer and track, frame-weighted for images), so both are kept. Seeds are averaged
-    within each scenario first; `seed_std` is the standard deviation over seeds of the equal average (0 for one seed).
+    within each scenario first; `seed_std` is the standard deviation over seeds of the equal average (0 for one seed), over the
+    seeds that have every scenario (NaN where fewer than two of several do).
     """
     keys = list(by)
-    weighted = scores.assign(weighted=scores["value"] * scores["frames"])
-    groups = weighted.groupby([*keys, "scenario"], sort=False)
-    per_scenario = groups.agg(value=("value", "mean"), weighted=("weighted", "sum"), frames=("frames", "sum")).reset_index()
+    groups = scores.groupby([*keys, "scenario"], sort=False)
+    per_scenario = groups.agg(value=("value", "mean"), frames=("frames", "mean")).reset_index()
+    per_scenario["weighted"] = per_scenario["value"] * per_scenario["frames"]
     total = per_scenario.groupby(keys, sort=False)
     result = total.agg(
         equal=("value", "mean"), weighted=("weighted", "sum"), all_frames=("frames", "sum"), scenarios=("scenario", "count")
     )
     result["frames"] = result.pop("weighted") / result.pop("all_frames")
-    per_seed = scores.groupby([*keys, "seed"], sort=False)["value"].mean().groupby(level=list(range(len(keys)))).std(ddof=1)
-    result["seed_std"] = per_seed.reindex(result.index).fillna(0.0)
+    per_seed = scores.groupby([*keys, "seed"], sort=False).agg(value=("value", "mean"), scenarios=("scenario", "nunique"))
+    by_seed = per_seed.groupby(level=list(range(len(keys))))
+    complete = per_seed[per_seed["scenarios"] == by_seed["scenarios"].transform("max")]
+    spread = complete["value"].groupby(level=list(range(len(keys)))).std(ddof=1)
+    result["seed_std"] = spread.reindex(result.index).where(by_seed.size().reindex(result.index) > 1, 0.0)
     return result.reset_index()

@@ -12,6 +12,7 @@ Beside them: four contact scalars, drag = drag0 exp(.), and the homogeneous fact
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -138,6 +139,8 @@ class TwinParameters(nn.Module):
         offset = bounded(raw["stiffness"], s.output_bound)
         linear = self.kind == "field" and s.field.scale == "linear"
         factor = 1 + offset if linear else offset.exp()
+        if linear and s.output_bound:
+            factor = inward_clamp(factor, math.exp(-s.output_bound), math.exp(s.output_bound))
         if "stiffness" in self.factors:
             factor = factor * self.factors["stiffness"].exp()
         stiffness = self.start["stiffness"] * factor

@@ -2,18 +2,21 @@
 
 Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
 syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
-`fit.py` re-runs fits; editing a docstring, or `tables.py`, re-runs nothing that costs time.
+`fit.py` re-runs fits; editing a docstring, or `tables.py`, re-runs nothing that costs time. Of `stages.py`, which reaches
+everything, the rules that cost little (rollout, transfer, score) follow the function that they call.
 """
 
 from __future__ import annotations
 
 import ast
+import copy
 import functools
 import hashlib
 import subprocess
 from pathlib import Path
 
 PACKAGE = "neuspring"
+STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
 NOT_NUMERICS = frozenset({f"{PACKAGE}.config", f"{PACKAGE}.progress", f"{PACKAGE}.records"})
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
@@ -64,7 +67,7 @@ def used_modules(module: str) -> list[str]:
     return sorted(seen)
 
 
-def _without_docstrings(tree: ast.Module) -> str:
+def _without_docstrings(tree: ast.AST) -> str:
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             # Any bare string is documentation: docstrings, and the notes under fields and constants.
@@ -76,9 +79,22 @@ def _is_text(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
+def _stage_code(stage: str) -> str:
+    """The function `stage` of `neuspring.stages`, and what it calls there."""
+    functions = {node.name: node for node in _tree(STAGES).body if isinstance(node, ast.FunctionDef)}
+    found: dict[str, str] = {}
+    waiting = [stage]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found[name] = _without_docstrings(copy.deepcopy(functions[name]))
+            waiting += [node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name) and node.id in functions]
+    return "".join(found[name] for name in sorted(found))
+
+
 @functools.cache
-def code_digest(*modules: str) -> str:
-    """A short SHA-256 over the code that the given package modules use."""
+def code_digest(*modules: str, stage: str = "") -> str:
+    """A short SHA-256 over the code that the given package modules use and, if named, the function of `neuspring.stages`."""
     digest = hashlib.sha256()
     used = {name for module in modules for name in used_modules(module)} - NOT_NUMERICS
     for name in sorted(used):
@@ -86,6 +102,7 @@ def code_digest(*modules: str) -> str:
         assert path is not None, name
         digest.update(name.encode())
         digest.update(_without_docstrings(ast.parse(path.read_text(encoding="utf-8"))).encode())
+    digest.update(_stage_code(stage).encode() if stage else b"")
     return digest.hexdigest()[:16]
 
 

@@ -202,8 +202,9 @@ def transfer(
 ) -> None:
     """Twin of one recording -> scores on other recordings of the same object (transfer.parquet), transfer.json.
 
-    All frames after the first of a target count (task `transfer`). Rest lengths are re-based on the target's first frame, unless
-    they were trained. A rollout that diverges leaves out its target.
+    All frames after the first of a target count (task `transfer`); with observed initial velocities the first two of them also
+    set the start. Rest lengths are re-based on the target's rest shape, unless they were trained. A rollout that diverges leaves
+    out its target.
     """
     from neuspring.motion import initial_velocity
     from neuspring.physics.solver import resolve_device
@@ -215,11 +216,14 @@ def transfer(
     inputs = {before.stage: digest_file(twin_record)} | {f"target{i}": digest_file(path) for i, path in enumerate(targets)}
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
     twin = Twin.load(before.file("twin", twin_record)) if before.status == "ok" else None
-    trained = bool(before.settings.get("fit", {}).get("rest_length_bound"))
+    kept = {
+        "keep_lengths": bool(before.settings.get("fit", {}).get("rest_length_bound")),
+        "keep_frame_time": before.settings["released_quirks"]["frame_time_667"],
+    }
     for path in targets if twin else ():
         observations = Observations.load(path)
         assert twin is not None
-        moved = rebase(twin, observations, keep_lengths=trained, safety=settings.simulation.safety)
+        moved = rebase(twin, observations, safety=settings.simulation.safety, **kept)
         velocity = initial_velocity(observations, moved.simulation.initial_velocity)
         trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity)
         frames = range(1, observations.scenario.frame_count)

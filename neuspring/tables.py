@@ -51,7 +51,8 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
         outcome = {"status": record["status"], "reason": record["reason"], "notes": "; ".join(record["notes"])}
         timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
         memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
-        rows.append(identity | outcome | timings | memory)
+        averaged = {"averaged": record.get("params", {}).get("rollout.result.averaged", 1)}
+        rows.append(identity | outcome | averaged | timings | memory)
         tables.append(pd.read_parquet(path.parent / record["scores_file"]))
     return Collected(_stacked(tables), pd.DataFrame(rows))
 
@@ -89,19 +90,23 @@ def _stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
 
 
 def comparable(collected: Collected) -> pd.DataFrame:
-    """Scores of the (scenario, seed) pairs that every method finished, so that averages compare like with like."""
+    """Scores of the (scenario, seed) pairs that every method finished, so that averages compare like with like.
+
+    A method that finished no run at all (yet) takes no part.
+    """
     good = collected.runs[collected.runs["status"] == "ok"]
-    methods = collected.runs["method"].nunique()
+    methods = good["method"].nunique()
     complete = good.groupby(["scenario", "seed"])["method"].nunique()
     pairs = complete[complete == methods].index
     keep = pd.MultiIndex.from_frame(collected.scores[["scenario", "seed"]]).isin(pairs)
-    return collected.scores[keep]
+    return collected.scores[keep & collected.scores["method"].isin(good["method"])]
 
 
 def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """Method minus baseline on the same scenario and seed: mean, and a 95 % bootstrap interval over scenarios and seeds.
 
-    Scenarios are resampled, and within each the seeds, since runs of one scenario are not independent.
+    Scenarios are resampled, and within each the seeds, since runs of one scenario are not independent. `relative` is the mean
+    difference over the baseline's mean on the same pairs.
     """
     rows = []
     rng = np.random.default_rng(0)
@@ -110,18 +115,29 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
         for method in wide.columns.drop(baseline, errors="ignore"):
             if baseline not in wide:
                 continue
-            runs = [part.to_numpy() for _, part in (wide[method] - wide[baseline]).dropna().groupby("scenario")]
+            both = wide[[method, baseline]].dropna()
+            runs = [part.to_numpy() for _, part in (both[method] - both[baseline]).groupby("scenario")]
             if not runs:
                 continue
             delta = np.array([part.mean() for part in runs])
-            # Means over resampled seeds [scenario, draw], of which every draw takes a resampled set of scenarios.
-            means = np.stack([rng.choice(part, (RESAMPLES, len(part))).mean(axis=1) for part in runs])
-            draws = means[rng.integers(len(runs), size=(len(runs), RESAMPLES)), np.arange(RESAMPLES)].mean(axis=0)
-            low, high = np.quantile(draws, [0.025, 0.975]) if len(delta) > 1 else (np.nan, np.nan)
-            base = wide[baseline].mean()
+            low, high = np.quantile(_resampled_means(runs, rng), [0.025, 0.975]) if len(delta) > 1 else (np.nan, np.nan)
+            base = both[baseline].groupby("scenario").mean().mean()
             row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": delta.mean()}
             rows.append(row | {"low": low, "high": high, "relative": delta.mean() / base, "scenarios": len(delta)})
     return pd.DataFrame(rows)
+
+
+def _resampled_means(runs: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Means over resampled scenarios, each with resampled seeds of its own [RESAMPLES]; `runs` has one array a scenario."""
+    counts = np.array([len(part) for part in runs])
+    padded = np.stack([np.resize(part, counts.max()) for part in runs])
+    total = np.zeros(RESAMPLES)
+    for _ in runs:
+        scenario = rng.integers(len(runs), size=RESAMPLES)
+        seed = (rng.random((RESAMPLES, counts.max())) * counts[scenario, None]).astype(int)
+        used = np.arange(counts.max()) < counts[scenario, None]
+        total += (padded[scenario[:, None], seed] * used).sum(axis=1) / counts[scenario]
+    return total / len(runs)
 
 
 def summary_text(collected: Collected, baseline: str) -> str:
@@ -147,11 +163,25 @@ def summary_text(collected: Collected, baseline: str) -> str:
     if len(bad):
         lines += ["", "Not in the averages:", ""]
         lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in bad.itertuples()]
+    lines += _averaged_notes(collected.runs)
     noted = collected.runs[collected.runs["notes"] != ""]
     if len(noted):
         lines += ["", "Notes:", ""]
         lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
     return "\n".join(lines) + "\n"
+
+
+def _averaged_notes(runs: pd.DataFrame) -> list[str]:
+    """What a reader must know of methods whose prediction is a mean over seeds."""
+    if "averaged" not in runs:
+        return []
+    counts = runs.groupby("method", sort=False)["averaged"].max()
+    same = "the same one for every seed; it costs as many fits, of which the times below show one"
+    return [
+        line
+        for method, count in counts[counts > 1].items()
+        for line in ("", f"{method} is the mean of {count:.0f} seeds' predictions, {same}.")
+    ]
 
 
 def _method_table(
@@ -168,7 +198,8 @@ def _method_table(
                 cells.append("–")
                 continue
             row = found.iloc[0]
-            spread = f" ± {MM * row['seed_std']:.2f}" if seeds > 1 else ""
+            spread = f" ± {MM * row['seed_std']:.2f}" if np.isfinite(row["seed_std"]) else " ± –"
+            spread = spread if seeds > 1 else ""
             cells.append(f"{MM * row['equal']:.2f}{spread} ({MM * row['frames']:.2f})")
         status = {str(name): int(value) for name, value in counts.loc[method].to_dict().items()}
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
@@ -249,7 +280,8 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     lines += _method_table(methods, means, counts, seeds, TRANSFER_HEADINGS)
     differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
-        lines += ["", f"Paired difference to {baseline}, mm [95 % bootstrap interval over sources and seeds]:", ""]
+        interval = "95 % bootstrap interval over sources and seeds; sources may share targets"
+        lines += ["", f"Paired difference to {baseline}, mm [{interval}]:", ""]
         lines += _difference_table(differences, TRANSFER_HEADINGS)
     return "\n".join(lines) + "\n"
 

@@ -25,7 +25,8 @@ REPAIR_SPRINGS = 3
 def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
     """Region of each node [N], 0 .. count - 1, by agglomerative clustering of nodes [N, 3], m.
 
-    Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter.
+    Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter (unless
+    distances tie, as on a lattice).
     Raises InputError if there are fewer nodes than regions, or than the connectivity graph needs.
     """
     if count < 1:

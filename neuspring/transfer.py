@@ -12,13 +12,16 @@ from neuspring.physics import stability
 from neuspring.topology import distances
 
 
-def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False, safety: float = 0.8) -> Twin:
+def rebase(
+    twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
+) -> Twin:
     """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its rest shape.
 
     A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape,
     which is frame 0 unless the observations say otherwise. With `keep_lengths` it keeps the length itself: for trained ones,
-    which belong to the body and not to a first frame. Frame time, up and ground follow the recording; more substeps are taken
-    if the new distances need them. Raises InputError if the node or controller counts differ, or a spring would have no length.
+    which belong to the body and not to a first frame. Up, ground and, unless `keep_frame_time`, the frame time follow the
+    recording; more substeps are taken if the new distances need them. Raises InputError if the node or controller counts
+    differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
     nodes, hands = observations.nodes, observations.controller_points[0]
@@ -35,7 +38,7 @@ def rebase(twin: Twin, observations: Observations, *, keep_lengths: bool = False
         )
     simulation = replace(
         twin.simulation,
-        frame_time=1.0 / scenario.frame_rate,
+        frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
         up=scenario.up,
         ground=scenario.ground,
         self_collision=scenario.self_collision,

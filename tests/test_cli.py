@@ -15,15 +15,15 @@ from tests.data.phystwin_case import write_case
 
 def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
     settings = tmp_path / "small.yaml"
-    settings.write_text("toy: {frames: 4}\n")
+    settings.write_text("toy: {frames: 5}\n")
     output = tmp_path / "observations.npz"
     arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/config.yaml,{settings}"]
     assert main([*arguments, "--output", str(output)]) == 0
-    assert Observations.load(output).scenario.frame_count == 4
+    assert Observations.load(output).scenario.frame_count == 5
 
 
 TINY = {
-    "toy": {"frames": 4},
+    "toy": {"frames": 5},
     "search": {"rollouts": 2, "start": {"object_radius": 0.045, "stiffness": 1e4}},
     "fit": {"epochs": 1, "field": {"channels": 2, "hidden": 4}},
 }

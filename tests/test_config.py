@@ -78,7 +78,7 @@ MISTAKES = {
     "negative weight": ("losses: {track: -1}", "losses.track", "greater than or equal to 0"),
     "negative horizon": ("fit: {horizon: -1}", "fit.horizon", "received -1"),
     "nan gravity": ("simulation: {gravity: .nan}", "simulation.gravity", "finite"),
-    "safety": ("simulation: {safety: 1.5}", "simulation.safety", "less than or equal to 1"),
+    "safety": ("simulation: {safety: 1.0}", "simulation.safety", "less than or equal to 0.95"),
     "substeps word": ("simulation: {substeps: many}", "simulation.substeps", "'auto'"),
     "no substeps": ("simulation: {substeps: 0}", "simulation.substeps", "received 0"),
     "occlusion": ("toy: {occlusion: 1}", "toy.occlusion", "less than 1"),
@@ -331,6 +331,13 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
         ({"method_table": "missing.yaml"}, "must be readable"),
         ({"search_table": "missing.yaml"}, "must be readable"),
         ({"device": "gpu"}, "device"),
+        ({"transfers": {"rope": []}}, r"transfers\.rope: at least one other scenario is required.*received \[\]"),
+        ({"transfers": {"rope": ["rope"]}}, r"transfers\.rope: at least one other scenario"),
+        ({"transfers": {"rope": ["cable", "cable"]}}, r"transfers\.rope: .* each once"),
+        (
+            {"transfers": {"rope": ["cable"]}},
+            "cable must be of the same object as rope: source toy, category toy; received source mocap",
+        ),
     ],
 )
 def test_a_benchmark_is_checked_before_any_job(values: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -364,12 +371,26 @@ def test_settings_of_chosen_searches_are_checked_too(tmp_path: Path) -> None:
 def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     """A search's own bounds count, and a method without a second stage has no clamp."""
     narrow = {"fit": {"stiffness_range": [0.0, 5e4]}}
-    with pytest.raises(InputError, match=r"method full, fit\.stiffness_range: must reach .* 100000\.0.*; received 50000\.0"):
+    with pytest.raises(
+        InputError, match=r"method full, fit\.stiffness_range: must hold .*0\.0 to 100000\.0.*; received \[0\.0, 50000\.0\]"
+    ):
         benchmark(tmp_path, **narrow)
+    with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
+        benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
     benchmark(tmp_path, methods=["coarse"], **narrow)
     text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [0.0, 4.0e+4]}}}\n"
     write(tmp_path / "soft.yaml", text)
     benchmark(tmp_path, search_table="soft.yaml", **narrow)
+
+
+def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) -> None:
+    rows = "".join(f"{name}\tmocap\tcable\tcable.csv\tfalse\ttrue\n" for name in ("one", "other"))
+    write(tmp_path / "cables.tsv", HEADER + rows)
+    (tmp_path / "cable.csv").touch()
+    chosen = {"scenarios": ["one"], "transfers": {"one": ["other"]}, "data_root": str(tmp_path), "scenario_table": "cables.tsv"}
+    with pytest.raises(InputError, match=r"mocap\.rings: must be set where twins are transferred"):
+        benchmark(tmp_path, **chosen, mocap={"rings": None})
+    assert benchmark(tmp_path, **chosen, mocap={"rings": 20}).transfers == {"one": ("other",)}
 
 
 def test_the_tables_of_the_project_are_valid_together() -> None:

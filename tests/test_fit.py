@@ -13,7 +13,7 @@ from neuspring import config
 from neuspring import fit as module
 from neuspring.artifacts import SCALARS, Observations, Twin
 from neuspring.errors import InputError, NumericalFailure
-from neuspring.fit import LOWEST_RATE, FitProblem, TwinFit, fit
+from neuspring.fit import LOWEST_RATE, FitProblem, NonFinite, TwinFit, fit
 from neuspring.losses import FrameLoss
 from neuspring.physics import stability
 from neuspring.rollout import roll_out
@@ -203,6 +203,14 @@ def test_stiffening_springs_get_more_substeps():
     assert result.twin.material.stiffness.max() > 2 * problem.twin.material.stiffness.max()
     assert result.twin.simulation.substeps > problem.twin.simulation.substeps
     stability.check(result.twin)
+
+
+def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
+    run = TwinFit(small.fit_problem(fit=config.Fit(damping="springs")))
+    with torch.no_grad():
+        run.parameters.offsets[0, 1] = 100.0
+    with pytest.raises(NonFinite, match="stiffness, rest length or dashpot is not finite"):
+        run.settled()
 
 
 @pytest.mark.parametrize("kind", ["springs", "field"])

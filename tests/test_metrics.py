@@ -183,6 +183,16 @@ def test_averages_by_one_key() -> None:
     assert found.loc["theirs", "seed_std"] == 0.0
 
 
+def test_scenarios_with_different_numbers_of_seeds() -> None:
+    """Seeds are averaged first, so that a scenario with more of them weighs no more; no spread from scenarios that seeds lack."""
+    scores = table(("ours", "a", 0, 9.0, 10), *(("ours", "b", seed, 1.0, 10) for seed in range(3)))
+    row = metrics.averages(scores).iloc[0]
+    assert (row["equal"], row["frames"]) == (5.0, 5.0)
+    assert np.isnan(row["seed_std"])
+    more = metrics.averages(pd.concat([scores, table(("ours", "a", 1, 8.0, 10))])).iloc[0]
+    assert more["seed_std"] == pytest.approx(np.std([5.0, 4.5], ddof=1))
+
+
 def test_averages_of_nothing_are_empty() -> None:
     given = observations()
     empty = metrics.score(rollout(given.nodes[None], frame_count=5, diverged_frame=1, reason="x"), given, "ours", 0)

@@ -1,5 +1,6 @@
 """What is trained becomes physics: gradients through the field and the simulator, bounds, clamps, warm start."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -231,6 +232,19 @@ def test_a_linear_field_adds_a_fraction_and_stops_at_the_clamp():
     expected = (trained.start["stiffness"] * (1 + f)).clamp(0, 1e5)
     torch.testing.assert_close(trained.physical()["stiffness"], expected, rtol=SINGLE, atol=0)
     assert trained.physical()["stiffness"].min() == 0
+
+
+def test_a_bounded_linear_field_stays_within_the_bound_and_finds_back():
+    trained = disturb(parameters(field={"scale": "linear"}, output_bound=1.5), 1.0)
+    stiffness, start = trained.physical()["stiffness"], trained.start["stiffness"]
+    factor = (stiffness / start).detach()
+    assert factor.min() == pytest.approx(math.exp(-1.5)), "some springs are at the bound"
+    assert factor.max() < math.exp(1.5)
+    lowest = int(factor.argmin())
+    (towards_more,) = torch.autograd.grad(-stiffness[lowest], trained.field.layers[-1].bias, retain_graph=True)
+    (towards_less,) = torch.autograd.grad(stiffness[lowest], trained.field.layers[-1].bias)
+    assert towards_more.abs().sum() > 0
+    assert towards_less.abs().sum() == 0
 
 
 def test_controllers_that_the_field_does_not_cover_keep_their_values_exactly():

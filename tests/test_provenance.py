@@ -55,6 +55,20 @@ def test_code_counts_where_it_is_used_and_nowhere_else(copy):
     }
 
 
+def test_a_stage_counts_with_the_functions_it_calls_and_no_other(copy):
+    def stage(name: str) -> str:
+        clear()
+        return provenance.code_digest("neuspring.metrics", stage=name)
+
+    before = {name: stage(name) for name in ("transfer", "score", "rollout")}
+    assert before["score"] != digest("neuspring.metrics")
+    edit(copy / "stages.py", '"""What a reader of the scores', '"""What any reader of the scores')
+    assert {name: stage(name) for name in before} == before
+    # A helper that score calls, and no other of the three.
+    edit(copy / "stages.py", "epochs rolled back,", "epochs taken back,")
+    assert {name for name in before if stage(name) != before[name]} == {"score"}
+
+
 def test_transitive_imports_count(copy):
     before = digest("neuspring.search")
     edit(copy / "physics" / "springs.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")

@@ -47,6 +47,39 @@ def test_seeds_of_one_scenario_are_not_independent():
     assert np.isnan(row["low"])
 
 
+def test_the_relative_difference_weighs_scenarios_equally():
+    values = {("a", "x", 0): 0.1, ("a", "y", 0): 0.09}
+    values |= {("b", m, seed): v for m, v in (("x", 0.01), ("y", 0.009)) for seed in range(3)}
+    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    assert row["difference"] == pytest.approx(-0.0055)
+    assert row["relative"] == pytest.approx(-0.1)
+
+
+def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
+    """Twelve scenarios alike but for independent noise of three seeds: the variance of resampled means is that of both levels."""
+    rng = np.random.default_rng(1)
+    runs = [rng.normal(size=3) for _ in range(12)]
+    within = np.mean([part.var() / 3 for part in runs]) / 12
+    between = np.var([part.mean() for part in runs]) / 12
+    assert tables._resampled_means(runs, np.random.default_rng(0)).var() == pytest.approx(within + between, rel=0.05)
+
+
+def test_a_method_that_has_not_begun_does_not_empty_the_table():
+    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008}
+    text = tables.summary_text(collected(values, failed=(("a", "z", 0),)), "x")
+    assert "10.00" in text
+    assert "8.00" in text
+    assert "a / z / seed 0: failed: diverged" in text
+
+
+def test_averaged_predictions_are_named():
+    found = collected({("a", "x", 0): 0.010, ("a", "y", 0): 0.008})
+    found.runs["averaged"] = [1, 3]
+    text = tables.summary_text(found, "x")
+    assert "y is the mean of 3 seeds' predictions" in text
+    assert "x is the mean" not in text
+
+
 def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
     text = tables.summary_text(collected(values, failed=(("b", "y", 0),)), "x")

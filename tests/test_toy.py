@@ -13,7 +13,7 @@ SCENES = [f"{shape}/{motion}/{field}" for shape in toy.SHAPES for motion in toy.
 
 @pytest.mark.parametrize("path", SCENES)
 def test_every_scene_is_a_valid_capture_with_its_truth(path):
-    made = small.scene(path, frames=4)
+    made = small.scene(path, frames=5)
     nodes = made.observations.nodes
     assert nodes.shape == made.truth.topology.nodes.shape
     # Without noise the observed rest state is the true one.

@@ -57,6 +57,13 @@ def test_more_substeps_where_the_new_distances_need_them():
     assert roll_out(moved, smaller.controller_points).diverged_frame is None
 
 
+def test_the_frame_time_follows_the_recording_unless_it_is_kept():
+    problem = small.fit_problem()
+    released = replace(problem.twin, simulation=replace(problem.twin.simulation, frame_time=0.03335))
+    assert rebase(released, problem.observations).simulation.frame_time == 1 / problem.observations.scenario.frame_rate
+    assert rebase(released, problem.observations, keep_frame_time=True).simulation.frame_time == 0.03335
+
+
 def test_another_number_of_nodes_is_refused():
     problem = small.fit_problem()
     seen = problem.observations

@@ -67,10 +67,12 @@ def section(*names):
 
 
 def observe_settings(wildcards):
-    names = {"toy": ["toy"], "mocap": ["mocap"], "phystwin": []}[
-        BENCHMARK.scenarios[wildcards.scenario].source
-    ]
-    return section("data_root", *names)
+    names = {
+        "toy": ["toy"],
+        "mocap": ["data_root", "mocap"],
+        "phystwin": ["data_root"],
+    }
+    return section(*names[BENCHMARK.scenarios[wildcards.scenario].source])
 
 
 def scenario_row(wildcards):
@@ -100,6 +102,10 @@ def search_settings(wildcards):
     chosen = common_settings()
     row = BENCHMARK.searches[wildcards.search]
     chosen["search"] = settings.plain(settings.search_of(CONFIG, row, wildcards.search))
+    if row.clusters == 1:
+        # What concerns regions alone changes nothing here, so it must not start the search again.
+        for name in ("clusters", "tied_rollouts", "freed_sigma"):
+            del chosen["search"][name]
     return json.dumps(chosen, sort_keys=True)
 
 
@@ -112,9 +118,10 @@ def common_settings():
 def fit_settings(wildcards):
     """The fit's sections, with the method's own settings on top."""
     chosen = common_settings()
-    chosen["fit"] = settings.plain(
-        settings.fit_of(CONFIG, BENCHMARK.fits[wildcards.method], wildcards.method)
-    )
+    method = BENCHMARK.fits[wildcards.method]
+    chosen["fit"] = settings.plain(settings.fit_of(CONFIG, method, wildcards.method))
+    if method.fit == "springs":
+        del chosen["fit"]["field"]
     return json.dumps(chosen, sort_keys=True)
 
 

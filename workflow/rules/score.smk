@@ -20,7 +20,7 @@ rule score:
     params:
         fit=fit_option,
         variant=variant,
-        code=code_digest("neuspring.metrics", "neuspring.figures"),
+        code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
     shell:
         "python -m neuspring score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
         " --rollout {input.rollout:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"

@@ -74,7 +74,9 @@ rule rollout:
         runtime=60,
     params:
         carry=carry_option,
-        code=code_digest("neuspring.rollout", "neuspring.motion", "neuspring.carry"),
+        code=code_digest(
+            "neuspring.rollout", "neuspring.motion", "neuspring.carry", stage="rollout"
+        ),
     shell:
         "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
         " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
@@ -106,6 +108,7 @@ rule transfer:
             "neuspring.transfer",
             "neuspring.motion",
             "neuspring.metrics",
+            stage="transfer",
         ),
     shell:
         "python -m neuspring transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
