@@ -60,13 +60,13 @@ def _json_mapping(option: str, text: str) -> dict[str, object]:
 
 
 def _observe(a: argparse.Namespace) -> int:
-    from neuspring import config, stages
+    from neuspring import benchmark, config, stages
 
     settings = _settings(a.settings)
     if a.row:
         row = config.parse(config.ScenarioRow, _json_mapping("--row", a.row), "--row")
     else:
-        rows = config.read_scenarios(Path(settings.scenario_table))
+        rows = benchmark.read_scenarios(Path(settings.scenario_table))
         if a.scenario not in rows:
             raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
         row = rows[a.scenario]

@@ -1,6 +1,6 @@
 """The whole configuration as frozen dataclasses: what may be set, its unit, its range, its default.
 
-`load(mapping)` turns parsed YAML into a `Config` strictly: unknown keys raise, values are never cast (YAML reads `5e-5` as
+`parse` turns plain YAML values into these dataclasses strictly: unknown keys raise, values are never cast (YAML reads `5e-5` as
 text; we say so instead of guessing), and every problem is listed with its path. This module imports nothing heavy, because
 the workflow reads it before any job exists.
 """
@@ -8,7 +8,6 @@ the workflow reads it before any job exists.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,7 +26,6 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published")
 Range = tuple[Finite, Finite]
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Kind = Literal["springs", "field"]
@@ -479,7 +477,8 @@ def plain(settings: Any) -> dict[str, Any]:
     return result
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """A file's text. Raises InputError."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -489,176 +488,12 @@ def _read_text(path: Path) -> str:
 def read_yaml(path: Path) -> dict[str, Any]:
     """A YAML mapping from a file. Raises InputError."""
     try:
-        values = yaml.safe_load(_read_text(path))
+        values = yaml.safe_load(read_text(path))
     except yaml.YAMLError as error:
         raise InputError(path, "this file must be YAML", str(error).replace("\n", " ")) from error
     if not isinstance(values, dict):
         raise InputError(path, "this file must hold a YAML mapping", type(values).__name__)
     return values
-
-
-def read_methods(path: Path) -> dict[str, Method]:
-    """The method table: name -> Method."""
-    return {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
-
-
-def read_searches(path: Path) -> dict[str, SearchRow]:
-    """The search table: name -> SearchRow."""
-    return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
-
-
-def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
-    """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
-    lines = [line for line in _read_text(path).splitlines() if line.strip() and not line.startswith("#")]
-    columns = [f.name for f in dataclasses.fields(ScenarioRow)]
-    if not lines or lines[0].split("\t") != columns:
-        raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
-    rows: dict[str, ScenarioRow] = {}
-    for line in lines[1:]:
-        cells = line.split("\t")
-        where = f"{path}, row {cells[0]!r}"
-        if len(cells) != len(columns):
-            raise InputError(where, f"{len(columns)} tab-separated cells are required", len(cells))
-        values: dict[str, Any] = dict(zip(columns, cells, strict=True))
-        for flag in ("self_collision", "ground"):
-            if values[flag] not in ("true", "false"):
-                raise InputError(f"{where}, {flag}", "must be true or false", values[flag])
-            values[flag] = values[flag] == "true"
-        if cells[0] in rows:
-            raise InputError(where, "scenario names must differ")
-        rows[cells[0]] = parse(ScenarioRow, values, where)
-    return rows
-
-
-def fit_of(config: Config, method: Method, name: str) -> Fit:
-    """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
-    return parse(Fit, _overlaid(config.fit, method.settings), f"method {name}, settings")
-
-
-def search_of(config: Config, row: SearchRow, name: str) -> Search:
-    """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
-    return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
-
-
-def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
-    values = plain(settings)
-    merge(values, own)
-    return values
-
-
-@dataclass(frozen=True)
-class Benchmark:
-    """A validated configuration with the rows it names."""
-
-    config: Config
-    scenarios: dict[str, ScenarioRow]
-    """Chosen ones, and those that twins are transferred to."""
-    methods: dict[str, Method]
-    searches: dict[str, SearchRow]
-    fits: dict[str, Method]
-    """The methods whose fits are made: of all rows of the table with the same fit, the first."""
-    fit_of_method: dict[str, str]
-    """Chosen method -> the method in whose folder its fit lies."""
-    transfers: dict[str, tuple[str, ...]]
-    """Chosen scenario -> those that its twins are transferred to."""
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
-        """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
-        config = parse(Config, values, "configuration")
-        for name in ("scenarios", "methods", "seeds"):
-            if not getattr(config, name):
-                raise InputError(f"configuration, {name}", "at least one entry is required")
-        scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
-        _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
-        _require_known("methods", config.methods, methods, config.method_table)
-        searches = read_searches(root / config.search_table)
-        wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
-        _require_known("methods' search", wanted, searches, config.search_table)
-        _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
-        pairs = config.transfers or {}
-        everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
-        _require_known("transfers", everyone, scenarios, config.scenario_table)
-        transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
-        targets = tuple(name for names in transfers.values() for name in names)
-        _require_alike(config, scenarios, transfers)
-        owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
-        chosen = cls(
-            config,
-            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets)},
-            {n: methods[n] for n in config.methods},
-            {n: searches[n] for n in wanted},
-            {n: methods[n] for n in owners.values()},
-            owners,
-            transfers,
-        )
-        for name in [*chosen.scenarios, *chosen.methods]:
-            if name in (*RESERVED, config.tables) or name.startswith("search-"):
-                rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
-                raise InputError("name of a scenario or method", rule, name, "Rename it.")
-        for name, method in chosen.methods.items():
-            wanted_low, wanted_high = search_of(config, searches[method.search], method.search).ranges.stiffness
-            low, high = fit_of(config, method, name).stiffness_range
-            if method.fit and not low <= wanted_low < wanted_high <= high:
-                rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
-                raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
-        chosen._require_data()
-        return chosen
-
-    @property
-    def compared_with(self) -> str:
-        """The method that tables compare the others with."""
-        wanted = self.config.compare_with
-        return wanted if wanted in self.methods else self.config.methods[0]  # type: ignore[return-value]
-
-    def data_path(self, name: str) -> Path | None:
-        """Where a scenario's data lie; None for toy scenes, which need none."""
-        row = self.scenarios[name]
-        return None if row.source == "toy" else Path(self.config.data_root or ".") / row.path
-
-    def _require_data(self) -> None:
-        for name, row in self.scenarios.items():
-            path = self.data_path(name)
-            if path is None:
-                continue
-            if self.config.data_root is None:
-                raise InputError(
-                    f"scenario {name}",
-                    f"{row.source} scenarios need data_root",
-                    "null",
-                    "Give it: --config data_root=/path/to/data.",
-                )
-            if not path.exists():
-                raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
-
-
-def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
-    """Method with a fit -> the first row of the table with the same search, stage and settings."""
-    first: dict[tuple[Any, ...], str] = {}
-    fitted = {name: method for name, method in methods.items() if method.fit}
-    return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
-
-
-def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:
-    """A twin moves only to a recording of the same object with as many nodes, which `mocap.spacing` does not promise."""
-    for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
-        here, there = scenarios[source], scenarios[target]
-        if (here.source, here.category) != (there.source, there.category):
-            rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
-            raise InputError("configuration, transfers", rule, f"source {there.source}, category {there.category}")
-        if here.source == "mocap" and config.mocap.rings is None:
-            rule = "must be set where twins are transferred, so that all recordings have as many nodes"
-            raise InputError("configuration, mocap.rings", rule, None)
-
-
-def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        close = {name: difflib.get_close_matches(name, known, n=1) for name in unknown}
-        hints = [f"{name!r}" + (f" (did you mean {match[0]!r}?)" if match else "") for name, match in close.items()]
-        raise InputError(
-            f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
-        )
 
 
 def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:

@@ -86,7 +86,7 @@ def test_declarations_and_reporting_do_not_count(copy):
 LEVELS = [
     {"errors"},
     {"artifacts", "config", "progress"},
-    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
+    {"benchmark", "records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
     {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters"},
     {"search", "fit", "carry", "figures", "tables"},
     {"stages"},
@@ -115,7 +115,10 @@ def test_only_tracking_imports_mlflow():
     assert users == ["tracking.py"]
 
 
-@pytest.mark.parametrize("module", ["neuspring", "neuspring.config", "neuspring.cli", "neuspring.provenance", "neuspring.tracking"])
+LIGHT = [f"neuspring{name}" for name in ("", ".benchmark", ".config", ".cli", ".provenance", ".tracking", ".data.phystwin")]
+
+
+@pytest.mark.parametrize("module", LIGHT)
 def test_imports_that_the_workflow_makes_at_start_are_light(module):
     code = f"import sys, {module}; print([m for m in ('torch', 'warp', 'mlflow', 'matplotlib', 'cma') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"

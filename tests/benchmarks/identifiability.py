@@ -42,6 +42,7 @@ from matplotlib.figure import Figure
 
 from neuspring import config, figures_twin, figures_views, metrics, tables
 from neuspring.artifacts import Twin, write_text
+from neuspring.benchmark import read_scenarios
 from neuspring.data import toy
 from neuspring.errors import NumericalFailure
 from neuspring.fit import FitProblem, fit
@@ -103,7 +104,7 @@ class Run:
 @functools.cache
 def scene_of(path: str, noise: float, seed: int) -> toy.ToyScene:
     """The toy scene as seen with `noise` [m]."""
-    rows = config.read_scenarios(Path(__file__).parents[2] / "config/scenarios.tsv")
+    rows = read_scenarios(Path(__file__).parents[2] / "config/scenarios.tsv")
     return toy.make(rows[f"toy_{path.replace('/', '_')}"], config.Toy(noise=noise, seed=seed))
 
 

@@ -17,6 +17,7 @@ import pandas as pd
 
 from neuspring import config, metrics
 from neuspring.artifacts import Observations, Twin
+from neuspring.benchmark import Benchmark, fit_of
 from neuspring.data import mocap
 from neuspring.motion import initial_velocity
 from neuspring.rollout import roll_out
@@ -25,15 +26,15 @@ from neuspring.transfer import rebase
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def benchmark_of(data_set: Path, methods: list[str]) -> config.Benchmark:
+def benchmark_of(data_set: Path, methods: list[str]) -> Benchmark:
     """The study of config/mocap.yaml, on its own scenarios alone."""
     values = config.read_yaml(ROOT / "config/config.yaml")
     config.merge(values, config.read_yaml(ROOT / "config/mocap.yaml"))
     config.merge(values, {"methods": methods, "compare_with": None, "data_root": str(data_set), "transfers": None})
-    return config.Benchmark.of(values, ROOT)
+    return Benchmark.of(values, ROOT)
 
 
-def restarted(benchmark: config.Benchmark, observations: Observations) -> Observations:
+def restarted(benchmark: Benchmark, observations: Observations) -> Observations:
     """The same recording from its first frame after the split on."""
     name, settings = observations.scenario.name, benchmark.config.mocap
     file = benchmark.data_path(name)
@@ -42,12 +43,12 @@ def restarted(benchmark: config.Benchmark, observations: Observations) -> Observ
     return mocap.read(benchmark.scenarios[name], file, replace(settings, start=start))
 
 
-def scores(results: Path, benchmark: config.Benchmark, name: str, method: str, seed: int) -> pd.DataFrame:
+def scores(results: Path, benchmark: Benchmark, name: str, method: str, seed: int) -> pd.DataFrame:
     """The workflow's scores of one run, and those of its restarted twin (task `restarted`)."""
     again = restarted(benchmark, Observations.load(results / name / "observations.npz"))
     row = benchmark.methods[method]
     folder = benchmark.fit_of_method[method] if row.fit else f"search-{row.search}"
-    trained = bool(row.fit and config.fit_of(benchmark.config, row, method).rest_length_bound)
+    trained = bool(row.fit and fit_of(benchmark.config, row, method).rest_length_bound)
     twin = rebase(Twin.load(results / name / folder / str(seed) / "twin.npz"), again, keep_lengths=trained)
     velocity = initial_velocity(again, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, again.controller_points, "cpu", velocity=velocity)

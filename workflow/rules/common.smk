@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
+from neuspring import benchmark as benchmarks
 from neuspring import config as settings
 from neuspring.data import phystwin
 from neuspring.errors import InputError
@@ -24,7 +25,7 @@ ROOT = Path(workflow.basedir)
 def checked_benchmark():
     """The validated configuration; a clear message and no traceback if it is wrong or the results folder is not writable."""
     try:
-        benchmark = settings.Benchmark.of(config, ROOT)
+        benchmark = benchmarks.Benchmark.of(config, ROOT)
         results = Path(benchmark.config.results)
         try:
             results.mkdir(parents=True, exist_ok=True)
@@ -101,7 +102,7 @@ def search_settings(wildcards):
     """The search's sections, with the search row's own settings on top."""
     chosen = common_settings()
     row = BENCHMARK.searches[wildcards.search]
-    chosen["search"] = settings.plain(settings.search_of(CONFIG, row, wildcards.search))
+    chosen["search"] = settings.plain(benchmarks.search_of(CONFIG, row, wildcards.search))
     if row.clusters == 1:
         # What concerns regions alone changes nothing here, so it must not start the search again.
         for name in ("clusters", "tied_rollouts", "freed_sigma"):
@@ -119,7 +120,7 @@ def fit_settings(wildcards):
     """The fit's sections, with the method's own settings on top."""
     chosen = common_settings()
     method = BENCHMARK.fits[wildcards.method]
-    chosen["fit"] = settings.plain(settings.fit_of(CONFIG, method, wildcards.method))
+    chosen["fit"] = settings.plain(benchmarks.fit_of(CONFIG, method, wildcards.method))
     if method.fit == "springs":
         del chosen["fit"]["field"]
     return json.dumps(chosen, sort_keys=True)
