@@ -5,7 +5,8 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -106,7 +107,8 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """Method minus baseline on the same scenario and seed: mean, and a 95 % bootstrap interval over scenarios and seeds.
 
     Scenarios are resampled, and within each the seeds, since runs of one scenario are not independent. `relative` is the mean
-    difference over the baseline's mean on the same pairs.
+    difference over the baseline's mean on the same pairs; `ratio` the geometric mean of method / baseline, with its interval,
+    in which a scenario of large errors weighs no more than another (NaN where an error is zero).
     """
     rows = []
     rng = np.random.default_rng(0)
@@ -116,15 +118,26 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
             if baseline not in wide:
                 continue
             both = wide[[method, baseline]].dropna()
-            runs = [part.to_numpy() for _, part in (both[method] - both[baseline]).groupby("scenario")]
-            if not runs:
+            if not len(both):
                 continue
-            delta = np.array([part.mean() for part in runs])
-            low, high = np.quantile(_resampled_means(runs, rng), [0.025, 0.975]) if len(delta) > 1 else (np.nan, np.nan)
-            base = both[baseline].groupby("scenario").mean().mean()
-            row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": delta.mean()}
-            rows.append(row | {"low": low, "high": high, "relative": delta.mean() / base, "scenarios": len(delta)})
+            difference, low, high = _mean_interval(both[method] - both[baseline], rng)
+            base = both[baseline].groupby("scenario").mean()
+            row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": difference}
+            row |= {"low": low, "high": high, "relative": difference / base.mean(), "scenarios": len(base)}
+            positive = bool((both > 0).all(axis=None))
+            ratios = np.exp(_mean_interval((both[method] / both[baseline]).map(math.log), rng)) if positive else [np.nan] * 3
+            rows.append(row | dict(zip(("ratio", "ratio_low", "ratio_high"), ratios, strict=True)))
     return pd.DataFrame(rows)
+
+
+def _mean_interval(values: pd.Series, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Mean over scenarios of `values` by (scenario, seed), and its 95 % bootstrap interval (NaN for one scenario)."""
+    runs = [part.to_numpy() for _, part in values.groupby("scenario")]
+    mean = float(np.mean([part.mean() for part in runs]))
+    if len(runs) == 1:
+        return mean, np.nan, np.nan
+    low, high = np.quantile(_resampled_means(runs, rng), [0.025, 0.975])
+    return mean, float(low), float(high)
 
 
 def _resampled_means(runs: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -159,6 +172,8 @@ def summary_text(collected: Collected, baseline: str) -> str:
             "",
         ]
         lines += _difference_table(differences)
+        lines += ["", f"Ratio to {baseline}, geometric mean [95 % interval], which no single scenario of large errors decides:", ""]
+        lines += _difference_table(differences, cell=_ratio)
     bad = collected.runs[collected.runs["status"] != "ok"]
     if len(bad):
         lines += ["", "Not in the averages:", ""]
@@ -208,13 +223,15 @@ def _method_table(
     return _markdown(["Method", *headings.values(), "Runs"], rows)
 
 
-def _difference_table(differences: pd.DataFrame, headings: Headings = HEADINGS) -> list[str]:
+def _difference_table(
+    differences: pd.DataFrame, headings: Headings = HEADINGS, cell: Callable[[Any], str] | None = None
+) -> list[str]:
     rows = []
     for method, part in differences.groupby("method", sort=False):
         cells = [str(method)]
         for task, metric in headings:
             found = part[(part["task"] == task) & (part["metric"] == metric)]
-            cells.append("–" if not len(found) else _interval(found.iloc[0]))
+            cells.append("–" if not len(found) else (cell or _interval)(found.iloc[0]))
         rows.append(cells)
     return _markdown(["Method", *headings.values()], rows)
 
@@ -224,6 +241,13 @@ def _interval(row: Any) -> str:
     if np.isfinite(row["low"]):
         text += f" [{MM * row['low']:+.2f}, {MM * row['high']:+.2f}]"
     return f"{text} ({100 * row['relative']:+.1f} %)"
+
+
+def _ratio(row: Any) -> str:
+    if not np.isfinite(row["ratio"]):
+        return "–"
+    interval = f" [{row['ratio_low']:.3f}, {row['ratio_high']:.3f}]" if np.isfinite(row["ratio_low"]) else ""
+    return f"{row['ratio']:.3f}{interval}"
 
 
 def per_scenario_text(scores: pd.DataFrame) -> str:
@@ -283,6 +307,8 @@ def transfer_text(collected: Collected, baseline: str) -> str:
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"
         lines += ["", f"Paired difference to {baseline}, mm [{interval}]:", ""]
         lines += _difference_table(differences, TRANSFER_HEADINGS)
+        lines += ["", f"Ratio to {baseline}, geometric mean [95 % interval]:", ""]
+        lines += _difference_table(differences, TRANSFER_HEADINGS, _ratio)
     return "\n".join(lines) + "\n"
 
 

@@ -55,6 +55,26 @@ def test_the_relative_difference_weighs_scenarios_equally():
     assert row["relative"] == pytest.approx(-0.1)
 
 
+def test_the_ratio_weighs_a_scenario_of_large_errors_like_another():
+    values = {
+        ("a", "x", 0): 1.0,
+        ("a", "y", 0): 2.0,
+        ("b", "x", 0): 0.01,
+        ("b", "y", 0): 0.005,
+        ("c", "x", 0): 0.01,
+        ("c", "y", 0): 0.005,
+    }
+    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    assert row["difference"] > 0
+    assert row["ratio"] == pytest.approx((2 * 0.5 * 0.5) ** (1 / 3))
+    assert pytest.approx(row["ratio_low"]) == 0.5
+    assert row["ratio_low"] < row["ratio"] < row["ratio_high"] <= 2.0
+    perfect = tables.paired_differences(collected(values | {("c", "y", 0): 0.0}).scores, "x").iloc[0]
+    assert np.isnan(perfect["ratio"])
+    assert np.isfinite(perfect["difference"])
+    assert "0.794 [" in tables.summary_text(collected(values), "x")
+
+
 def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
     """Twelve scenarios alike but for independent noise of three seeds: the variance of resampled means is that of both levels."""
     rng = np.random.default_rng(1)
