@@ -18,6 +18,8 @@ import pandas as pd
 from neuspring.artifacts import write_atomically, write_text
 from neuspring.figures_clusters import NAME as CLUSTERS
 from neuspring.figures_clusters import cluster_methods, clusters_figure
+from neuspring.figures_ratios import NAME as RATIOS
+from neuspring.figures_ratios import ratios_figure
 from neuspring.metrics import COLUMNS, averages
 from neuspring.records import RECORD_FORMAT, StageRecord, read_json
 
@@ -291,6 +293,17 @@ def write_clusters(collected: Collected, folder: Path) -> str:
     return f"\n## Number of regions\n\n![Chamfer distance against the number of regions K]({CLUSTERS})\n"
 
 
+def write_ratios(scores: pd.DataFrame, differences: pd.DataFrame, folder: Path) -> str:
+    """Draw ratios.png if there is an interval to draw; returns the lines that show it, else nothing."""
+    if len(differences):
+        order = list(dict.fromkeys(scores["method"]))
+        differences = differences.sort_values("method", key=lambda names: names.map(order.index), kind="stable")
+    counts = f"{scores['scenario'].nunique()} scenarios, {scores['seed'].nunique()} seed(s)"
+    if ratios_figure(differences, folder / RATIOS, counts) is None:
+        return ""
+    return f"\n![Ratio of every method's errors to the baseline's]({RATIOS})\n"
+
+
 def transfer_text(collected: Collected, baseline: str) -> str:
     """The section on transferred twins; nothing if there are none."""
     if not len(collected.runs):
@@ -324,7 +337,8 @@ def _markdown(header: list[str], rows: list[list[str]]) -> list[str]:
 def write(collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None) -> str:
     """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, transfers.csv and summary.md; returns the summary.
 
-    With methods clusters_<K>, also clusters.png, which summary.md then shows.
+    Where a method can be compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md
+    shows them.
     """
     scores = collected.scores
     usable = comparable(collected)
@@ -341,7 +355,7 @@ def write(collected: Collected, baseline: str, folder: Path, transfers: Collecte
     transferred = transfer_text(transfers, baseline) if transfers else ""
     transfer_scores = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
     write_text(folder / "transfers.csv", transfer_scores.to_csv(index=False))
-    text = f"# Scores\n\n{summary}{transferred}{write_clusters(collected, folder)}"
+    text = f"# Scores\n\n{summary}{write_ratios(usable, differences, folder)}{transferred}{write_clusters(collected, folder)}"
     text += f"\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
     write_text(folder / "summary.md", text)
     return summary

@@ -9,7 +9,7 @@ from matplotlib import image
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 
-from neuspring import figures, figures_clusters, figures_twin, figures_views, tables
+from neuspring import figures, figures_clusters, figures_ratios, figures_twin, figures_views, tables
 from neuspring.artifacts import Observations, Trajectory, Twin
 from neuspring.config import Clusters
 from neuspring.metrics import COLUMNS
@@ -359,3 +359,42 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monk
     # clusters_4 finished no run: it is not drawn and holds nobody back.
     assert set(scores["method"]) == {"clusters_1", "clusters_10"}
     assert "3 of 4 pairs" in note
+
+
+def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(figures_ratios, "save", lambda figure, path: kept.append(figure) or path)
+    rows = [
+        {
+            "method": m,
+            "baseline": "x",
+            "task": task,
+            "metric": "track_error",
+            "ratio": r,
+            "ratio_low": r - 0.1,
+            "ratio_high": r + 0.2,
+        }
+        for task in ("future", "reconstruction")
+        for m, r in (("far", 1.1), ("near", 0.8))
+    ]
+    assert figures_ratios.ratios_figure(pd.DataFrame(rows), tmp_path / "ratios.png", "") is not None
+    (figure,) = kept
+    assert [axis.get_title() for axis in figure.axes] == ["training frames", "future"]
+    for axis in figure.axes:
+        ((points, _, (bars,)),) = axis.containers
+        assert points.get_xdata().tolist() == [1.1, 0.8]
+        np.testing.assert_allclose([segment[:, 0] for segment in bars.get_segments()], [[1.0, 1.3], [0.7, 1.0]])
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["far", "near"]
+    plt.close(figure)
+
+
+def test_a_picture_of_ratios_needs_two_scenarios_and_is_not_left_over(tmp_path):
+    def written(scenarios: str) -> str:
+        values = {(s, m, 0): v for s in scenarios for m, v in (("x", 0.01), ("y", 0.008))}
+        tables.write(collected(values), "x", tmp_path)
+        return (tmp_path / "summary.md").read_text()
+
+    assert "](ratios.png)" in written("ab")
+    assert (tmp_path / "ratios.png").stat().st_size > 5000
+    assert "ratios.png" not in written("a")
+    assert not (tmp_path / "ratios.png").exists()

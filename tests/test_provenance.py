@@ -87,7 +87,7 @@ LEVELS = [
     {"errors"},
     {"artifacts", "config", "progress"},
     {"benchmark", "records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
-    {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters"},
+    {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios"},
     {"search", "fit", "carry", "figures", "tables"},
     {"stages"},
     {"cli"},
