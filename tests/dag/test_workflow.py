@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,51 +18,7 @@ from neuspring.artifacts import Twin
 from neuspring.benchmark import Benchmark, read_scenarios
 from neuspring.errors import InputError
 
-ROOT = Path(__file__).parents[2]
-TINY = {
-    "scenarios": ["toy_rope_lift_smooth"],
-    "methods": ["search_only", "baseline"],
-    "seeds": [0],
-    "search": {"rollouts": 11},
-    "fit": {"epochs": 3, "checkpoint_every": 1},
-    "toy": {"frames": 8},
-    "device": "cpu",
-}
-SCENE = TINY["scenarios"][0]
-
-
-@pytest.fixture
-def place(tmp_path):
-    """A working copy of the workflow's own files, so that locks and metadata of tests do not meet."""
-    return copy_workflow(tmp_path / "project")
-
-
-def copy_workflow(project: Path) -> Path:
-    project.mkdir()
-    for name in ("Snakefile", "workflow", "config"):
-        source = ROOT / name
-        shutil.copytree(source, project / name) if source.is_dir() else shutil.copy(source, project / name)
-    return project
-
-
-def arguments(project: Path, changes=None, *extra: str) -> list[str]:
-    overlay = project / "overlay.yaml"
-    overlay.write_text(yaml.safe_dump(config_with(changes or {})))
-    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2"]
-    return [*command, "--configfile", "config/config.yaml", str(overlay), *extra]
-
-
-def config_with(changes: dict) -> dict:
-    values = json.loads(json.dumps(TINY))
-    config.merge(values, changes)
-    return values
-
-
-def run(project: Path, changes=None, *extra: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        arguments(project, changes, *extra), cwd=project, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
+from .project import ROOT, SCENE, arguments, config_with, copy_workflow, jobs, run
 
 
 @pytest.fixture(scope="module")
@@ -115,44 +70,6 @@ def test_methods_share_searches_and_fits(finished):
     assert planned["rollout"] == planned["score"] == 11 * 2
 
 
-def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(place):
-    changes = {
-        "methods": ["neuspring", "plus_carry_over", "plus_average"],
-        "seeds": [0, 1],
-        "fit": {"epochs": 1},
-        "transfers": {SCENE: ["toy_rope_shake_smooth"], "toy_rope_shake_smooth": [SCENE]},
-    }
-    result = run(place, changes)
-    text = result.stdout + result.stderr
-    assert result.returncode == 0, text
-    results = place / "results"
-    summary = (results / "tables" / "summary.md").read_text()
-    assert all(f"| {name} " in summary for name in changes["methods"])
-    assert "## Transfer" in summary
-    transfers = pd.read_csv(results / "tables" / "transfers.csv")
-    # Averaging and carrying over concern a recording's own future; the other recording is no source, since it is not chosen.
-    assert set(transfers["method"]) == {"neuspring"}
-    assert set(transfers["scenario"]) == {SCENE}
-    averaged = [pd.read_parquet(results / SCENE / "plus_average" / seed / "scores.parquet")["value"] for seed in "01"]
-    np.testing.assert_array_equal(*averaged)
-    record = json.loads((results / SCENE / "neuspring" / "0" / "run.json").read_text())
-    assert record["variant"]["clusters"] == 5
-    assert record["variant"]["field.plane_learning_rate"] == 0.01
-    assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
-    assert {Path(name).name for name in record["artifacts"]["plots"]} >= {"topology.png", "stiffness.png", "motion.png"}
-
-    more = run(place, changes | {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}})
-    text = more.stdout + more.stderr
-    assert more.returncode == 0, text
-    assert "continuing the search after 11 rollouts" in text
-    assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
-
-
-def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
-    lines = (result.stdout + result.stderr).split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
-    return {name: int(count) for name, count in (line.split() for line in lines) if name != "total"}
-
-
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, place):
     project, _ = finished
     changes = {"methods": ["baseline"], "fit": {"epochs": 60}, "tracking": {"enabled": False}}
@@ -184,37 +101,6 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
     expected = Twin.load(project / "results" / SCENE / "baseline" / "0" / "twin.npz")
     np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)
-
-
-def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):
-    # No candidate can be integrated with a single substep, so the search fails numerically.
-    changes = {"simulation": {"max_substeps": 1}, "methods": ["search_only"], "tracking": {"enabled": False}}
-    result = run(place, changes)
-    text = result.stdout + result.stderr
-    assert result.returncode == 0, text
-    assert "0/1 (1 failed)" in text
-    assert "none of 11 candidates could be simulated" in text
-
-
-def test_a_job_that_breaks_is_retried_and_does_not_stop_the_others(place):
-    changes = {"scenarios": [SCENE, "DLO1_train_48"], "methods": ["search_only"], "tracking": {"enabled": False}}
-    changes |= {"data_root": str(place / "data")}
-    broken = place / "data" / "DLO1" / "train" / "48.pkl"
-    broken.parent.mkdir(parents=True)
-    broken.write_bytes(b"\x80\x04 truncated")
-    result = run(place, changes)
-    text = result.stdout + result.stderr
-    assert result.returncode == 1
-    assert f"neuspring: error: {broken}" in text
-    assert "MissingOutputException" not in text, "the command fails by its status"
-    assert "Trying to restart job" in text
-    # The healthy scenario is finished and in the table; the broken one is listed as missing.
-    assert (place / "results" / SCENE / "search_only" / "0" / "run.json").exists()
-    assert "DLO1_train_48 / search_only / seed 0: missing" in text
-    assert "1/2" in text
-    # What the interrupted run printed does not pass for the table: the next one goes on.
-    planned = jobs(run(place, changes, "--dry-run"))
-    assert planned == {"observe": 1, "search": 1, "rollout": 1, "score": 1, "tables": 1, "all": 1}
 
 
 def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(place, tmp_path):

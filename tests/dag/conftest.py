@@ -1,0 +1,9 @@
+import pytest
+
+from .project import copy_workflow
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A project folder of the test's own."""
+    return copy_workflow(tmp_path / "project")
