@@ -155,8 +155,11 @@ def _resampled_means(runs: list[np.ndarray], rng: np.random.Generator) -> np.nda
     return total / len(runs)
 
 
-def summary_text(collected: Collected, baseline: str) -> str:
-    """The tables in Markdown, in millimetres: both averages, the paired comparison, failures."""
+def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame | None = None) -> str:
+    """The tables in Markdown, in millimetres: both averages, the paired comparison, failures.
+
+    `differences` are the paired ones if the caller has them already, since the bootstrap takes seconds on a large benchmark.
+    """
     methods = list(dict.fromkeys(collected.runs["method"]))
     scores = comparable(collected)
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
@@ -166,7 +169,8 @@ def summary_text(collected: Collected, baseline: str) -> str:
     lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
     lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, seeds)
-    differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
+    if differences is None:
+        differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
         lines += [
             "",
@@ -348,7 +352,7 @@ def write(collected: Collected, baseline: str, folder: Path, transfers: Collecte
     for name, table in {"scores": scores, "runs": collected.runs, "averages": averaged, "differences": differences}.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     write_atomically(folder / "scores.parquet", lambda temporary: scores.to_parquet(temporary, index=False))
-    summary = summary_text(collected, baseline)
+    summary = summary_text(collected, baseline, differences)
     finished = scores.merge(collected.runs.loc[collected.runs["status"] == "ok", ["scenario", "method", "seed"]])
     details = per_scenario_text(finished) if len(finished) else "No run has finished.\n"
     timings = timing_text(collected.runs)
