@@ -102,7 +102,9 @@ def search_settings(wildcards):
     """The search's sections, with the search row's own settings on top."""
     chosen = common_settings()
     row = BENCHMARK.searches[wildcards.search]
-    chosen["search"] = settings.plain(benchmarks.search_of(CONFIG, row, wildcards.search))
+    chosen["search"] = settings.plain(
+        benchmarks.search_of(CONFIG, row, wildcards.search)
+    )
     if row.clusters == 1:
         # What concerns regions alone changes nothing here, so it must not start the search again.
         for name in ("clusters", "tied_rollouts", "freed_sigma"):
