@@ -233,7 +233,7 @@ def picture(found: dict[str, dict[str, np.ndarray]]) -> Figure:
             handle.set_alpha(1.0)
     label = "stiffness / geometric mean of the truth"
     ticks: dict[str, Any] = {"ticks": [0.3, 0.5, 1, 2, 3], "format": "{x:g}", "extend": "both"}
-    figure.colorbar(lines, ax=axes[:, :3], label=label, location="bottom", aspect=60, **ticks).minorticks_off()
+    figure.colorbar(lines, ax=axes, label=label, location="bottom", aspect=60, shrink=0.6, pad=0.01, **ticks).minorticks_off()
     figure.suptitle(f"Stiffness of object springs, noise {1e3 * SHOWN[0]:g} mm, seed {SHOWN[1]}")
     return figure
 
