@@ -27,7 +27,7 @@ def ratios_figure(differences: pd.DataFrame, path: Path, note: str) -> Path | No
     tasks = [task for task in TITLES if len(rows) and (rows["task"] == task).any()]
     if not tasks:
         return None
-    methods = list(dict.fromkeys(rows["method"]))
+    methods, baseline = list(dict.fromkeys(rows["method"])), rows["baseline"].iloc[0]
     size = (4.2 * len(tasks) + 1.2, 0.34 * len(methods) + 1.6)
     figure, axes = plt.subplots(1, len(tasks), figsize=size, layout="constrained", squeeze=False, sharey=True)
     for axis, task in zip(axes[0], tasks, strict=True):
@@ -39,7 +39,7 @@ def ratios_figure(differences: pd.DataFrame, path: Path, note: str) -> Path | No
             reach = np.stack([part["ratio"] - part["ratio_low"], part["ratio_high"] - part["ratio"]])
             axis.errorbar(part["ratio"], place, xerr=reach, fmt=marker, color=colour, ms=4, capsize=2, label=label)
         axis.axvline(1.0, color="0.3", lw=0.8, ls="--")
-        axis.set(title=TITLES[task], xscale="log", xlabel="error / baseline's error (below 1 is better)")
+        axis.set(title=TITLES[task], xscale="log", xlabel=f"error / that of {baseline} (below 1 is better)")
         low, high = axis.get_xlim()
         axis.set_xticks([tick for tick in TICKS if low <= tick <= high])
         axis.xaxis.set_major_formatter(ScalarFormatter())
@@ -48,5 +48,5 @@ def ratios_figure(differences: pd.DataFrame, path: Path, note: str) -> Path | No
     axes[0][0].set_yticks(range(len(methods)), methods)
     axes[0][0].invert_yaxis()
     axes[0][-1].legend(frameon=False, fontsize=8)
-    figure.suptitle(f"Ratio to {rows['baseline'].iloc[0]}, geometric mean and 95 % interval\n{note}", fontsize=9)
+    figure.suptitle(f"Ratio to {baseline}, geometric mean and 95 % interval\n{note}", fontsize=9)
     return save(figure, path)
