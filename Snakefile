@@ -8,6 +8,7 @@ configfile: "config/config.yaml"
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/perceive.smk"
 include: "workflow/rules/observe.smk"
 include: "workflow/rules/twin.smk"
 include: "workflow/rules/score.smk"

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuspring.config import Config, Fit, Method, ScenarioRow, Search, SearchRow, merge, parse, plain, read_text, read_yaml
+from neuspring.config import MADE, Config, Fit, Method, ScenarioRow, Search, SearchRow, merge, parse, plain, read_text, read_yaml
+from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
 
 RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published")
@@ -131,9 +132,24 @@ class Benchmark:
         return wanted if wanted in self.methods else self.config.methods[0]  # type: ignore[return-value]
 
     def data_path(self, name: str) -> Path | None:
-        """Where a scenario's data lie; None for toy scenes, which need none."""
+        """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""
         row = self.scenarios[name]
-        return None if row.source == "toy" else Path(self.config.data_root or ".") / row.path
+        return None if row.source in MADE else Path(self.config.data_root or ".") / row.path
+
+    def capture_folder(self, name: str) -> Path:
+        """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
+        own = self.data_path(name) if self.scenarios[name].source == "capture" else None
+        return own or Path(self.config.results) / name / "capture"
+
+    def cameras(self, name: str) -> tuple[str, ...]:
+        """Names of a filmed scenario's cameras, which are known before its capture is made. Raises InputError."""
+        source, path = self.scenarios[name].source, self.data_path(name)
+        if source == "synthetic":
+            return tuple(map(str, range(self.config.synthetic.cameras)))
+        assert path is not None
+        if source == "phystwin_raw":
+            return tuple(map(str, range(phystwin_raw.camera_count(path))))
+        return tuple(camera.name for camera in capture.read_description(path / capture.CAPTURE).cameras)
 
     def _require_data(self) -> None:
         for name, row in self.scenarios.items():

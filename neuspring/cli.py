@@ -18,7 +18,7 @@ from neuspring import __version__
 from neuspring.errors import InputError
 
 if TYPE_CHECKING:
-    from neuspring.config import Config
+    from neuspring.config import Config, ScenarioRow
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,18 +59,51 @@ def _json_mapping(option: str, text: str) -> dict[str, object]:
     return values
 
 
-def _observe(a: argparse.Namespace) -> int:
-    from neuspring import benchmark, config, stages
+def _row(a: argparse.Namespace, settings: Config) -> ScenarioRow:
+    from neuspring import benchmark, config
+
+    if a.row:
+        return config.parse(config.ScenarioRow, _json_mapping("--row", a.row), "--row")
+    rows = benchmark.read_scenarios(Path(settings.scenario_table))
+    if a.scenario not in rows:
+        raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
+    return rows[a.scenario]
+
+
+def _capture(a: argparse.Namespace) -> int:
+    from neuspring import perceive
 
     settings = _settings(a.settings)
-    if a.row:
-        row = config.parse(config.ScenarioRow, _json_mapping("--row", a.row), "--row")
-    else:
-        rows = benchmark.read_scenarios(Path(settings.scenario_table))
-        if a.scenario not in rows:
-            raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
-        row = rows[a.scenario]
-    stages.observe(row, settings, a.output)
+    perceive.make_capture(_row(a, settings), settings, a.output)
+    return 0
+
+
+def _segment(a: argparse.Namespace) -> int:
+    from neuspring import perceive
+
+    perceive.segment(a.capture.parent, a.camera, _settings(a.settings), a.device, a.output)
+    return 0
+
+
+def _track(a: argparse.Namespace) -> int:
+    from neuspring import perceive
+
+    perceive.track(a.capture.parent, a.camera, a.masks, _settings(a.settings), a.device, a.output)
+    return 0
+
+
+def _lift(a: argparse.Namespace) -> int:
+    from neuspring import perceive
+
+    perceive.lift(a.capture.parent, a.masks, a.tracks, _settings(a.settings), a.output)
+    return 0
+
+
+def _observe(a: argparse.Namespace) -> int:
+    from neuspring import stages
+
+    settings = _settings(a.settings)
+    stages.observe(_row(a, settings), settings, a.capture and a.capture.parent, a.lifted, a.output)
     return 0
 
 
@@ -179,10 +212,21 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="command")
     add = _Adder(commands)
 
-    observe = add("observe", _observe, "capture -> observations.npz", "settings", "output")
-    which = observe.add_mutually_exclusive_group(required=True)
-    which.add_argument("--scenario", help="name of a row of the scenario table")
-    which.add_argument("--row", help="the row itself, as JSON")
+    add("capture", _capture, "synthetic scene or PhysTwin's raw layout -> capture folder", "scenario", "settings", "output")
+    segment = add("segment", _segment, "one camera of a capture -> masks", "capture", "settings", "compute", "output")
+    segment.add_argument("--camera", required=True)
+    track = add("track", _track, "masks of one camera -> tracks of pixels", "capture", "settings", "compute", "output")
+    track.add_argument("--camera", required=True)
+    track.add_argument("--masks", type=Path, required=True, help="masks.json")
+    lift = add(
+        "lift", _lift, "masks and tracks of all cameras -> points in the world, shape prior", "capture", "settings", "output"
+    )
+    lift.add_argument("--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order")
+    lift.add_argument("--tracks", type=Path, nargs="+", required=True, help="tracks.json of every camera, in the same order")
+
+    observe = add("observe", _observe, "capture -> observations.npz", "scenario", "settings", "output")
+    observe.add_argument("--capture", type=Path, help="capture.json of raw video")
+    observe.add_argument("--lifted", type=Path, help="lifted.json of raw video")
 
     search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
     search.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
@@ -243,6 +287,12 @@ class _Adder:
     def __call__(self, name: str, run: object, text: str, *shared: str) -> argparse.ArgumentParser:
         parser = self._commands.add_parser(name, help=text, description=text)
         parser.set_defaults(run=run)
+        if "scenario" in shared:
+            which = parser.add_mutually_exclusive_group(required=True)
+            which.add_argument("--scenario", help="name of a row of the scenario table")
+            which.add_argument("--row", help="the row itself, as JSON")
+        if "capture" in shared:
+            parser.add_argument("--capture", type=Path, required=True, help="capture.json")
         if "observations" in shared:
             parser.add_argument("--observations", type=Path, required=True, help="observations.npz")
         if "settings" in shared:

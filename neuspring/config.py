@@ -15,19 +15,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
+from neuspring.config_perception import Perception, Synthetic
+from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range
 from neuspring.errors import InputError
 
 T = TypeVar("T")
-STRICT = ConfigDict(extra="forbid", strict=True)
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Range = tuple[Finite, Finite]
 Beta = Annotated[float, Field(ge=0, lt=1)]
+FILMED = ("synthetic", "capture", "phystwin_raw")
+"""Sources of raw video, which perception makes observations of."""
+MADE = ("toy", "synthetic")
+"""Sources that need no data."""
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
 
@@ -389,6 +388,10 @@ class Config:
     """See [toy](#toy)."""
     mocap: Mocap = field(default_factory=Mocap)
     """See [mocap](#mocap)."""
+    synthetic: Synthetic = field(default_factory=Synthetic)
+    """See [synthetic](#synthetic)."""
+    perception: Perception = field(default_factory=Perception)
+    """See [perception](#perception)."""
     tracking: Tracking = field(default_factory=Tracking)
     """See [tracking](#tracking)."""
 
@@ -439,10 +442,10 @@ class ScenarioRow:
 
     __pydantic_config__ = STRICT
     scenario: Name
-    source: Literal["phystwin", "mocap", "toy"]
+    source: Literal["phystwin", "mocap", "toy", "synthetic", "capture", "phystwin_raw"]
     category: Name
     path: str
-    """Folder or file under data_root; for toy scenes, the scene's name."""
+    """Folder or file under data_root; for toy and synthetic scenes, the scene's name."""
     self_collision: bool
     ground: bool
 

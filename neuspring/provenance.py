@@ -80,10 +80,12 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def _stage_code(stage: str) -> str:
-    """The function `stage` of `neuspring.stages`, and what it calls there."""
-    functions = {node.name: node for node in _tree(STAGES).body if isinstance(node, ast.FunctionDef)}
+    """The function `stage` of `neuspring.stages`, or `module.function` of another module, and what it calls there."""
+    module, _, function = stage.rpartition(".")
+    tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
+    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     found: dict[str, str] = {}
-    waiting = [stage]
+    waiting = [function]
     while waiting:
         name = waiting.pop()
         if name not in found:
@@ -94,7 +96,7 @@ def _stage_code(stage: str) -> str:
 
 @functools.cache
 def code_digest(*modules: str, stage: str = "") -> str:
-    """A short SHA-256 over the code that the given package modules use and, if named, the function of `neuspring.stages`."""
+    """A short SHA-256 over the code that the given package modules use and, if named, a function (see `_stage_code`)."""
     digest = hashlib.sha256()
     used = {name for module in modules for name in used_modules(module)} - NOT_NUMERICS
     for name in sorted(used):

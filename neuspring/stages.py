@@ -19,7 +19,7 @@ import pandas as pd
 from neuspring import config, figures, metrics, provenance
 from neuspring.artifacts import Observations, Trajectory, Twin, write_atomically, write_text
 from neuspring.config import Config, Kind, ScenarioRow
-from neuspring.errors import NumericalFailure
+from neuspring.errors import InputError, NumericalFailure
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
 RESULT_ROLES = ("twin", "trajectory")
@@ -32,10 +32,20 @@ def write_table(table: pd.DataFrame, path: Path) -> Path:
     return path
 
 
-def observe(row: ScenarioRow, settings: Config, output: Path) -> None:
-    """Capture -> observations.npz; for toy scenes also truth.npz beside it (never read by a method)."""
+def observe(row: ScenarioRow, settings: Config, capture: Path | None, lifted_record: Path | None, output: Path) -> None:
+    """Capture -> observations.npz; for toy scenes also truth.npz beside it (never read by a method).
+
+    Raw video has been perceived before: `capture` is its folder, `lifted_record` its lifted.json.
+    """
     location = Path(settings.data_root or ".") / row.path
-    if row.source == "toy":
+    if row.source in config.FILMED:
+        from neuspring.perceive import assemble
+
+        if capture is None or lifted_record is None:
+            rule = f"scenarios of source {row.source} need --capture and --lifted"
+            raise InputError(f"scenario {row.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
+        observations = assemble(row, capture, lifted_record, settings)
+    elif row.source == "toy":
         from neuspring.data import toy
 
         scene = toy.make(row, settings.toy)

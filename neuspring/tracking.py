@@ -25,7 +25,8 @@ from urllib.parse import urlsplit
 
 from pydantic import AwareDatetime, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
-from neuspring.config import Name, Tracking
+from neuspring.config import Tracking
+from neuspring.config_types import Name
 from neuspring.errors import InputError
 from neuspring.records import RECORD_FORMAT, read_json
 

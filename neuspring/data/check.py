@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.data import conformance, mocap, phystwin
+from neuspring.data.check_capture import check_capture, is_capture
 from neuspring.data.departure import Case, Departure, broken, note, unusual
 from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
@@ -25,7 +26,8 @@ RIGID_TOLERANCE = 1e-5
 
 
 def check(folder: Path) -> list[Departure]:
-    """Check `folder`: a case, a folder of cases, a root with data/different_types, or cable recordings (folder or .pkl file).
+    """Check `folder`: a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, or
+    cable recordings (folder or .pkl file).
 
     Reports every departure. Raises InputError only if `folder` does not exist or holds no data that we know.
     """
@@ -34,6 +36,9 @@ def check(folder: Path) -> list[Departure]:
         return mocap.check_mocap(folder)
     if not folder.is_dir():
         raise InputError(folder, "a folder or file to check is required", "nothing there")
+    captures = [path for path in (folder, *_subfolders(folder)) if is_capture(path)]
+    if captures:
+        return [departure for path in captures for departure in check_capture(path)]
     paths, root = _find_cases(folder)
     if not paths and root is None:
         return _check_recordings(folder)

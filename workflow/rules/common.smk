@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 from neuspring import benchmark as benchmarks
 from neuspring import config as settings
-from neuspring.data import phystwin
+from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
 from neuspring.provenance import code_digest
 
@@ -57,6 +57,7 @@ wildcard_constraints:
     scenario="|".join(map(re.escape, BENCHMARK.scenarios)),
     method="|".join(map(re.escape, BENCHMARK.methods | BENCHMARK.fits)),
     search="|".join(map(re.escape, BENCHMARK.searches)),
+    camera=r"[A-Za-z0-9][A-Za-z0-9_.-]*",
     seed="|".join(map(str, CONFIG.seeds)),
 
 
@@ -68,12 +69,21 @@ def section(*names):
 
 
 def observe_settings(wildcards):
+    source = BENCHMARK.scenarios[wildcards.scenario].source
+    if source in settings.FILMED:
+        return perception_settings("sample", "seed")
     names = {
         "toy": ["toy"],
         "mocap": ["data_root", "mocap"],
         "phystwin": ["data_root"],
     }
-    return section(*names[BENCHMARK.scenarios[wildcards.scenario].source])
+    return section(*names[source])
+
+
+def perceived_options(wildcards, input):
+    if BENCHMARK.scenarios[wildcards.scenario].source not in settings.FILMED:
+        return []
+    return ["--capture", str(input[0]), "--lifted", str(input[1])]
 
 
 def scenario_row(wildcards):
@@ -83,13 +93,89 @@ def scenario_row(wildcards):
 
 
 def reader_digest(wildcards):
+    source = BENCHMARK.scenarios[wildcards.scenario].source
+    if source in settings.FILMED:
+        return code_digest("neuspring.perception.sample", stage="perceive.assemble")
+    return code_digest(f"neuspring.data.{source}")
+
+
+def capture_file(wildcards):
+    """capture.json of a scenario: the user's own, or one that the workflow makes."""
+    return f"{BENCHMARK.capture_folder(wildcards.scenario)}/capture.json"
+
+
+def raw_files(wildcards):
+    """What a capture is imported from, so that changed data are read again."""
+    if BENCHMARK.scenarios[wildcards.scenario].source != "phystwin_raw":
+        return []
+    folder = BENCHMARK.data_path(wildcards.scenario)
+    return [str(folder / name) for name in phystwin_raw.FILES if (folder / name).exists()]
+
+
+def camera_files(wildcards, name):
+    cameras = BENCHMARK.cameras(wildcards.scenario)
+    return [
+        f"{RESULTS}/{wildcards.scenario}/perception/{camera}/{name}"
+        for camera in cameras
+    ]
+
+
+def capture_settings(wildcards):
+    source = BENCHMARK.scenarios[wildcards.scenario].source
+    return section("synthetic" if source == "synthetic" else "data_root")
+
+
+def capture_digest(wildcards):
+    source = BENCHMARK.scenarios[wildcards.scenario].source
     return code_digest(
-        f"neuspring.data.{BENCHMARK.scenarios[wildcards.scenario].source}"
+        "neuspring.data.synthetic.make"
+        if source == "synthetic"
+        else "neuspring.data.phystwin_raw"
     )
+
+
+BACKENDS = {
+    ("segment", "given"): "neuspring.data.capture",
+    ("segment", "opencv"): "neuspring.perception.segment_opencv",
+    ("segment", "grounded_sam2"): "neuspring.perception.segment_sam2",
+    ("track", "opencv"): "neuspring.perception.track_opencv",
+    ("track", "cotracker3"): "neuspring.perception.track_cotracker",
+}
+
+
+def backend_digest(step):
+    """The code of a step's chosen backend, and of the step."""
+    backend = getattr(CONFIG.perception, step).backend
+    return code_digest(BACKENDS[step, backend], stage=f"perceive.{step}")
+
+
+def perception_settings(*names):
+    """Some sections of `perception`, with the chosen backend's own settings alone."""
+    values = settings.plain(CONFIG)["perception"]
+    chosen = {name: values[name] for name in names}
+    for name in ("segment", "track"):
+        if name in chosen:
+            backend = chosen[name]["backend"]
+            chosen[name] = {
+                key: value
+                for key, value in chosen[name].items()
+                if key in ("backend", backend)
+            }
+    return json.dumps({"perception": chosen}, sort_keys=True)
+
+
+def needs_gpu(section, backend):
+    chosen = getattr(CONFIG.perception, section).backend
+    return 1 if chosen == backend and DEVICE != "cpu" else 0
 
 
 def scenario_files(wildcards):
     """The capture's files, so that changed data are read again."""
+    if BENCHMARK.scenarios[wildcards.scenario].source in settings.FILMED:
+        return [
+            capture_file(wildcards),
+            f"{RESULTS}/{wildcards.scenario}/perception/lifted.json",
+        ]
     path = BENCHMARK.data_path(wildcards.scenario)
     if path is None:
         return []

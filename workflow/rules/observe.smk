@@ -18,6 +18,7 @@ rule observe:
         settings=observe_settings,
         row=scenario_row,
         code=reader_digest,
+        perceived=perceived_options,
     shell:
-        "python -m neuspring observe --row {params.row:q} --settings {params.settings:q} --output {output:q}"
+        "python -m neuspring observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"
         " 2>&1 | tee -a {log:q}"

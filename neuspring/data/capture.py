@@ -1,0 +1,326 @@
+"""The capture folder: RGBD video of one or more cameras, as JSON and images only.
+
+    capture.json                       everything but images, see `Description`
+    color/<camera>/<frame>.png         8-bit RGB
+    depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float metres (npy); along the optical axis,
+                                       0: none
+    mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
+    tracks.json                        optional, for scoring alone: [K][T] of [x, y, z] m in the world, or null where not annotated
+
+Frames are numbered from 0 with five digits. Pixel centres lie at whole coordinates, x right, y down, z forward (OpenCV). The world
+is right-handed, metres, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
+and has no files.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import cv2
+import numpy as np
+from pydantic import Field, TypeAdapter
+
+from neuspring.artifacts import write_text
+from neuspring.config import parse
+from neuspring.config_types import STRICT, Finite, Name, Positive
+from neuspring.data.departure import Departure, broken, refuse
+from neuspring.errors import InputError
+
+CAPTURE, TRACKS = "capture.json", "tracks.json"
+FORMAT = 1
+NOTHING, OBJECT, HANDS = 0, 1, 2
+"""Labels of masks."""
+RIGID_TOLERANCE = 1e-4
+"""Of R^T R - 1; leaves room for matrices that went through text with five digits."""
+Row3: TypeAlias = tuple[Finite, Finite, Finite]
+Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraEntry:
+    """One camera of capture.json."""
+
+    __pydantic_config__ = STRICT
+    name: Name
+    """Its folder under color, depth and mask."""
+    width: Annotated[int, Field(ge=16)]
+    height: Annotated[int, Field(ge=16)]
+    intrinsics: tuple[Row3, Row3, Row3]
+    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
+    camera_to_world: tuple[Row4, Row4, Row4, Row4]
+    """Rigid, m."""
+    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Frames that this camera does not have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """capture.json."""
+
+    __pydantic_config__ = STRICT
+    format: Literal[1]
+    name: Name
+    category: str
+    """What the object is, in words: cloth, rope, package, ..."""
+    frame_count: Annotated[int, Field(ge=5)]
+    frame_rate: Positive
+    """Frames per second."""
+    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    depth_unit: Positive = 0.001
+    """Metres per count of an integer depth image."""
+    depth_format: Literal["png", "npy"] = "png"
+    up: Literal["+z", "-z"] = "+z"
+    """Which way is up along the world's z axis."""
+    train_end: Annotated[int, Field(ge=2)] | None = None
+    """Training frames are [0, train_end); null: the first 70 %."""
+    masks: bool = False
+    """Whether mask/ is there."""
+    provenance: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera."""
+
+    name: str
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    """K [3, 3], pixels."""
+    camera_to_world: np.ndarray
+    """[4, 4], m."""
+
+    def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
+        ones = np.ones((*np.shape(depth), 1))
+        rays = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
+        return np.asarray((rays * np.asarray(depth)[..., None]) @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3])
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (x, y) [..., 2] and depth [...], m, of world points [..., 3]; pixels are meaningless for depth <= 0."""
+        local = (points - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]
+        depth = local[..., 2]
+        flat = local @ self.intrinsics.T
+        return flat[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None], depth
+
+    def sees(self, pixels: np.ndarray) -> np.ndarray:
+        """Whether pixels (x, y) [..., 2] round to one of the image."""
+        x, y = np.round(pixels[..., 0]), np.round(pixels[..., 1])
+        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture folder, its images read on demand."""
+
+    folder: Path
+    description: Description
+
+    @classmethod
+    def load(cls, folder: Path) -> Capture:
+        """Read capture.json and check the calibration. Raises InputError naming file and field."""
+        folder = Path(folder)
+        path = folder / CAPTURE
+        description = read_description(path)
+        refuse(description_departures(path, description))
+        return cls(folder, description)
+
+    @cached_property
+    def cameras(self) -> dict[str, Camera]:
+        """By name, in the order of capture.json."""
+        return {
+            c.name: Camera(c.name, c.width, c.height, np.array(c.intrinsics), np.array(c.camera_to_world))
+            for c in self.description.cameras
+        }
+
+    @property
+    def frame_count(self) -> int:
+        """Frames, missing ones included."""
+        return self.description.frame_count
+
+    @property
+    def train_end(self) -> int:
+        """Training frames are [0, train_end)."""
+        return self.description.train_end or int(0.7 * self.frame_count)
+
+    def has(self, camera: str, frame: int) -> bool:
+        """Whether the camera has this frame."""
+        return frame not in self._missing[camera]
+
+    @cached_property
+    def _missing(self) -> dict[str, frozenset[int]]:
+        return {c.name: frozenset(c.missing) for c in self.description.cameras}
+
+    def path(self, what: Literal["color", "depth", "mask"], camera: str, frame: int) -> Path:
+        """The file of one image."""
+        ending = self.description.depth_format if what == "depth" else "png"
+        return self.folder / what / camera / f"{frame:05d}.{ending}"
+
+    def colour(self, camera: str, frame: int) -> np.ndarray:
+        """RGB [H, W, 3] uint8. Raises InputError."""
+        return _image(self.path("color", camera, frame), self.cameras[camera], cv2.IMREAD_COLOR)[..., ::-1]
+
+    def depth(self, camera: str, frame: int) -> np.ndarray:
+        """Depth [H, W], m, 0 where nothing was measured. Raises InputError."""
+        path, of = self.path("depth", camera, frame), self.cameras[camera]
+        values = _image(path, of, cv2.IMREAD_UNCHANGED) if path.suffix == ".png" else _array(path, of)
+        if values.dtype.kind == "f":
+            return np.where(np.isfinite(values), values, 0.0)
+        if values.dtype != np.uint16:
+            raise InputError(path, "depth must be 16-bit integers, or floating-point metres (npy)", values.dtype)
+        return values * self.description.depth_unit
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
+        path = self.path("mask", camera, frame)
+        labels = _image(path, self.cameras[camera], cv2.IMREAD_GRAYSCALE)
+        if labels.max() > HANDS:
+            raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
+        return labels
+
+    def tracks(self) -> np.ndarray:
+        """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
+        path = self.folder / TRACKS
+        if not path.exists():
+            return np.zeros((self.frame_count, 0, 3))
+        listed = _json(path)
+        try:
+            rows = [[[np.nan] * 3 if point is None else point for point in track] for track in listed]
+            tracks = np.array(rows, dtype=float).reshape(len(rows), -1, 3)
+        except (TypeError, ValueError) as error:
+            raise InputError(path, "a list of tracks of [x, y, z] or null is required", str(error)) from error
+        if len(rows) and tracks.shape[1] != self.frame_count:
+            raise InputError(path, f"every track needs {self.frame_count} entries", tracks.shape[1])
+        return np.swapaxes(tracks, 0, 1) if len(rows) else np.zeros((self.frame_count, 0, 3))
+
+
+class Writer:
+    """Writes a capture folder, image by image, capture.json last: a folder without it is not a capture."""
+
+    def __init__(self, folder: Path, description: Description) -> None:
+        self.capture = Capture(Path(folder), description)
+        (self.capture.folder / CAPTURE).unlink(missing_ok=True)
+
+    def frame(self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """RGB uint8 [H, W, 3], depth as stored [H, W], labels uint8 [H, W]."""
+        _write_png(self.capture.path("color", camera, frame), colour[..., ::-1])
+        path = self.capture.path("depth", camera, frame)
+        if path.suffix == ".png":
+            _write_png(path, depth)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.save(path, depth, allow_pickle=False)
+        if mask is not None:
+            self.mask(camera, frame, mask)
+
+    def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
+        """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""
+        _write_png(self.capture.path("mask", camera, frame), labels)
+
+    def finish(self, tracks: np.ndarray | None = None) -> Capture:
+        """Write tracks [T, K, 3], m, NaN where not annotated, and capture.json."""
+        folder = self.capture.folder
+        if tracks is not None:
+            listed = [
+                [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
+                for track in np.swapaxes(tracks, 0, 1)
+            ]
+            write_text(folder / TRACKS, json.dumps(listed) + "\n")
+        plain = TypeAdapter(Description).dump_python(self.capture.description, mode="json")
+        write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
+        return self.capture
+
+
+def read_description(path: Path) -> Description:
+    """capture.json, every key and type checked. Raises InputError that lists each problem."""
+    values = _json(path)
+    if not isinstance(values, dict):
+        raise InputError(path, "a JSON object is required", type(values).__name__)
+    return parse(Description, values, str(path))
+
+
+def description_departures(path: Path, description: Description) -> list[Departure]:
+    """What types cannot say: calibration, frame numbers, the split."""
+    found = []
+    names = [camera.name for camera in description.cameras]
+    if len(set(names)) < len(names):
+        found.append(broken(path, "cameras", "names must differ", names))
+    if description.train_end is not None and description.train_end > description.frame_count:
+        found.append(broken(path, "train_end", f"must be at most frame_count = {description.frame_count}", description.train_end))
+    for camera in description.cameras:
+        where = f"cameras.{camera.name}"
+        found += _calibration_departures(path, where, camera)
+        beyond = [frame for frame in camera.missing if frame >= description.frame_count]
+        if beyond:
+            found.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
+        if 0 in camera.missing:
+            found.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+    return found
+
+
+def _calibration_departures(path: Path, where: str, camera: CameraEntry) -> list[Departure]:
+    found = []
+    k = np.array(camera.intrinsics)
+    if not (k[0, 0] > 0 and k[1, 1] > 0 and k[0, 1] == 0 and np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])):
+        found.append(broken(path, f"{where}.intrinsics", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0", k.tolist()))
+    elif not (0 <= k[0, 2] < camera.width and 0 <= k[1, 2] < camera.height):
+        found.append(
+            broken(path, f"{where}.intrinsics", f"(cx, cy) must lie in the {camera.width} x {camera.height} image", k.tolist())
+        )
+    pose = np.array(camera.camera_to_world)
+    error = float(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max())
+    if error > RIGID_TOLERANCE or np.linalg.det(pose[:3, :3]) < 0:
+        rule = "the upper left 3 x 3 block must be a rotation (orthonormal, right-handed)"
+        found.append(
+            broken(path, f"{where}.camera_to_world", rule, f"a departure of {error:.3g} from R^T R = 1, or a mirror image")
+        )
+    if not np.array_equal(pose[3], [0, 0, 0, 1]):
+        found.append(broken(path, f"{where}.camera_to_world", "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
+    return found
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "this file must be readable", error.strerror) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "this file must be JSON", str(error)) from error
+
+
+def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:
+    if not path.is_file():
+        remedy = f"List the frame in cameras.{camera.name}.missing of {CAPTURE} if the camera does not have it."
+        raise InputError(path, "this image must exist", "no such file", remedy)
+    image = cv2.imread(str(path), flag)
+    if image is None:
+        raise InputError(path, "this file must be a readable PNG", "a damaged file")
+    _require_size(path, image, camera)
+    return image
+
+
+def _array(path: Path, camera: Camera) -> np.ndarray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
+    if array.ndim != 2:
+        raise InputError(path, "a depth image [H, W] is required", array.shape)
+    _require_size(path, array, camera)
+    return np.asarray(array)
+
+
+def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
+    if image.shape[:2] != (camera.height, camera.width):
+        rule = f"camera {camera.name} has images of {camera.width} x {camera.height}"
+        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to colour.")
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
+        raise InputError(path, "this file must be writable")

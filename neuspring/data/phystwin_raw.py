@@ -1,0 +1,166 @@
+"""PhysTwin's raw layout (`data/different_types/<case>/` before processing) -> a capture folder.
+
+Images are linked where the file system allows it, else copied; masks are put together from one image per detection.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuspring.config import ScenarioRow
+from neuspring.data import phystwin
+from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.departure import Departure, broken, refuse
+from neuspring.data.unpickle import load_pickle
+from neuspring.errors import InputError
+from neuspring.records import digest_file
+
+CALIBRATION = "calibrate.pkl"
+FILES = (phystwin.METADATA, CALIBRATION, phystwin.SPLIT, phystwin.TRACKS)
+"""All but images that the importer looks for in a case's folder."""
+HAND_PHRASE = "hand"
+"""The detected phrase of hands; the one other phrase of a camera is the object."""
+
+
+def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
+    """Write `case` as a capture folder. Raises InputError naming file and key."""
+    case = Path(case)
+    metadata, poses = phystwin.load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
+    refuse(raw_departures(case, metadata, poses))
+    width, height = metadata["WH"]
+    frames = int(metadata["frame_num"])
+    has_masks = (case / "mask").is_dir()
+    cameras = tuple(
+        CameraEntry(
+            name=str(index),
+            width=width,
+            height=height,
+            intrinsics=_rows(intrinsics),
+            camera_to_world=_rows(pose),
+        )
+        for index, (intrinsics, pose) in enumerate(zip(metadata["intrinsics"], poses, strict=True))
+    )
+    description = Description(
+        format=1,
+        name=row.scenario,
+        category=row.category,
+        frame_count=frames,
+        frame_rate=float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
+        cameras=cameras,
+        depth_unit=0.001,
+        depth_format="npy",
+        up="-z",
+        train_end=_train_end(case, frames),
+        masks=has_masks,
+        provenance={name: f"sha256:{digest_file(case / name)}" for name in (phystwin.METADATA, CALIBRATION)},
+    )
+    writer = Writer(folder, description)
+    capture = writer.capture
+    for camera in capture.cameras:
+        ids = _detections(case, camera) if has_masks else {}
+        for frame in range(frames):
+            _link(case / "color" / camera / f"{frame}.png", capture.path("color", camera, frame))
+            _link(case / "depth" / camera / f"{frame}.npy", capture.path("depth", camera, frame))
+            if has_masks:
+                writer.mask(camera, frame, _labels(case, camera, frame, ids, (height, width)))
+    return writer.finish(_tracks(case, frames))
+
+
+def camera_count(case: Path) -> int:
+    """How many cameras metadata.json declares. Raises InputError."""
+    path = Path(case) / phystwin.METADATA
+    metadata = phystwin.load_json(path)
+    intrinsics = metadata.get("intrinsics") if isinstance(metadata, dict) else None
+    if not isinstance(intrinsics, list) or not intrinsics:
+        raise InputError(path, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
+    return len(intrinsics)
+
+
+def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
+    """Keys and shapes of metadata.json and calibrate.pkl."""
+    path, calibration = case / phystwin.METADATA, case / CALIBRATION
+    if not isinstance(metadata, dict):
+        return [broken(path, "", "a JSON object is required", type(metadata).__name__)]
+    found = phystwin.frame_rate_departures(path, metadata)
+    size, count = metadata.get("WH"), metadata.get("frame_num")
+    if not (isinstance(size, list) and len(size) == 2 and all(type(v) is int and v > 0 for v in size)):
+        found.append(broken(path, "WH", "[width, height] in pixels is required", size))
+    if type(count) is not int or count < 5:
+        found.append(broken(path, "frame_num", "at least 5 frames are required", count))
+    intrinsics: Any = metadata.get("intrinsics")
+    if not isinstance(intrinsics, list) or any(np.shape(k) != (3, 3) for k in intrinsics):
+        found.append(broken(path, "intrinsics", "a list of 3 x 3 matrices is required", np.shape(intrinsics) or "nothing"))
+        intrinsics = []
+    if not isinstance(poses, list) or any(np.shape(pose) != (4, 4) for pose in poses):
+        found.append(broken(calibration, "", "a list of 4 x 4 camera-to-world matrices is required", type(poses).__name__))
+    elif len(poses) != len(intrinsics):
+        found.append(broken(calibration, "", f"{phystwin.METADATA} has {len(intrinsics)} cameras", f"{len(poses)} matrices"))
+    return found
+
+
+def _detections(case: Path, camera: str) -> dict[int, list[str]]:
+    """Label -> ids of the detections with it. Exactly one detection is not a hand."""
+    path = case / "mask" / f"mask_info_{camera}.json"
+    info = phystwin.load_json(path)
+    if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
+        raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
+    objects = [key for key, phrase in info.items() if phrase != HAND_PHRASE]
+    if len(objects) != 1:
+        rule = f"exactly one detection must not be {HAND_PHRASE!r}: the object"
+        raise InputError(path, rule, info, "Remove the others from this file, or give them the phrase 'hand'.")
+    return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
+
+
+def _labels(case: Path, camera: str, frame: int, ids: dict[int, list[str]], size: tuple[int, int]) -> np.ndarray:
+    labels = np.zeros(size, dtype=np.uint8)
+    for label, names in sorted(ids.items()):
+        for name in names:
+            path = case / "mask" / camera / name / f"{frame}.png"
+            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if mask is None:
+                raise InputError(
+                    path, "this mask must be a readable PNG", "no such file" if not path.exists() else "a damaged file"
+                )
+            if mask.shape != size:
+                raise InputError(path, f"masks have the size of the images, {size[1]} x {size[0]}", mask.shape[::-1])
+            labels[mask > 0] = label
+    return labels
+
+
+def _tracks(case: Path, frames: int) -> np.ndarray | None:
+    path = case / phystwin.TRACKS
+    if not path.exists():
+        return None
+    tracks = load_pickle(path)
+    refuse(phystwin.tracks_departures(path, tracks, frames))
+    return np.asarray(tracks, dtype=float)
+
+
+def _train_end(case: Path, frames: int) -> int | None:
+    path = case / phystwin.SPLIT
+    if not path.exists():
+        return None
+    split = phystwin.load_json(path)
+    refuse(phystwin.split_departures(path, split, frames))
+    return int(split["train"][1])
+
+
+def _rows(matrix: Any) -> Any:
+    return tuple(tuple(float(value) for value in row) for row in np.asarray(matrix))
+
+
+def _link(source: Path, target: Path) -> None:
+    if not source.is_file():
+        raise InputError(source, "this image must exist", "no such file")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

@@ -1,0 +1,351 @@
+"""Explicit finite elements (Newton's semi-implicit solver) with hands: the motion that synthetic captures show.
+
+Its numerics have nothing in common with the spring-mass simulator of the twins: stable neo-Hookean tetrahedra, membranes with
+hinge bending, penalty contacts. Substeps follow from the largest eigenvalue of the engine's own forces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import newton
+import numpy as np
+import warp as wp
+
+from neuspring.data.synthetic import fem_kernels as kernels
+from neuspring.data.synthetic.body import Body
+from neuspring.data.synthetic.fem_model import GRAVITY, build, lame
+from neuspring.data.synthetic.hands import Hand
+from neuspring.data.synthetic.tetrahedra import edges, volumes
+from neuspring.errors import NumericalFailure
+
+SAFETY = 0.6
+"""Fraction of the critical step."""
+COLLIDE_EVERY = 5
+"""Substeps between searches for contacts, whose margin covers what happens between."""
+DAMP_EVERY = 4
+"""Substeps between dampings of the deformation, a slow process."""
+CONTACT_MARGIN = 0.02
+"""m."""
+POWER_ITERATIONS = 60
+NUDGE = 1e-6
+"""m, standard deviation per coordinate: the rounding of single precision over a few substeps."""
+ESCAPED = 5.0
+"""m; further from the origin a clip counts as diverged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damping:
+    """Numerical damping beside the material's."""
+
+    deformation: float = 2.0
+    """1/s, of motion relative to the best rigid motion."""
+    drag: float = 0.1
+    """1/s, of all motion."""
+    edges: float = 0.35
+    """Dashpots on the edges of tetrahedra, in parts of what the time step allows: they end the ringing of single elements."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A simulated motion."""
+
+    positions: np.ndarray
+    """Nodes [T, N, 3], m; frame 0 is the start."""
+    kinetic: np.ndarray
+    """[T], J."""
+    potential: np.ndarray
+    """[T], J."""
+    least_jacobian: np.ndarray
+    """[T] smallest det F of a tetrahedron; 1 for sheets."""
+    most_stretch: np.ndarray
+    """[T] largest ratio of an edge to its rest length."""
+    substeps: int
+
+
+class FiniteElements:
+    """A body with its hands, from `start` (rest shape where None), on one core.
+
+    `substeps` None: as many as the critical step asks for, an even number. `holder` None: a hand holds the nodes in its reach.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        hands: Sequence[Hand],
+        frames: int,
+        frame_rate: float,
+        damping: Damping,
+        start: np.ndarray | None = None,
+        substeps: int | None = None,
+        holder: np.ndarray | None = None,
+    ) -> None:
+        self.body, self.hands, self.frames, self.frame_rate, self.damping = body, tuple(hands), frames, frame_rate, damping
+        self.start = body.nodes if start is None else start
+        fists = [index for index, hand in enumerate(hands) if hand.kind == "fist"]
+        # The engine declares every array of models and states as possibly missing; ours are not.
+        self.model: Any = self._build(len(fists))
+        self.volumes = volumes(body.nodes, body.tetrahedra)
+        self.mass: np.ndarray = self.model.particle_mass.numpy().astype(float)  # type: ignore[union-attr]
+        self.solver = self._solver()
+        self.pipeline = newton.CollisionPipeline(self.model, soft_contact_gap=CONTACT_MARGIN)
+        self.contacts = self.pipeline.contacts()
+        self.control = self.model.control()
+        self.now: Any = self.model.state()
+        self.next: Any = self.model.state()
+        self._maxwell = self._maxwell_state()
+        self.substeps = self._choose_substeps(substeps)
+        self._hold(fists, holder)
+        self._graph: wp.Graph | None = None
+
+    @property
+    def substep(self) -> float:
+        """s."""
+        return 1.0 / (self.frame_rate * self.substeps)
+
+    def again(self, frames: int, start: np.ndarray, substeps: int) -> Self:
+        """The same body and hands anew; they hold the same nodes, whatever the start."""
+        return type(self)(self.body, self.hands, frames, self.frame_rate, self.damping, start, substeps, self.holder)
+
+    def run(self) -> Clip:
+        """Simulate all frames. Raises NumericalFailure if nodes escape or become infinite."""
+        found = [self._measure(self.start)]
+        for frame in range(1, self.frames):
+            self._frame()
+            position = self.now.particle_q.numpy()
+            if not np.isfinite(position).all() or np.abs(position).max() > ESCAPED:
+                raise NumericalFailure(f"the finite-element clip diverged in frame {frame} with {self.substeps} substeps per frame")
+            found.append(self._measure(position))
+        names = ("positions", "kinetic", "potential", "least_jacobian", "most_stretch")
+        arrays = {name: np.array([row[k] for row in found]) for k, name in enumerate(names)}
+        return Clip(**arrays, substeps=self.substeps)
+
+    def velocities(self) -> np.ndarray:
+        """Of the last frame [N, 3], m/s."""
+        return np.asarray(self.now.particle_qd.numpy())
+
+    def _build(self, fists: int) -> newton.Model:
+        return build(self.body, fists)
+
+    def _solver(self) -> newton.solvers.SolverBase:
+        return newton.solvers.SolverSemiImplicit(self.model, enable_tri_contact=False)
+
+    def _choose_substeps(self, wished: int | None) -> int:
+        step, dashpot = self._critical_step()
+        self._set_dashpots(dashpot)
+        return wished or max(2 * int(np.ceil(1.0 / (self.frame_rate * step) / 2)), 2)
+
+    def _maxwell_state(self) -> list[wp.array] | None:
+        """Tetrahedra, inverse rest shapes, volumes, moduli, strain and stress of the Maxwell branch."""
+        body = self.body
+        share = body.viscosity[0]
+        if body.is_sheet or not share:
+            return None
+        rest, deformed = (_spans(positions, body.tetrahedra) for positions in (body.nodes, self.start))
+        inverse = np.linalg.inv(rest)
+        gradient = deformed @ inverse
+        strain = 0.5 * (np.swapaxes(gradient, 1, 2) @ gradient - np.eye(3))
+        mu, first = lame(share * body.youngs_modulus, body.poisson_ratio)
+        return [
+            wp.array(body.tetrahedra, dtype=wp.int32, device="cpu"),
+            wp.array(inverse, dtype=wp.mat33, device="cpu"),
+            *(wp.array(values, dtype=wp.float32, device="cpu") for values in (self.volumes, mu, first)),
+            wp.array(strain, dtype=wp.mat33, device="cpu"),
+            wp.zeros(len(body.tetrahedra), dtype=wp.mat33, device="cpu"),
+        ]
+
+    def _hold(self, fists: list[int], known: np.ndarray | None) -> None:
+        """Place the hands, and give them the nodes that they grip in frame 0."""
+        hands = self.hands
+        times = np.arange((self.frames - 1) * self.substeps + 2) * self.substep
+        poses = np.stack([hand.poses(times) for hand in hands]) if hands else np.zeros((1, len(times), 7))
+        holder, local = np.full(len(self.start), -1, dtype=np.int32), np.zeros((len(self.start), 3))
+        for index, hand in enumerate(hands):
+            # Keys are turns from frame 0, in which a hand's frame has the world's axes.
+            assert not np.any(hand.keys[0][2]), "a hand must start unturned"
+            offset = self.start - poses[index, 0, :3]
+            if hand.kind == "grip":
+                within = np.linalg.norm(offset, axis=1) < hand.reach
+                held = (within & (holder < 0)) if known is None else known == index
+                assert held.any(), "a hand must hold something"
+                holder[held], local[held] = index, offset[held]
+        self.holder = holder
+        inverse = np.where((self.mass > 0) & (holder < 0), 1.0 / np.maximum(self.mass, 1e-12), 0.0)
+        self.model.particle_inv_mass.assign(inverse.astype(np.float32))
+        for state in (self.now, self.next):
+            state.particle_q.assign(self.start.astype(np.float32))
+        self._poses: wp.array = wp.array(poses, dtype=wp.transform, device="cpu")
+        self._holder: wp.array = wp.array(holder, dtype=wp.int32, device="cpu")
+        self._local: wp.array = wp.array(local, dtype=wp.vec3, device="cpu")
+        self._fists: wp.array = wp.array(np.array(fists, dtype=np.int32), dtype=wp.int32, device="cpu")
+        self._step = wp.zeros(1, dtype=wp.int32, device="cpu")
+        self._sums = wp.zeros(16, dtype=wp.float32, device="cpu")
+
+    def _frame(self) -> None:
+        """One frame; the first compiles, the second is recorded, the others replay the record."""
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        if int(self._step.numpy()[0]):
+            with wp.ScopedCapture(device="cpu") as capture:
+                self._substeps()
+            self._graph = capture.graph
+            wp.capture_launch(self._graph)
+            return
+        self._substeps()
+
+    def _substeps(self) -> None:
+        model, dt, contacts = self.model, self.substep, self.contacts
+        for k in range(self.substeps):
+            now, following = self.now, self.next
+            now.clear_forces()
+            held = [self._step, self._poses, self._holder, self._local, dt, now.particle_q, now.particle_qd]
+            wp.launch(kernels.drive_nodes, model.particle_count, held, device="cpu")
+            if len(self._fists):
+                pushed = [self._step, self._poses, self._fists, dt, now.body_q, now.body_qd]
+                wp.launch(kernels.drive_bodies, len(self._fists), pushed, device="cpu")
+            self._add_maxwell(now, float(np.exp(-dt / self.body.viscosity[1])))
+            if k % COLLIDE_EVERY == 0:
+                self.pipeline.collide(now, contacts)
+            self.solver.step(now, following, self.control, contacts, dt)
+            self._rub(now, following, dt)
+            if k % DAMP_EVERY == 0:
+                self._damp(following, DAMP_EVERY * dt)
+            wp.launch(kernels.advance, 1, [self._step], device="cpu")
+            self.now, self.next = following, now
+
+    def _add_maxwell(self, state: newton.State, decay: float) -> None:
+        if self._maxwell is None:
+            return
+        *fixed, strain, stress = self._maxwell
+        arguments = [*fixed, decay, state.particle_q, strain, stress, state.particle_f]
+        wp.launch(kernels.maxwell, len(self.body.tetrahedra), arguments, device="cpu")
+
+    def _rub(self, before: newton.State, after: newton.State, dt: float) -> None:
+        found, model = self.contacts, self.model
+        arguments = [
+            *(found.soft_contact_count, found.soft_contact_particle, found.soft_contact_shape),
+            *(found.soft_contact_body_pos, found.soft_contact_normal, model.shape_body),
+            *(self.body.friction, self.body.contact_stiffness, before.body_q, before.body_qd),
+            *(model.particle_radius, model.particle_inv_mass, before.particle_q, dt, after.particle_q, after.particle_qd),
+        ]
+        wp.launch(kernels.coulomb, found.soft_contact_max, arguments, device="cpu")
+
+    def _damp(self, state: newton.State, dt: float) -> None:
+        self._sums.zero_()
+        count, model = self.model.particle_count, self.model
+        wp.launch(kernels.moments, count, [state.particle_q, state.particle_qd, model.particle_mass, self._sums], device="cpu")
+        rates = [self.damping.deformation, self.damping.drag, dt]
+        arguments = [state.particle_q, model.particle_inv_mass, self._sums, *rates, state.particle_qd]
+        wp.launch(kernels.damp_deformation, count, arguments, device="cpu")
+
+    def _measure(self, positions: np.ndarray) -> tuple[np.ndarray, float, float, float, float]:
+        """Positions, kinetic and potential energy, smallest Jacobian, largest stretch."""
+        body, x = self.body, np.asarray(positions, dtype=float)
+        speed = self.now.particle_qd.numpy().astype(float)
+        kinetic = 0.5 * float((self.mass[:, None] * speed**2).sum())
+        potential = GRAVITY * float((self.mass * x[:, 2]).sum())
+        jacobian = 1.0
+        if not body.is_sheet:
+            jacobian = float((volumes(x, body.tetrahedra) / self.volumes).min())
+        lines = edges(body.triangles if body.is_sheet else body.tetrahedra)
+        length = np.linalg.norm(x[lines[:, 0]] - x[lines[:, 1]], axis=1)
+        rest = np.linalg.norm(body.nodes[lines[:, 0]] - body.nodes[lines[:, 1]], axis=1)
+        return positions.copy(), kinetic, potential, jacobian, float((length / rest).max())
+
+    def _critical_step(self) -> tuple[float, float]:
+        """SAFETY times the largest stable step, s, and the dashpot of every edge, N s/m, that goes with it.
+
+        Symplectic Euler is stable for dt < (-c + sqrt(c^2 + 4 w^2)) / w^2, w^2 the largest eigenvalue of M^-1 K and c that of
+        M^-1 C, both by power iteration on the engine's forces.
+        """
+        frequency = np.sqrt(self._largest("position"))
+        if self.body.is_sheet or not self.damping.edges:
+            damping = self._largest("velocity")
+            return SAFETY * _stable(frequency, damping), 0.0
+        unit = 1e-3
+        self._set_dashpots(unit)
+        per_dashpot = self._largest("velocity") / unit
+        step = SAFETY * _stable(frequency, 0.0)
+        for _ in range(20):
+            dashpot = self.damping.edges / step / per_dashpot
+            step = min(step, SAFETY * _stable(frequency, per_dashpot * dashpot))
+        return step, dashpot
+
+    def _set_dashpots(self, value: float) -> None:
+        if self.model.spring_count:
+            self.model.spring_damping.fill_(value)
+
+    def _largest(self, of: str) -> float:
+        """Largest eigenvalue of M^-1 K (`of` position) or M^-1 C (velocity) at rest."""
+        rest = self.body.nodes
+        still = np.zeros_like(rest)
+        base = self._acceleration(rest, still)
+        direction = np.random.default_rng(0).normal(size=rest.shape)
+        value = 0.0
+        for _ in range(POWER_ITERATIONS):
+            step = (1e-5 if of == "position" else 1e-2) * direction / np.abs(direction).max()
+            moved = self._acceleration(rest + step, still) if of == "position" else self._acceleration(rest, step)
+            response = base - moved
+            value = float(np.linalg.norm(response) / np.linalg.norm(step))
+            if value == 0.0:
+                return 0.0
+            direction = response / np.linalg.norm(response)
+        return value
+
+    def _acceleration(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+        """[N, 3], m/s^2: the change of velocity over one engine step of one second without contacts."""
+        state, after = self.now, self.next
+        state.particle_q.assign(positions.astype(np.float32))
+        state.particle_qd.assign(velocities.astype(np.float32))
+        state.clear_forces()
+        if self._maxwell is not None:
+            # An instantaneous change of strain loads the branch like a spring of its modulus.
+            *fixed, strain, stress = self._maxwell
+            arguments = [*fixed, 1.0, state.particle_q, wp.zeros_like(strain), wp.zeros_like(stress), state.particle_f]
+            wp.launch(kernels.maxwell, len(self.body.tetrahedra), arguments, device="cpu")
+        limit, grid = self.model.particle_max_velocity, self.model.particle_grid
+        self.model.particle_max_velocity, self.model.particle_grid = np.inf, None
+        self.solver.step(state, after, self.control, None, 1.0)
+        self.model.particle_max_velocity, self.model.particle_grid = limit, grid
+        change = after.particle_qd.numpy().astype(float) - velocities
+        for used in (state, after):
+            used.particle_qd.zero_()
+        return np.asarray(change)
+
+
+def settle(body: Body, frame_rate: float, seconds: float = 4.0, still: float = 0.01) -> np.ndarray:
+    """Node positions [N, 3], m, of the body lying on the table: dropped with strong drag until no node moves faster than `still`,
+    m/s, at most `seconds`."""
+    position, frames = body.nodes, max(int(0.5 * frame_rate), 2)
+    for _ in range(int(np.ceil(2 * seconds))):
+        engine = FiniteElements(body, (), frames, frame_rate, Damping(deformation=8.0, drag=4.0), start=position)
+        position = engine.run().positions[-1]
+        if np.abs(engine.velocities()).max() < still:
+            break
+    return position
+
+
+def certify(engine: FiniteElements, clip: Clip, frames: int) -> tuple[float, float]:
+    """How far, m, the mean node of the first `frames` frames of the `engine`'s clip moves (largest of all frames) with twice the
+    substeps, and with a start that is NUDGE off.
+
+    A cloth that wrinkles multiplies any difference: there the second figure, not zero, is what the first has to be compared with.
+    """
+    frames = min(frames, len(clip.positions))
+    nudged = engine.start + NUDGE * np.random.default_rng(0).normal(size=engine.start.shape)
+    trials = (engine.again(frames, engine.start, 2 * clip.substeps), engine.again(frames, nudged, clip.substeps))
+    moved = [np.linalg.norm(e.run().positions - clip.positions[:frames], axis=2).mean(axis=1).max() for e in trials]
+    return float(moved[0]), float(moved[1])
+
+
+def _spans(positions: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Edge matrices [E, 3, 3]: columns from corner 0 to the others."""
+    corners = positions[tetrahedra]
+    return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+
+def _stable(frequency: float, damping: float) -> float:
+    return float((-damping + np.sqrt(damping**2 + 4.0 * frequency**2)) / frequency**2)

@@ -1,0 +1,191 @@
+"""Warp kernels that the finite-element engine lacks: driven nodes and fists, a Maxwell branch, Coulomb friction, damping of
+deformation. None of them carries stiffness; elasticity, bending, normal contact and integration are the engine's."""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def drive_nodes(
+    step: wp.array[int],
+    poses: wp.array2d[wp.transform],
+    holder: wp.array[int],
+    local: wp.array[wp.vec3],
+    dt: float,
+    position: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+):
+    """Held nodes (inverse mass 0) lie where their hand is and get its finite-difference velocity, with which the engine moves
+    them."""
+    i = wp.tid()
+    hand = holder[i]
+    if hand < 0:
+        return
+    here = wp.transform_point(poses[hand, step[0]], local[i])
+    there = wp.transform_point(poses[hand, step[0] + 1], local[i])
+    position[i] = here
+    velocity[i] = (there - here) / dt
+
+
+@wp.kernel(enable_backward=False)
+def drive_bodies(
+    step: wp.array[int],
+    poses: wp.array2d[wp.transform],
+    hand_of_body: wp.array[int],
+    dt: float,
+    pose: wp.array[wp.transform],
+    twist: wp.array[wp.spatial_vector],
+):
+    """Kinematic fists: pose of the hand, and the linear and angular velocity that takes it to the next step's."""
+    body = wp.tid()
+    here = poses[hand_of_body[body], step[0]]
+    there = poses[hand_of_body[body], step[0] + 1]
+    pose[body] = here
+    turn = wp.transform_get_rotation(there) * wp.quat_inverse(wp.transform_get_rotation(here))
+    side = wp.where(turn[3] < 0.0, -1.0, 1.0)
+    spin = wp.vec3(turn[0], turn[1], turn[2]) * (2.0 * side / dt)
+    twist[body] = wp.spatial_vector((wp.transform_get_translation(there) - wp.transform_get_translation(here)) / dt, spin)
+
+
+@wp.kernel(enable_backward=False)
+def advance(step: wp.array[int]):
+    """Count one time step."""
+    step[0] = step[0] + 1
+
+
+@wp.kernel(enable_backward=False)
+def maxwell(
+    tetrahedra: wp.array2d[int],
+    inverse_rest: wp.array[wp.mat33],
+    volume: wp.array[float],
+    mu: wp.array[float],
+    lame: wp.array[float],
+    decay: float,
+    position: wp.array[wp.vec3],
+    strain: wp.array[wp.mat33],
+    stress: wp.array[wp.mat33],
+    force: wp.array[wp.vec3],
+):
+    """dS/dt = 2 mu dE/dt + lambda tr(dE/dt) I - S / tau, E the Green strain, P = F S: damping that leaves rigid motion alone."""
+    t = wp.tid()
+    a = tetrahedra[t, 0]
+    b = tetrahedra[t, 1]
+    c = tetrahedra[t, 2]
+    d = tetrahedra[t, 3]
+    origin = position[a]
+    gradient = wp.matrix_from_cols(position[b] - origin, position[c] - origin, position[d] - origin) * inverse_rest[t]
+    green = (wp.transpose(gradient) * gradient - wp.identity(n=3, dtype=float)) * 0.5
+    change = green - strain[t]
+    now = stress[t] * decay + change * (2.0 * mu[t]) + wp.identity(n=3, dtype=float) * (lame[t] * wp.trace(change))
+    strain[t] = green
+    stress[t] = now
+    h = (gradient * now) * wp.transpose(inverse_rest[t]) * volume[t]
+    on_b = wp.vec3(h[0, 0], h[1, 0], h[2, 0])
+    on_c = wp.vec3(h[0, 1], h[1, 1], h[2, 1])
+    on_d = wp.vec3(h[0, 2], h[1, 2], h[2, 2])
+    wp.atomic_sub(force, b, on_b)
+    wp.atomic_sub(force, c, on_c)
+    wp.atomic_sub(force, d, on_d)
+    wp.atomic_add(force, a, on_b + on_c + on_d)
+
+
+@wp.kernel(enable_backward=False)
+def coulomb(
+    count: wp.array[int],
+    node: wp.array[int],
+    shape: wp.array[int],
+    on_body: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    shape_body: wp.array[int],
+    friction: float,
+    stiffness: float,
+    body_pose: wp.array[wp.transform],
+    body_twist: wp.array[wp.spatial_vector],
+    radius: wp.array[float],
+    inverse_mass: wp.array[float],
+    before: wp.array[wp.vec3],
+    dt: float,
+    position: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+):
+    """Take from the tangential velocity at most mu f_n dt / m, f_n = k depth: sticks without creeping, whatever the time step.
+
+    The engine's own friction is viscous and explodes for stiff settings; it is switched off.
+    """
+    t = wp.tid()
+    if t >= count[0]:
+        return
+    i = node[t]
+    if inverse_mass[i] == 0.0:
+        return
+    body = shape_body[shape[t]]
+    point = on_body[t]
+    surface_velocity = wp.vec3()
+    if body >= 0:
+        point = wp.transform_point(body_pose[body], on_body[t])
+        lever = point - wp.transform_get_translation(body_pose[body])
+        surface_velocity = wp.spatial_top(body_twist[body]) + wp.cross(wp.spatial_bottom(body_twist[body]), lever)
+    depth = radius[i] - wp.dot(normal[t], before[i] - point)
+    if depth <= 0.0:
+        return
+    relative = velocity[i] - surface_velocity
+    tangential = relative - normal[t] * wp.dot(normal[t], relative)
+    speed = wp.length(tangential)
+    if speed < 1.0e-9:
+        return
+    change = -tangential * (wp.min(speed, friction * stiffness * depth * inverse_mass[i] * dt) / speed)
+    velocity[i] = velocity[i] + change
+    position[i] = position[i] + change * dt
+
+
+@wp.kernel(enable_backward=False)
+def moments(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], mass: wp.array[float], sums: wp.array[float]):
+    """Mass, first moments, momentum, angular momentum about the origin, second moments."""
+    i = wp.tid()
+    m = mass[i]
+    x = position[i]
+    v = velocity[i]
+    spin = wp.cross(x, v)
+    wp.atomic_add(sums, 0, m)
+    for k in range(3):
+        wp.atomic_add(sums, 1 + k, m * x[k])
+        wp.atomic_add(sums, 4 + k, m * v[k])
+        wp.atomic_add(sums, 7 + k, m * spin[k])
+    wp.atomic_add(sums, 10, m * x[0] * x[0])
+    wp.atomic_add(sums, 11, m * x[1] * x[1])
+    wp.atomic_add(sums, 12, m * x[2] * x[2])
+    wp.atomic_add(sums, 13, m * x[0] * x[1])
+    wp.atomic_add(sums, 14, m * x[0] * x[2])
+    wp.atomic_add(sums, 15, m * x[1] * x[2])
+
+
+@wp.kernel(enable_backward=False)
+def damp_deformation(
+    position: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    sums: wp.array[float],
+    rate: float,
+    drag: float,
+    dt: float,
+    velocity: wp.array[wp.vec3],
+):
+    """v -= rate dt (v - v_rigid) + drag dt v, v_rigid the rigid motion of least squares."""
+    i = wp.tid()
+    if inverse_mass[i] == 0.0:
+        return
+    m = sums[0]
+    centre = wp.vec3(sums[1], sums[2], sums[3]) / m
+    mean = wp.vec3(sums[4], sums[5], sums[6]) / m
+    spin = wp.vec3(sums[7], sums[8], sums[9]) - m * wp.cross(centre, mean)
+    xx = sums[10] - m * centre[0] * centre[0]
+    yy = sums[11] - m * centre[1] * centre[1]
+    zz = sums[12] - m * centre[2] * centre[2]
+    xy = sums[13] - m * centre[0] * centre[1]
+    xz = sums[14] - m * centre[0] * centre[2]
+    yz = sums[15] - m * centre[1] * centre[2]
+    # A straight rope has no moment of inertia about itself.
+    least = 1.0e-3 * (xx + yy + zz)
+    inertia = wp.mat33(yy + zz + least, -xy, -xz, -xy, xx + zz + least, -yz, -xz, -yz, xx + yy + least)
+    rigid = mean + wp.cross(wp.inverse(inertia) * spin, position[i] - centre)
+    velocity[i] = velocity[i] - (velocity[i] - rigid) * (rate * dt) - velocity[i] * (drag * dt)

@@ -1,0 +1,237 @@
+"""A scene -> a capture folder and its truth: settle, simulate, certify, place cameras, render, pass through the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.config import ScenarioRow
+from neuspring.config_perception import Synthetic
+from neuspring.data.capture import Camera, CameraEntry, Capture, Description, Writer
+from neuspring.data.synthetic.body import Body
+from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, certify, settle
+from neuspring.data.synthetic.hands import SKIN, Hand, place
+from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
+from neuspring.data.synthetic.scenes import SCENES
+from neuspring.data.synthetic.sensor import measured, quantised
+from neuspring.data.synthetic.truth import Truth
+from neuspring.data.synthetic.vbd import VertexBlockDescent
+from neuspring.errors import InputError, NumericalFailure
+from neuspring.progress import Progress
+
+FRAME_RATE = 30.0
+DEPTH_UNIT = 0.001
+"""m, as the cameras of the PhysTwin data."""
+FIELD_OF_VIEW = 55.0
+"""Degrees, along the width."""
+AZIMUTHS = (-35.0, 85.0, 205.0)
+"""Degrees, of the cameras around the object; the first looks at its head."""
+ELEVATION = 38.0
+MARGIN = 0.9
+"""Part of the image that object and hands' origins stay in, from its centre."""
+ANNOTATED = 40
+"""Tracks for scoring."""
+LEAST_JACOBIAN, SHARE = 0.02, 0.1
+"""A clip is refused if an element falls below this volume ratio in more than this share of frames."""
+ENGINES = {"": FiniteElements, "vbd": VertexBlockDescent}
+MOST_DEVIATION = 0.001
+"""m; a clip is refused if twice the substeps move the mean node further, ..."""
+CHAOS = 3.0
+"""... unless a nudge of the start does the same, within this factor: then the motion is chaotic, not the time step too long."""
+CERTIFIED_FRAMES = 20
+GRAINS = {"cloth": (45.0, 0.5), "rope": (70.0, 0.5), "package": (35.0, 0.5)}
+"""Frequency, 1/m, and contrast of the fine texture by category."""
+PLUSH_GRAIN, HAND_GRAIN = (32.0, 0.7), (45.0, 0.6)
+
+
+@dataclass(frozen=True)
+class Size:
+    """Images and meshes."""
+
+    width: int
+    height: int
+    mesh: float
+    """Spacing of finite-element nodes of a plush animal, m; other bodies scale it."""
+    skin: float
+    """Spacing of visible vertices, m."""
+
+
+SIZES = {"tiny": Size(120, 68, 0.02, 0.008), "demo": Size(424, 240, 0.014, 0.004), "full": Size(848, 480, 0.014, 0.003)}
+
+
+def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, Truth]:
+    """Write the capture of scene `row.path` to `folder`; returns it with its truth. Deterministic in the settings' seed.
+
+    Raises InputError for an unknown scene, NumericalFailure for a clip that must not be shipped.
+    """
+    engine_name, _, name = row.path.rpartition("/")
+    if name not in SCENES or engine_name not in ENGINES:
+        rule = f"must be a scene, or vbd/<scene> for the held-out engine; scenes: {sorted(SCENES)}"
+        raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
+    scene, size = SCENES[name], SIZES[settings.size]
+    body = scene.body(size.mesh, size.skin)
+    frames = min(settings.frames or scene.frames, scene.frames)
+    start = settle(body, FRAME_RATE)
+    hands = scene.hands(start, scene.frames / FRAME_RATE)
+    if engine_name and (body.is_sheet or any(hand.kind == "fist" for hand in hands)):
+        rule = "the held-out engine has solids that hands grip, no cloths and no pushes"
+        raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
+    engine = ENGINES[engine_name](body, hands, frames, FRAME_RATE, Damping(), start=start)
+    clip = engine.run()
+    truth = _truth(body, hands, clip, engine.holder, certify(engine, clip, CERTIFIED_FRAMES))
+    _refuse(row.scenario, truth)
+    cameras = place_cameras(body, clip, hands, size, settings.cameras)
+    description = Description(
+        format=1,
+        name=row.scenario,
+        category=row.category,
+        frame_count=frames,
+        frame_rate=FRAME_RATE,
+        cameras=tuple(_entry(camera) for camera in cameras),
+        depth_unit=DEPTH_UNIT,
+        masks=True,
+        provenance={
+            "scene": name,
+            "engine": engine_name or "semi-implicit",
+            "size": settings.size,
+            "sensor": settings.sensor,
+            "seed": str(settings.seed),
+        },
+    )
+    writer = Writer(folder, description)
+    _film(writer, body, clip, hands, cameras, row, settings, size)
+    return writer.finish(_annotate(truth, cameras[0], writer.capture)), truth
+
+
+def _truth(body: Body, hands: Sequence[Hand], clip: Clip, held: np.ndarray, deviations: tuple[float, float]) -> Truth:
+    times = np.arange(len(clip.positions)) / FRAME_RATE
+    return Truth(
+        nodes=clip.positions,
+        tetrahedra=body.tetrahedra,
+        triangles=body.triangles,
+        youngs_modulus=body.youngs_modulus,
+        membrane=body.membrane,
+        surface_nodes=body.surface.nodes,
+        surface_weights=body.surface.weights,
+        surface_faces=body.surface.faces,
+        hand_poses=np.stack([hand.poses(times) for hand in hands], axis=1),
+        held=held,
+        touches=clip.positions[..., 2] < body.radius + 5e-4,
+        kinetic=clip.kinetic,
+        potential=clip.potential,
+        least_jacobian=clip.least_jacobian,
+        substeps=clip.substeps,
+        certificate=deviations[0],
+        sensitivity=deviations[1],
+    )
+
+
+def _refuse(name: str, truth: Truth) -> None:
+    crushed = float((truth.least_jacobian < LEAST_JACOBIAN).mean())
+    if crushed > SHARE:
+        raise NumericalFailure(f"{name}: an element is crushed (det F < {LEAST_JACOBIAN}) in {crushed:.0%} of the frames")
+    if truth.certificate > max(MOST_DEVIATION, CHAOS * truth.sensitivity):
+        found = f"{1e3 * truth.certificate:.2f} mm, a start that is 1 um off by {1e3 * truth.sensitivity:.2f} mm"
+        raise NumericalFailure(f"{name}: twice the substeps move the mean node by {found}; not converged")
+
+
+def place_cameras(body: Body, clip: Clip, hands: Sequence[Hand], size: Size, count: int) -> list[Camera]:
+    """Cameras around the object, as near as the motion of object and hands allows, so that they fill the image."""
+    focal = 0.5 * size.width / np.tan(np.radians(FIELD_OF_VIEW / 2))
+    k = np.array([[focal, 0.0, (size.width - 1) / 2], [0.0, focal, (size.height - 1) / 2], [0.0, 0.0, 1.0]])
+    times = np.arange(len(clip.positions)) / FRAME_RATE
+    seen = [clip.positions[::5, ::7].reshape(-1, 3), *(hand.poses(times)[:, :3] for hand in hands)]
+    points = np.concatenate(seen)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    cameras = []
+    for index, azimuth in enumerate(np.radians(AZIMUTHS[:count])):
+        up = np.radians(ELEVATION)
+        away = np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
+        distance = 0.35
+        while True:
+            camera = Camera(str(index), size.width, size.height, k, looking(middle + distance * away, middle))
+            pixels, depth = camera.project(points)
+            off = np.abs(pixels / k[:2, 2] - 1.0).max()
+            if (depth > 0.1).all() and off < MARGIN:
+                break
+            distance += 0.02
+        cameras.append(camera)
+    return cameras
+
+
+def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera-to-world [4, 4]: z towards the target, y down."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return pose
+
+
+def _entry(camera: Camera) -> CameraEntry:
+    rows = [tuple(tuple(float(v) for v in row) for row in m) for m in (camera.intrinsics, camera.camera_to_world)]
+    return CameraEntry(
+        name=camera.name,
+        width=camera.width,
+        height=camera.height,
+        intrinsics=rows[0],  # type: ignore[arg-type]
+        camera_to_world=rows[1],  # type: ignore[arg-type]
+    )
+
+
+def _film(
+    writer: Writer,
+    body: Body,
+    clip: Clip,
+    hands: Sequence[Hand],
+    cameras: Sequence[Camera],
+    row: ScenarioRow,
+    settings: Synthetic,
+    size: Size,
+) -> None:
+    frames = len(clip.positions)
+    times = np.arange(frames) / FRAME_RATE
+    meshes = [hand.mesh(1.5 * size.skin) for hand in hands]
+    placed = [place(vertices, hand.poses(times)) for hand, (vertices, _) in zip(hands, meshes, strict=True)]
+    skin = body.surface
+    parts = [Part(skin.rest, skin.faces, skin.colours, OBJECT, GRAINS.get(row.category, PLUSH_GRAIN))]
+    parts += [Part(vertices, faces, np.tile(SKIN, (len(vertices), 1)), HAND, HAND_GRAIN) for vertices, faces in meshes]
+    renderer = Renderer(parts)
+    surfaces = skin.follow(clip.positions)
+    report = Progress(f"render {row.scenario}", frames)
+    for frame in range(frames):
+        renderer.move([surfaces[frame], *(hand[frame] for hand in placed)])
+        for index, camera in enumerate(cameras):
+            view = renderer.render(camera)
+            rng = np.random.default_rng([settings.seed, index, frame, *row.scenario.encode()])
+            if settings.sensor == "clean":
+                depth = quantised(view.depth, DEPTH_UNIT)
+            else:
+                depth = measured(view.depth, view.slope, DEPTH_UNIT, rng)
+            writer.frame(camera.name, frame, view.colour, depth, view.label)
+        report.update(frame + 1)
+
+
+def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
+    """Tracks [T, K, 3], m, of vertices that the first camera sees in frame 0, spread over what it sees."""
+    vertices = truth.surface(0)
+    pixels, depth = camera.project(vertices)
+    inside = np.flatnonzero(camera.sees(pixels))
+    x, y = np.round(pixels[inside]).astype(int).T
+    seen = capture.depth(camera.name, 0)[y, x]
+    visible = inside[(capture.mask(camera.name, 0)[y, x] == OBJECT) & (np.abs(seen - depth[inside]) < 0.004)]
+    chosen = visible[farthest(vertices[visible], ANNOTATED)]
+    return np.stack([truth.surface(frame)[chosen] for frame in range(len(truth.nodes))])
+
+
+def farthest(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` points, each the farthest from those before; the first is point 0."""
+    chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -1,0 +1,108 @@
+"""A ray caster on Warp meshes: colour, depth along the optical axis, and who is seen (0 table, 1 object, 2 hand), per camera.
+
+Texture is a function of rest coordinates, so it sticks to the material. Pixel centres lie at whole coordinates, x right, y down,
+z forward (OpenCV); the table is the plane z = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy.sparse import coo_matrix
+
+from neuspring.data.capture import Camera
+from neuspring.data.synthetic.render_kernels import cast
+
+OBJECT, HAND = 1, 2
+LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
+"""Direction to the light."""
+FARTHEST = 8.0
+"""m; what lies further is background without depth."""
+SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
+"""Where a pixel's colour is sampled; depth and label are those of the first."""
+GAMMA = 1.0 / 2.2
+
+
+@dataclass(frozen=True)
+class Part:
+    """One thing that is seen: its triangles, where its texture lives, its colours."""
+
+    rest: np.ndarray
+    """[V, 3], m."""
+    faces: np.ndarray
+    """[F, 3]."""
+    colours: np.ndarray
+    """[V, 3] linear RGB."""
+    label: int
+    grain: tuple[float, float]
+    """Spatial frequency, 1/m, and contrast of the fine texture."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera sees in one frame."""
+
+    colour: np.ndarray
+    """[H, W, 3] uint8 RGB."""
+    depth: np.ndarray
+    """[H, W] m along the optical axis; 0 where nothing is seen."""
+    label: np.ndarray
+    """[H, W] uint8."""
+    slope: np.ndarray
+    """[H, W] cosine between the surface normal and the ray."""
+
+
+class Renderer:
+    """Renders parts whose vertices move, on the CPU."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        counts = np.cumsum([0, *(len(part.rest) for part in parts)])
+        self._faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)]).astype(np.int32)
+        labels = np.concatenate([np.full(len(part.faces), part.label) for part in parts])
+        grains = np.zeros((max(part.label for part in parts) + 1, 2))
+        for part in parts:
+            grains[part.label] = part.grain
+        self._rest: wp.array = wp.array(np.concatenate([part.rest for part in parts]), dtype=wp.vec3, device="cpu")
+        self._colours: wp.array = wp.array(np.concatenate([part.colours for part in parts]), dtype=wp.vec3, device="cpu")
+        self._indices: wp.array = wp.array(self._faces.ravel(), dtype=wp.int32, device="cpu")
+        self._labels: wp.array = wp.array(labels, dtype=wp.int32, device="cpu")
+        self._grains: wp.array = wp.array(grains, dtype=wp.vec2, device="cpu")
+        self._points = wp.zeros(int(counts[-1]), dtype=wp.vec3, device="cpu")
+        self._normals = wp.zeros_like(self._points)
+        self._offsets: wp.array = wp.array(SUBPIXELS, dtype=wp.vec2, device="cpu")
+        self._mesh: wp.Mesh | None = None
+        corners = self._faces.T.ravel()
+        owners = np.tile(np.arange(len(self._faces)), 3)
+        self._sum_faces = coo_matrix((np.ones(len(corners)), (corners, owners)), shape=(int(counts[-1]), len(self._faces))).tocsr()
+
+    def move(self, vertices: Sequence[np.ndarray]) -> None:
+        """Place the vertices of every part, m."""
+        points = np.concatenate(vertices).astype(np.float32)
+        corners = points[self._faces]
+        normals = self._sum_faces @ np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        self._points.assign(points)
+        self._normals.assign(normals.astype(np.float32))
+        if self._mesh is None:
+            self._mesh = wp.Mesh(self._points, self._indices)
+        else:
+            self._mesh.refit()
+
+    def render(self, camera: Camera) -> View:
+        """What `camera` sees now."""
+        assert self._mesh is not None, "move() comes first"
+        size = (camera.height, camera.width)
+        colour = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
+        depth, slope = (wp.zeros(size, dtype=wp.float32, device="cpu") for _ in range(2))
+        label = wp.zeros(size, dtype=wp.uint8, device="cpu")
+        k = camera.intrinsics
+        arguments = [
+            *(self._mesh.id, self._normals, self._rest, self._colours, self._indices, self._labels, self._grains),
+            *(wp.transform_from_matrix(wp.mat44(camera.camera_to_world)), wp.vec2(k[0, 0], k[1, 1]), wp.vec2(k[0, 2], k[1, 2])),
+            *(self._offsets, wp.vec3(*LIGHT), GAMMA, FARTHEST, colour, depth, label, slope),
+        ]
+        wp.launch(cast, size, arguments, device="cpu")
+        return View(colour.numpy(), depth.numpy(), label.numpy(), slope.numpy())

@@ -1,0 +1,221 @@
+"""Tetrahedral meshes of implicit bodies (body-centred lattice, boundary snapped to the surface), boxes and rods, in NumPy.
+
+Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from neuspring.data.synthetic.implicit import Sdf, gradient
+
+LATTICE_ALTITUDE = np.sqrt(0.5)
+"""Altitude of a tetrahedron of the body-centred lattice, in lattice constants."""
+LEAST_ALTITUDE = 0.4
+"""Snapping never takes a tetrahedron below this fraction of the lattice's altitude."""
+SNAPPING_STEPS = 40
+EMBEDDING_CANDIDATES = 12
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def volumes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Signed volumes [E], m^3."""
+    a, b, c, d = (nodes[tetrahedra[:, k]] for k in range(4))
+    return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
+
+
+def altitudes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Smallest altitude of each tetrahedron [E], m: 3 V / largest face; negative where inverted."""
+    areas = []
+    for i, j, k in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
+        a, b, c = nodes[tetrahedra[:, i]], nodes[tetrahedra[:, j]], nodes[tetrahedra[:, k]]
+        areas.append(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0)
+    return np.asarray(3.0 * volumes(nodes, tetrahedra) / np.max(areas, axis=0))
+
+
+def oriented(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """The tetrahedra with two corners exchanged where the volume is negative."""
+    tetrahedra = tetrahedra.copy()
+    inverted = volumes(nodes, tetrahedra) < 0
+    tetrahedra[inverted] = tetrahedra[inverted][:, [0, 1, 3, 2]]
+    return tetrahedra
+
+
+def boundary(tetrahedra: np.ndarray) -> np.ndarray:
+    """Faces [F, 3] that belong to one tetrahedron only, outward."""
+    corners = [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]
+    faces = np.concatenate([tetrahedra[:, c] for c in corners])
+    _, inverse, counts = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(faces[counts[inverse.ravel()] == 1])
+
+
+def edges(elements: np.ndarray) -> np.ndarray:
+    """Unique edges [M, 2] of elements of any size."""
+    size = elements.shape[1]
+    pairs = np.concatenate([elements[:, [i, j]] for i in range(size) for j in range(i)])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
+    """Tetrahedra of the body-centred cubic lattice that covers a box: two cell centres and an edge of the face between them."""
+    first = np.asarray(low, float) - spacing
+    corners = np.ceil((np.asarray(high, float) + spacing - first) / spacing).astype(int) + 1
+    cells = corners - 1
+    corner_grid, cell_grid = _grid(corners), _grid(cells)
+    nodes = np.concatenate([first + spacing * corner_grid.reshape(-1, 3), first + spacing * (cell_grid.reshape(-1, 3) + 0.5)])
+
+    def corner(index: np.ndarray) -> np.ndarray:
+        return _flat_index(index, corners)
+
+    def centre(index: np.ndarray) -> np.ndarray:
+        return len(nodes) - int(np.prod(cells)) + _flat_index(index, cells)
+
+    found = []
+    for axis in range(3):
+        step, right, up = np.roll(np.eye(3, dtype=int), axis, axis=1)
+        inner = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
+        cell = cell_grid[inner].reshape(-1, 3)
+        base = cell + step
+        ring = [corner(base), corner(base + right), corner(base + right + up), corner(base + up)]
+        for k in range(4):
+            found.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
+    return nodes, oriented(nodes, np.concatenate(found))
+
+
+def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
+    """Tetrahedra of the inside of `sdf`: lattice cells with their centroid inside, largest piece, boundary moved to the surface.
+
+    The boundary follows -grad(sdf) with smoothing; a move that would take a tetrahedron's altitude below LEAST_ALTITUDE of the
+    lattice's is shortened. Altitude and not a scale-free quality, because cells that shrink evenly keep their quality and ruin
+    the time step.
+    """
+    nodes, tetrahedra = lattice(low, high, spacing)
+    nodes, tetrahedra = _largest_piece(nodes, tetrahedra[sdf(nodes[tetrahedra].mean(axis=1)) < -0.05 * spacing])
+    skin = boundary(tetrahedra)
+    outer = np.unique(skin)
+    inner = np.setdiff1d(np.arange(len(nodes)), outer)
+    everywhere, along = _averaging(tetrahedra, len(nodes)), _averaging(skin, len(nodes))
+    nominal = LATTICE_ALTITUDE * spacing
+    for _ in range(SNAPPING_STEPS):
+        move = np.zeros_like(nodes)
+        move[inner] = 0.3 * (everywhere @ nodes - nodes)[inner]
+        normal, distance = gradient(sdf, nodes[outer]), sdf(nodes[outer])
+        drift = (along @ nodes - nodes)[outer]
+        tangential = drift - (drift * normal).sum(axis=1, keepdims=True) * normal
+        move[outer] = 0.3 * tangential - 0.6 * np.clip(distance, -0.3 * spacing, 0.3 * spacing)[:, None] * normal
+        nodes = nodes + _admissible(nodes, tetrahedra, move, nominal)[:, None] * move
+    return nodes, tetrahedra
+
+
+def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nominal: float) -> np.ndarray:
+    """Fraction of the move [N] that every node may make."""
+    allowed = np.minimum(LEAST_ALTITUDE, altitudes(nodes, tetrahedra) / nominal)
+    fraction = np.ones(len(nodes))
+    for attempt in range(10):
+        bad = altitudes(nodes + fraction[:, None] * move, tetrahedra) / nominal < allowed - 1e-12
+        if not bad.any():
+            return fraction
+        fraction[np.unique(tetrahedra[bad])] *= 0.4 if attempt < 7 else 0.0
+    return np.zeros(len(nodes))
+
+
+def _largest_piece(nodes: np.ndarray, tetrahedra: np.ndarray) -> Mesh:
+    """Of the pieces that hang together by faces."""
+    labels = pieces(tetrahedra)
+    kept = tetrahedra[labels == np.bincount(labels).argmax()]
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return nodes[used], renumbered.reshape(-1, 4)
+
+
+def pieces(tetrahedra: np.ndarray) -> np.ndarray:
+    """[E] the piece of each tetrahedron; neighbours share a face."""
+    faces = np.sort(np.concatenate([tetrahedra[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]), axis=1)
+    owner = np.tile(np.arange(len(tetrahedra)), 4)
+    order = np.lexsort(faces.T)
+    same = (np.diff(faces[order], axis=0) == 0).all(axis=1)
+    pairs = np.stack([owner[order][:-1][same], owner[order][1:][same]], axis=1)
+    return np.asarray(connected_components(_adjacency(pairs, len(tetrahedra)), directed=False)[1])
+
+
+def _adjacency(pairs: np.ndarray, count: int) -> csr_matrix:
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+
+
+def _averaging(elements: np.ndarray, count: int) -> csr_matrix:
+    """The matrix that replaces each node by the mean of its neighbours."""
+    graph = _adjacency(edges(elements), count)
+    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
+    return coo_matrix(graph.multiply(1.0 / degree[:, None])).tocsr()
+
+
+def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray, cells: Sequence[int]) -> Mesh:
+    """A box of regular cells, five tetrahedra each, mirrored from cell to cell so that faces agree."""
+    counts = np.asarray(cells)
+    first, last = np.asarray(low, float), np.asarray(high, float)
+    nodes = (first + _grid(counts + 1) * (last - first) / counts).reshape(-1, 3)
+    cell = _grid(counts).reshape(-1, 3)
+    odd = cell.sum(axis=1) % 2 == 1
+    five = (
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((1, 1, 0), (1, 0, 0), (0, 1, 0), (1, 1, 1)),
+        ((1, 0, 1), (1, 0, 0), (0, 0, 1), (1, 1, 1)),
+        ((0, 1, 1), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
+        ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
+    )
+    found = []
+    for corners in five:
+        offsets = np.array(corners)
+        mirrored = offsets * [-1, 1, 1] + [1, 0, 0]
+        for chosen, shift in ((~odd, offsets), (odd, mirrored)):
+            found.append(_flat_index(cell[chosen][:, None] + shift, counts + 1))
+    return nodes, oriented(nodes, np.concatenate(found))
+
+
+def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
+    """A rod along x, centred: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
+    tetrahedra per prism, split by node order so that neighbours agree."""
+    along = np.linspace(-length / 2, length / 2, len(radii))
+    angles = 2 * np.pi * np.arange(around) / around
+    ring = np.stack([np.zeros(around), np.cos(angles), np.sin(angles)], axis=1)
+    offsets = np.concatenate([np.zeros((1, 3)), ring])
+    nodes = (radii[:, None, None] * offsets + along[:, None, None] * [1.0, 0.0, 0.0]).reshape(-1, 3)
+    ids = np.arange(len(nodes)).reshape(len(radii), around + 1)
+    found = []
+    for k in range(around):
+        bottom = np.sort(np.stack([ids[:-1, 0], ids[:-1, 1 + k], ids[:-1, 1 + (k + 1) % around]], axis=1), axis=1)
+        top = bottom + around + 1
+        a, b, c = bottom.T
+        d, e, f = top.T
+        found += [np.stack(t, axis=1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    return nodes, oriented(nodes, np.concatenate(found))
+
+
+def embed(points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each point's tetrahedron [V] and barycentric weights [V, 4]; slightly negative where a point lies outside all of them."""
+    candidates = cKDTree(nodes[tetrahedra].mean(axis=1)).query(points, k=EMBEDDING_CANDIDATES)[1]
+    best = np.full(len(points), -np.inf)
+    element, weights = np.zeros(len(points), dtype=int), np.zeros((len(points), 4))
+    for candidate in candidates.T:
+        corners = nodes[tetrahedra[candidate]]
+        basis = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        inner = np.linalg.solve(basis, (points - corners[:, 0])[..., None])[..., 0]
+        own = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+        better = own.min(axis=1) > best
+        best[better], element[better], weights[better] = own.min(axis=1)[better], candidate[better], own[better]
+    return element, weights
+
+
+def _grid(counts: np.ndarray) -> np.ndarray:
+    """Integer lattice points [nx, ny, nz, 3]."""
+    return np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
+
+
+def _flat_index(index: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return np.asarray((index[..., 0] * counts[1] + index[..., 1]) * counts[2] + index[..., 2])

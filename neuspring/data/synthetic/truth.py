@@ -1,0 +1,41 @@
+"""What a synthetic capture knows and methods may not read: motion of every node, correspondences, materials, contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from neuspring.artifacts import Artifact, array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth(Artifact):
+    """Lies beside the capture, never in it."""
+
+    kind: ClassVar[str] = "truth"
+    nodes: np.ndarray = array("T,N,3", np.float32, "m", "positions of the finite-element nodes")
+    tetrahedra: np.ndarray = array("E,4", np.int32, "1", "elements of a solid; none for a sheet")
+    triangles: np.ndarray = array("M,3", np.int32, "1", "elements of a sheet, or the fabric skin of a solid")
+    youngs_modulus: np.ndarray = array("E", np.float32, "Pa", "of tetrahedra")
+    membrane: np.ndarray = array("M", np.float32, "N/m", "in-plane stiffness of triangles")
+    surface_nodes: np.ndarray = array("V,k", np.int32, "1", "nodes that each visible vertex follows")
+    surface_weights: np.ndarray = array("V,k", np.float32, "1", "their weights")
+    surface_faces: np.ndarray = array("F,3", np.int32, "1", "visible triangles")
+    hand_poses: np.ndarray = array("T,H,7", np.float32, "m, 1", "position and quaternion (x, y, z, w) of each hand")
+    held: np.ndarray = array("N", np.int32, "1", "the hand that holds each node; -1: none")
+    touches: np.ndarray = array("T,N", np.bool_, "1", "whether a node touches the table")
+    kinetic: np.ndarray = array("T", np.float32, "J", "kinetic energy")
+    potential: np.ndarray = array("T", np.float32, "J", "potential energy")
+    least_jacobian: np.ndarray = array("T", np.float32, "1", "smallest det F of an element")
+    substeps: int
+    """Per frame."""
+    certificate: float
+    """Largest mean distance, m, to the same clip with twice the substeps, ..."""
+    sensitivity: float
+    """... and to the same clip from a start that is a micrometre off: what cannot be predicted, whatever the time step."""
+
+    def surface(self, frame: int) -> np.ndarray:
+        """Visible vertices [V, 3], m, in one frame."""
+        return np.asarray(np.einsum("vkc,vk->vc", self.nodes[frame][self.surface_nodes], self.surface_weights))

@@ -1,0 +1,176 @@
+"""The steps from a capture to observations: each reads artefacts, computes with the chosen backend, writes an artefact, a picture
+and a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuspring import config
+from neuspring.artifacts import Observations, Scenario
+from neuspring.config import Config, ScenarioRow
+from neuspring.data.capture import CAPTURE, Capture
+from neuspring.errors import InputError
+from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.records import StageRecord, Stopwatch, digest_file
+
+
+def make_capture(row: ScenarioRow, settings: Config, output: Path) -> None:
+    """A capture folder, whose capture.json is `output`, of a synthetic scene or of PhysTwin's raw layout.
+
+    The truth of a synthetic scene lies beside the folder (truth.npz) and is never read by a method.
+    """
+    if row.source == "synthetic":
+        from neuspring.data.synthetic.make import make
+
+        _, truth = make(row, settings.synthetic, output.parent)
+        truth.save(output.parent.with_name("truth.npz"))
+    elif row.source == "phystwin_raw":
+        from neuspring.data import phystwin_raw
+
+        phystwin_raw.convert(row, Path(settings.data_root or ".") / row.path, output.parent)
+    else:
+        raise InputError(
+            f"scenario {row.scenario}, source", "captures are made of synthetic and phystwin_raw scenarios", row.source
+        )
+
+
+def segment(folder: Path, camera: str, settings: Config, device: str, output: Path) -> None:
+    """Capture -> masks.npz and masks.png of one camera, masks.json."""
+    from neuspring.perception import figures
+
+    clock = Stopwatch()
+    capture, chosen = Capture.load(folder), settings.perception.segment
+    _require_camera(capture, camera)
+    if chosen.backend == "given":
+        labels = _given(capture, camera)
+    elif chosen.backend == "opencv":
+        from neuspring.perception import segment_opencv
+
+        labels = segment_opencv.segment(capture, camera, chosen.opencv)
+    else:
+        from neuspring.perception import segment_sam2
+        from neuspring.physics.solver import resolve_device
+
+        labels = segment_sam2.segment(capture, camera, chosen.grounded_sam2, resolve_device(device))
+    facts = {"object_share": float((labels == 1).mean()), "hand_share": float((labels == 2).mean())}
+    masks = Masks(labels=labels, backend=chosen.backend, facts=facts)
+    path = output.with_name("masks.npz")
+    masks.save(path)
+    picture = figures.masks_strip(capture, camera, masks, output.with_name("masks.png"))
+    _record(clock, "segment", {"masks": path, "picture": picture}, masks.facts, chosen, folder).save(output)
+
+
+def track(folder: Path, camera: str, masks_record: Path, settings: Config, device: str, output: Path) -> None:
+    """Capture and masks of one camera -> tracks.npz and tracks.png, tracks.json."""
+    from neuspring.perception import figures
+
+    clock = Stopwatch()
+    capture, chosen = Capture.load(folder), settings.perception.track
+    masks = Masks.load(StageRecord.load(masks_record).file("masks", masks_record))
+    _require_camera(capture, camera)
+    if chosen.backend == "opencv":
+        from neuspring.perception import track_opencv
+
+        found = track_opencv.track(capture, camera, masks.labels, chosen.opencv, settings.perception.seed)
+    else:
+        from neuspring.perception import track_cotracker
+        from neuspring.physics.solver import resolve_device
+
+        found = track_cotracker.track(
+            capture, camera, masks.labels, chosen.cotracker3, settings.perception.seed, resolve_device(device)
+        )
+    facts = {"points": float(found.pixels.shape[1]), "visible_share": float(found.visible.mean())}
+    tracks = PixelTracks(pixels=found.pixels, visible=found.visible, backend=chosen.backend, facts=facts)
+    path = output.with_name("tracks.npz")
+    tracks.save(path)
+    picture = figures.tracks_strip(capture, camera, tracks, output.with_name("tracks.png"))
+    _record(clock, "track", {"tracks": path, "picture": picture}, tracks.facts, chosen, folder).save(output)
+
+
+def lift(folder: Path, masks: Sequence[Path], tracks: Sequence[Path], settings: Config, output: Path) -> None:
+    """Records of masks and tracks of all cameras, in the capture's order -> lifted.npz, shape.npz and lifted.png, lifted.json."""
+    from neuspring.perception import figures
+    from neuspring.perception.lift import lift as run
+    from neuspring.perception.shape_prior import shape_prior
+
+    clock = Stopwatch()
+    capture, chosen = Capture.load(folder), settings.perception
+    if not len(masks) == len(tracks) == len(capture.cameras):
+        raise InputError(
+            "--masks, --tracks", f"one record per camera is required: {list(capture.cameras)}", (len(masks), len(tracks))
+        )
+    loaded = {n: Masks.load(StageRecord.load(path).file("masks", path)) for n, path in zip(capture.cameras, masks, strict=True)}
+    followed = {
+        n: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for n, path in zip(capture.cameras, tracks, strict=True)
+    }
+    lifted = run(capture, loaded, followed, chosen.lift)
+    prior = shape_prior(capture, loaded, lifted.cloud, chosen.shape)
+    paths = {"lifted": output.with_name("lifted.npz"), "shape": output.with_name("shape.npz")}
+    lifted.save(paths["lifted"])
+    prior.save(paths["shape"])
+    paths["picture"] = figures.lifted_figure(lifted, prior, output.with_name("lifted.png"))
+    facts = {**lifted.facts, **{f"shape_{name}": value for name, value in prior.facts.items()}}
+    _record(clock, "lift", paths, facts, (chosen.lift, chosen.shape), folder).save(output)
+
+
+def assemble(row: ScenarioRow, folder: Path, lifted_record: Path, settings: Config) -> Observations:
+    """Lifted tracks and shape prior -> observations: one structure point per voxel, tracks for scoring from the capture."""
+    from neuspring.perception.sample import on_table, structure
+
+    capture, chosen = Capture.load(folder), settings.perception
+    record = StageRecord.load(lifted_record)
+    lifted, prior = LiftedTracks.load(record.file("lifted", lifted_record)), ShapePrior.load(record.file("shape", lifted_record))
+    up = 1.0 if capture.description.up == "+z" else -1.0
+    kept, surface, interior = structure(lifted, prior, chosen.sample, up, chosen.seed)
+    visible = lifted.object_visibility[:, kept]
+    points = np.where(visible[..., None], on_table(lifted.object_points[:, kept], up), 0.0)
+    return Observations(
+        scenario=Scenario(
+            name=row.scenario,
+            source=row.source,
+            category=row.category,
+            frame_count=capture.frame_count,
+            train_end=capture.train_end,
+            frame_rate=capture.description.frame_rate,
+            up=capture.description.up,
+            self_collision=row.self_collision,
+            ground=row.ground,
+            provenance=capture.description.provenance
+            | {CAPTURE: f"sha256:{digest_file(folder / CAPTURE)}", "lift": lifted.backend, "shape prior": prior.backend},
+        ),
+        object_points=points,
+        object_visibility=visible,
+        object_motion_valid=lifted.object_motion_valid[:, kept],
+        controller_points=lifted.controller_points,
+        surface_points=surface,
+        interior_points=interior,
+        tracks=capture.tracks(),
+    )
+
+
+def _given(capture: Capture, camera: str) -> np.ndarray:
+    if not capture.description.masks:
+        rule = "perception.segment.backend: given needs masks: true and the folder mask/"
+        raise InputError(capture.folder / CAPTURE, rule, "masks: false", "Choose another backend: opencv or grounded_sam2.")
+    of = capture.cameras[camera]
+    labels = np.zeros((capture.frame_count, of.height, of.width), dtype=np.uint8)
+    for frame in range(capture.frame_count):
+        if capture.has(camera, frame):
+            labels[frame] = capture.mask(camera, frame)
+    return labels
+
+
+def _require_camera(capture: Capture, camera: str) -> None:
+    if camera not in capture.cameras:
+        raise InputError(capture.folder / CAPTURE, f"must have a camera {camera}", sorted(capture.cameras))
+
+
+def _record(clock: Stopwatch, stage: str, files: Mapping[str, Path], facts: Mapping[str, Any], chosen: Any, folder: Path) -> Any:
+    sections = chosen if isinstance(chosen, tuple) else (chosen,)
+    settings = {type(section).__name__: config.plain(section) for section in sections}
+    inputs = {"capture": digest_file(folder / CAPTURE)}
+    return clock.stage(stage, "ok", dict(files), facts=dict(facts), settings=settings, inputs=inputs)

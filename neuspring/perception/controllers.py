@@ -1,0 +1,88 @@
+"""Which points of the hands move the object: seen throughout, moving with their neighbours, spread over the hands."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.config_perception import Lift
+from neuspring.errors import InputError
+
+HAND_GAP = 0.04
+"""m; points of one hand lie nearer to some other of it."""
+LEAST_FOR_POSE = 3
+
+
+def choose_controllers(
+    points: np.ndarray, visible: np.ndarray, valid: np.ndarray, settings: Lift, where: str
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Controllers [T, C, 3], m, and facts about them, of hand tracks [T, n, 3].
+
+    `controller_gaps: none`, as released: points visible in all frames whose motion never disagrees. `rigid`: points seen in at
+    least `controller_share` of the frames; where one is not seen it goes where the rigid motion of its hand takes it. At most
+    `controllers` points, each the farthest from those before. Raises InputError if fewer than `least_controllers` remain.
+    """
+    complete = visible.all(axis=0) & valid[:-1].all(axis=0)
+    chosen, filled = complete, 0.0
+    if settings.controller_gaps == "rigid":
+        trusted = visible & np.concatenate([visible[:1], valid[:-1]])
+        chosen = trusted.mean(axis=0) >= settings.controller_share
+        filled = float(1.0 - trusted[:, chosen].mean()) if chosen.any() else 0.0
+        points = fill_rigidly(points[:, chosen], trusted[:, chosen])
+    else:
+        points = points[:, chosen]
+    count = points.shape[1]
+    if count < settings.least_controllers:
+        rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
+        remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
+        raise InputError(where, rule, f"{count} of {visible.shape[1]}", remedy)
+    found = points[:, farthest(points[0], settings.controllers)]
+    return found, {"controllers": float(found.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
+
+
+def fill_rigidly(points: np.ndarray, trusted: np.ndarray) -> np.ndarray:
+    """Points [T, n, 3] with untrusted entries replaced by the rigid motion of their hand from frame 0.
+
+    The motion of a frame is the least-squares one of the hand's trusted points; with fewer than three it is that of the last
+    frame that had them.
+    """
+    result = points.copy()
+    for hand in hands_of(points[0]):
+        start = points[0, hand]
+        rotation, shift = Rotation.identity(), np.zeros(3)
+        for frame in range(1, len(points)):
+            known = trusted[frame, hand]
+            if known.sum() >= LEAST_FOR_POSE:
+                rotation, shift = rigid_motion(start[known], points[frame, hand][known])
+            missing = hand[~known]
+            result[frame, missing] = rotation.apply(points[0, missing]) + shift if len(missing) else result[frame, missing]
+    return result
+
+
+def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[Rotation, np.ndarray]:
+    """Rotation R and shift t of least squares with target = R source + t (Kabsch)."""
+    centre, goal = source.mean(axis=0), target.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(target - goal, source - centre)
+    return rotation, goal - rotation.apply(centre)
+
+
+def hands_of(points: np.ndarray) -> list[np.ndarray]:
+    """Indices of the points [n, 3] of each hand: pieces that lie HAND_GAP or more apart."""
+    pairs = cKDTree(points).query_pairs(HAND_GAP, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    count, labels = connected_components(graph, directed=False)
+    return [np.flatnonzero(labels == k) for k in range(count)]
+
+
+def farthest(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` points [n, 3], each the farthest from those before; the first is point 0."""
+    if not len(points):
+        return np.zeros(0, dtype=int)
+    chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -1,0 +1,90 @@
+"""Pictures of perception to look at: masks and tracks over the video, the lifted points from two sides, the shape prior."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+
+from neuspring.artifacts import write_atomically
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+
+FRAMES = 5
+"""Of a film strip."""
+TINTS = {OBJECT: np.array([40, 200, 60]), HANDS: np.array([70, 110, 255])}
+TRAIL = 8
+"""Frames of a track's tail."""
+DRAWN = 400
+"""Tracks drawn."""
+
+
+def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
+    """Frames of the video, object tinted green, hands blue."""
+    tiles = []
+    for frame in _frames(capture, camera):
+        image = capture.colour(camera, frame).astype(float)
+        for label, tint in TINTS.items():
+            own = masks.labels[frame] == label
+            image[own] = 0.5 * image[own] + 0.5 * tint
+        tiles.append(image.astype(np.uint8))
+    return _save(tiles, path)
+
+
+def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path) -> Path:
+    """Frames of the video with the visible points and where they came from, coloured by their place in frame 0."""
+    count = tracks.pixels.shape[1]
+    drawn = np.random.default_rng(0).permutation(count)[:DRAWN]
+    start = tracks.pixels[0, drawn]
+    hue = start @ [1.0, 0.6]
+    shade = (hue - hue.min()) / max(float(np.ptp(hue)), 1e-6)
+    colours = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int)
+    tiles = []
+    for frame in _frames(capture, camera):
+        image = np.ascontiguousarray(capture.colour(camera, frame))
+        first = max(frame - TRAIL, 0)
+        for point, colour in zip(drawn, colours.tolist(), strict=True):
+            if tracks.visible[frame, point]:
+                tail = tracks.pixels[first : frame + 1, point][tracks.visible[first : frame + 1, point]]
+                cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, colour, 1, cv2.LINE_AA)
+                cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, colour, -1, cv2.LINE_AA)
+        tiles.append(image)
+    return _save(tiles, path)
+
+
+def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) -> Path:
+    """Frame 0 and the last frame from the side and from above: object points in their colours, controllers red, the prior grey."""
+    from matplotlib import pyplot as plt
+
+    last = len(lifted.object_points) - 1
+    figure, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained")
+    for row, (name, across, up) in zip(axes, (("side", 0, 2), ("above", 0, 1)), strict=True):
+        for axis, frame in zip(row, (0, last), strict=True):
+            seen = lifted.object_visibility[frame]
+            if frame == 0 and prior is not None and len(prior.vertices):
+                axis.plot(prior.vertices[:, across], prior.vertices[:, up], ",", color="0.8", zorder=0)
+            points = lifted.object_points[frame, seen]
+            axis.scatter(points[:, across], points[:, up], s=2, c=lifted.object_colours[seen], linewidths=0)
+            hands = lifted.controller_points[frame]
+            axis.plot(hands[:, across], hands[:, up], "r.", ms=4)
+            axis.set_title(f"frame {frame}, from {'the ' if name == 'side' else ''}{name}: {seen.sum()} points", fontsize=9)
+            axis.set_aspect("equal")
+            axis.set_xlabel("x [m]")
+            axis.set_ylabel("z [m]" if up == 2 else "y [m]")
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
+    plt.close(figure)
+    return path
+
+
+def _frames(capture: Capture, camera: str) -> list[int]:
+    there = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    return [there[k] for k in np.unique(np.linspace(0, len(there) - 1, FRAMES).astype(int))]
+
+
+def _save(tiles: list[np.ndarray], path: Path) -> Path:
+    ok, data = cv2.imencode(".png", np.hstack(tiles)[..., ::-1])
+    assert ok, "a PNG of tiles can be encoded"
+    write_atomically(path, lambda temporary: temporary.write_bytes(data.tobytes()))
+    return path

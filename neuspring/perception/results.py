@@ -1,0 +1,60 @@
+"""What the steps of perception hand on, each one file, each with the backend that made it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from neuspring.artifacts import Artifact, array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Masks(Artifact):
+    """Who is where in one camera."""
+
+    kind: ClassVar[str] = "masks"
+    labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands; all 0 in frames that the camera missed")
+    backend: str
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelTracks(Artifact):
+    """Points followed through one camera's video, all starting in frame 0."""
+
+    kind: ClassVar[str] = "pixel_tracks"
+    pixels: np.ndarray = array("T,Q,2", np.float32, "px", "x, y; where a point is not visible its last place")
+    visible: np.ndarray = array("T,Q", np.bool_, "1", "whether the tracker sees the point")
+    backend: str
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftedTracks(Artifact):
+    """Tracks of all cameras in the world, filtered; object tracks are visible in frame 0, controllers in every frame."""
+
+    kind: ClassVar[str] = "lifted_tracks"
+    object_points: np.ndarray = array("T,No,3", np.float32, "m", "zeros where invisible")
+    object_visibility: np.ndarray = array("T,No", np.bool_, "1", "seen by its camera, inside the cleaned mask")
+    object_motion_valid: np.ndarray = array(
+        "T,No", np.bool_, "1", "row t: the motion from frame t to t+1 agrees with its neighbours"
+    )
+    object_colours: np.ndarray = array("No,3", np.float32, "1", "RGB in frame 0")
+    controller_points: np.ndarray = array("T,C,3", np.float32, "m", "chosen points of the hands")
+    cloud: np.ndarray = array("P,3", np.float32, "m", "all object points of frame 0")
+    cloud_colours: np.ndarray = array("P,3", np.float32, "1", "their RGB")
+    backend: str
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapePrior(Artifact):
+    """A closed surface of the object in frame 0; empty without a prior."""
+
+    kind: ClassVar[str] = "shape_prior"
+    vertices: np.ndarray = array("V,3", np.float32, "m", "world")
+    faces: np.ndarray = array("F,3", np.int32, "1", "outward")
+    backend: str
+    facts: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,66 @@
+"""Lifted tracks and shape prior -> the structure points of a twin, one per voxel: observed points first, then the prior's surface,
+then its inside (section 2.9 of the released processing, seeded)."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from neuspring.config_perception import Sampling
+from neuspring.perception.results import LiftedTracks, ShapePrior
+from neuspring.perception.sample_kernels import winding
+
+
+def structure(
+    lifted: LiftedTracks, prior: ShapePrior, settings: Sampling, up: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices of the object tracks to keep [No], surface points [Ns, 3] and interior points [Ni, 3], m.
+
+    Tracks with the same place in frame 0 count once, in lexicographic order of their places. Every voxel of side `settings.voxel`
+    holds one point; object before surface before interior. Points below the table are lifted to it.
+    """
+    start = on_table(lifted.object_points[0], up)
+    _, unique = np.unique(start, axis=0, return_index=True)
+    surface, interior = _samples(prior, settings, seed)
+    surface, interior = on_table(surface, up), on_table(interior, up)
+    everything = np.concatenate([start[unique], surface, interior])
+    cells = np.floor((everything - everything.min(axis=0)) / settings.voxel).astype(int)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    kept = np.zeros(len(everything), dtype=bool)
+    kept[first] = True
+    ends = np.cumsum([len(unique), len(surface)])
+    own, outer, inner = np.split(kept, ends)
+    return unique[own], surface[outer], interior[inner]
+
+
+def on_table(points: np.ndarray, up: float) -> np.ndarray:
+    """Points [..., 3] with those below the table z = 0 moved up to it; `up` is +1 or -1."""
+    lifted = np.array(points, dtype=float)
+    lifted[..., 2] = up * np.maximum(up * lifted[..., 2], 0.0)
+    return lifted
+
+
+def _samples(prior: ShapePrior, settings: Sampling, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Area-uniform surface points, and those of uniform points of the bounding box that lie inside."""
+    if not len(prior.faces):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    rng = np.random.default_rng(seed)
+    corners = prior.vertices[prior.faces].astype(float)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face = rng.choice(len(area), settings.surface, p=area / area.sum())
+    weights = rng.dirichlet((1.0, 1.0, 1.0), settings.surface)
+    surface = np.einsum("ns,nsc->nc", weights, corners[face])
+    low, high = prior.vertices.min(axis=0), prior.vertices.max(axis=0)
+    box = rng.uniform(low, high, (settings.interior, 3))
+    return surface, box[inside(prior, box)]
+
+
+def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
+    """Whether points [n, 3] lie inside the closed surface, by its winding number."""
+    indices: wp.array = wp.array(prior.faces.ravel(), dtype=wp.int32, device="cpu")
+    mesh = wp.Mesh(wp.array(prior.vertices, dtype=wp.vec3, device="cpu"), indices, support_winding_number=True)
+    found = wp.zeros(len(points), dtype=wp.bool, device="cpu")
+    reach = float(np.ptp(prior.vertices, axis=0).max()) * 2.0
+    arguments = [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, found]
+    wp.launch(winding, len(points), arguments, device="cpu")
+    return np.asarray(found.numpy())

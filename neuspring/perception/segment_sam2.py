@@ -1,0 +1,124 @@
+"""Segmentation by GroundingDINO and SAM 2, through `transformers` (extra `perception`): words find boxes in the first frame, boxes
+start masks, masks are carried through the video.
+
+Weights come from the usual Hugging Face cache or from a folder; they are large and only downloaded if `download` allows it. As in
+the released processing: a prompt of object and hand, boxes above a score, every detection that is not a hand is the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from neuspring.config_perception import GroundedSam2
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.errors import InputError
+
+
+@dataclass(frozen=True)
+class Models:
+    """The two networks with their processors."""
+
+    detector: Any
+    detector_processor: Any
+    video: Any
+    video_processor: Any
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A box in the first frame."""
+
+    box: tuple[float, float, float, float]
+    """x0, y0, x1, y1, pixels."""
+    words: str
+    score: float
+
+
+def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, models: Models | None = None) -> np.ndarray:
+    """Labels [T, H, W]. Raises InputError where weights are missing or the prompt finds no object or no hand."""
+    models = models or load(settings, device)
+    frames = [f for f in range(capture.frame_count) if capture.has(camera, f)]
+    images = [capture.colour(camera, frame) for frame in frames]
+    prompt = settings.prompt or capture.description.category
+    found = detect(images[0], prompt, settings, models, device)
+    hands = [d for d in found if settings.hand_prompt in d.words]
+    objects = [d for d in found if d not in hands]
+    where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
+    for what, detections in (("object", objects), ("hand", hands)):
+        if not detections:
+            rule = f"the prompt {prompt!r} and {settings.hand_prompt!r} must find an object and a hand"
+            remedy = "Set perception.segment.grounded_sam2.prompt to words for the object, or lower box_threshold."
+            raise InputError(where, rule, f"no {what} among {[d.words for d in found]}", remedy)
+    labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
+    of_detection = [HANDS if d in hands else OBJECT for d in found]
+    for frame, masks in zip(frames, propagate(images, found, models, device), strict=True):
+        for label, mask in sorted(zip(of_detection, masks, strict=True), key=lambda pair: pair[0]):
+            # Hands are in front of what they hold.
+            labels[frame][mask] = label
+    return labels
+
+
+def load(settings: GroundedSam2, device: str) -> Models:
+    """Networks with pretrained weights. Raises InputError saying which are missing."""
+    try:
+        import transformers
+    except ImportError as error:
+        remedy = 'Install it: .venv/bin/pip install -e ".[perception]"'
+        raise InputError("perception.segment.backend: grounded_sam2", "needs the extra `perception`", str(error), remedy) from error
+    detector, video_model, local = transformers.GroundingDinoForObjectDetection, transformers.Sam2VideoModel, not settings.download
+    try:
+        return Models(
+            detector.from_pretrained(settings.detector, local_files_only=local).to(device).eval(),  # type: ignore[arg-type]
+            transformers.AutoProcessor.from_pretrained(settings.detector, local_files_only=local),
+            video_model.from_pretrained(settings.video_model, local_files_only=local).to(device).eval(),  # type: ignore[arg-type]
+            transformers.Sam2VideoProcessor.from_pretrained(settings.video_model, local_files_only=local),
+        )
+    except OSError as error:
+        rule = f"weights of {settings.detector} and {settings.video_model} must be in the Hugging Face cache, or be folders"
+        remedy = "Set perception.segment.grounded_sam2.download: true once, or copy the cache from a machine that has it."
+        raise InputError("perception.segment.grounded_sam2", rule, str(error).splitlines()[0], remedy) from error
+
+
+def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Models, device: str) -> list[Detection]:
+    """Boxes of an RGB image that the prompt finds, best first."""
+    import torch
+
+    words = f"{prompt}. {settings.hand_prompt}."
+    inputs = models.detector_processor(images=image, text=words.lower(), return_tensors="pt").to(device)
+    with torch.inference_mode():
+        outputs = models.detector(**inputs)
+    found = models.detector_processor.post_process_grounded_object_detection(
+        outputs,
+        inputs["input_ids"],
+        threshold=settings.box_threshold,
+        text_threshold=settings.text_threshold,
+        target_sizes=[image.shape[:2]],
+    )[0]
+    rows = zip(found["boxes"].tolist(), found["text_labels"], found["scores"].tolist(), strict=True)
+    detections = [Detection(tuple(box), str(text), float(score)) for box, text, score in rows]
+    return sorted(detections, key=lambda d: -d.score)
+
+
+def propagate(images: list[np.ndarray], found: list[Detection], models: Models, device: str) -> list[np.ndarray]:
+    """Masks [detections, H, W] bool of every image."""
+    import torch
+
+    size = images[0].shape[:2]
+    masks = [np.zeros((len(found), *size), dtype=bool) for _ in images]
+    with torch.inference_mode():
+        session = models.video_processor.init_video_session(video=images, inference_device=device)
+        models.video_processor.add_inputs_to_inference_session(
+            inference_session=session,
+            frame_idx=0,
+            obj_ids=list(range(len(found))),
+            input_boxes=[[list(d.box) for d in found]],
+        )
+        models.video(inference_session=session, frame_idx=0)
+        for output in models.video.propagate_in_video_iterator(session):
+            scaled = models.video_processor.post_process_masks([output.pred_masks], original_sizes=[list(size)], binarize=True)[0]
+            for place, detection in enumerate(session.obj_ids):
+                masks[output.frame_idx][detection] = scaled[place, 0].cpu().numpy().astype(bool)
+    return masks

@@ -1,0 +1,193 @@
+"""The capture folder: what is written is read, and every refusal names the file, the field and the value."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.data.capture import CAPTURE, Camera, CameraEntry, Capture, Description, Writer
+from neuspring.errors import InputError
+
+FRAMES = 5
+POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))
+
+
+def entry(name: str = "0", width: int = 32, height: int = 24, missing: tuple[int, ...] = ()) -> CameraEntry:
+    intrinsics = ((40.0, 0.0, (width - 1) / 2), (0.0, 40.0, (height - 1) / 2), (0.0, 0.0, 1.0))
+    return CameraEntry(name=name, width=width, height=height, intrinsics=intrinsics, camera_to_world=POSE, missing=missing)
+
+
+def describe(**changes) -> Description:
+    plain = Description(
+        format=1, name="thing", category="rope", frame_count=FRAMES, frame_rate=30.0, cameras=(entry(),), masks=True
+    )
+    return replace(plain, **changes)
+
+
+def write(folder, description: Description | None = None, tracks: np.ndarray | None = None) -> Capture:
+    """A capture of random images: depth of 500 to 900 mm, every label."""
+    description = description or describe()
+    writer, rng = Writer(folder, description), np.random.default_rng(0)
+    for camera in description.cameras:
+        for frame in set(range(description.frame_count)) - set(camera.missing):
+            size = (camera.height, camera.width)
+            depth = rng.integers(500, 900, size).astype(np.uint16)
+            writer.frame(camera.name, frame, rng.integers(0, 256, (*size, 3), np.uint8), depth, rng.integers(0, 3, size, np.uint8))
+    return writer.finish(tracks)
+
+
+def edit(folder, **changes) -> None:
+    path = folder / CAPTURE
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize("form", ["png", "npy"])
+def test_what_is_written_is_read(tmp_path, form):
+    tracks = np.random.default_rng(1).normal(size=(FRAMES, 3, 3)).round(6)
+    tracks[2, 1] = np.nan
+    written = write(tmp_path, describe(depth_format=form), tracks)
+    read = Capture.load(tmp_path)
+    assert read.description == written.description
+    rng = np.random.default_rng(0)
+    depth, colour, mask = (
+        rng.integers(500, 900, (24, 32)),
+        rng.integers(0, 256, (24, 32, 3), np.uint8),
+        rng.integers(0, 3, (24, 32), np.uint8),
+    )
+    np.testing.assert_array_equal(read.colour("0", 0), colour)
+    np.testing.assert_allclose(read.depth("0", 0), depth / 1000)
+    np.testing.assert_array_equal(read.mask("0", 0), mask)
+    np.testing.assert_array_equal(read.tracks(), tracks)
+    assert read.train_end == 3
+
+
+def test_lifting_and_projecting_are_inverse():
+    rng = np.random.default_rng(0)
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    camera = Camera("0", 32, 24, np.array(entry().intrinsics), pose)
+    pixels, depth = rng.uniform(0, 24, (50, 2)), rng.uniform(0.3, 1.5, 50)
+    found, distance = camera.project(camera.lift(pixels, depth))
+    np.testing.assert_allclose(found, pixels, atol=1e-9)
+    np.testing.assert_allclose(distance, depth)
+
+
+def test_the_optical_axis_by_hand():
+    camera = Camera("0", 32, 24, np.array(entry().intrinsics), np.array(POSE))
+    np.testing.assert_allclose(camera.lift(np.array([15.5, 11.5]), np.array(0.9)), [0.1, 0.2, 0.0], atol=1e-12)
+    # Forty pixels to the right at a focal length of forty: as far as deep. Down in the image is down the camera's y.
+    np.testing.assert_allclose(camera.lift(np.array([55.5, 11.5]), np.array(0.5)), [0.6, 0.2, 0.4], atol=1e-12)
+    np.testing.assert_allclose(camera.lift(np.array([15.5, 51.5]), np.array(0.5)), [0.1, -0.3, 0.4], atol=1e-12)
+
+
+def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
+    write(tmp_path, describe(cameras=(entry("left"), entry("right", 40, 20, missing=(2,)))))
+    capture = Capture.load(tmp_path)
+    assert list(capture.cameras) == ["left", "right"]
+    assert capture.colour("right", 1).shape == (20, 40, 3)
+    assert [capture.has("right", frame) for frame in range(FRAMES)] == [True, True, False, True, True]
+
+
+SKEWED = [list(row) for row in POSE]
+SKEWED[0][0] = 1.01
+MIRRORED = [list(row) for row in POSE]
+MIRRORED[0][0] = -1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera_to_world": SKEWED}, r"cameras\.0\.camera_to_world: the upper left 3 x 3 block must be a rotation.*0\.02"),
+        ({"camera_to_world": MIRRORED}, r"camera_to_world: .*right-handed.*a mirror image"),
+        ({"intrinsics": [[40.0, 1.0, 15.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]}, r"cameras\.0\.intrinsics"),
+        ({"intrinsics": [[40.0, 0.0, 99.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]}, r"\(cx, cy\) must lie in the 32 x 24 image"),
+        ({"missing": [0]}, r"missing: frame 0 is where every twin starts"),
+        ({"missing": [7]}, r"frames must lie below 5; received 7"),
+        ({"width": "32"}, r"cameras\.0\.width"),
+    ],
+)
+def test_bad_cameras_are_refused(tmp_path, change, message):
+    write(tmp_path)
+    camera = json.loads((tmp_path / CAPTURE).read_text())["cameras"][0]
+    edit(tmp_path, cameras=[camera | change])
+    with pytest.raises(InputError, match=message):
+        Capture.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fps": 30}, "fps: unknown key"),
+        ({"train_end": 9}, "train_end: must be at most frame_count = 5; received 9"),
+        ({"frame_count": 2}, "frame_count"),
+        ({"format": 2}, "format"),
+        ({"cameras": []}, "cameras"),
+    ],
+)
+def test_bad_descriptions_are_refused(tmp_path, change, message):
+    write(tmp_path)
+    edit(tmp_path, **change)
+    with pytest.raises(InputError, match=message):
+        Capture.load(tmp_path)
+
+
+def test_two_cameras_of_one_name_are_refused(tmp_path):
+    write(tmp_path)
+    camera = json.loads((tmp_path / CAPTURE).read_text())["cameras"][0]
+    edit(tmp_path, cameras=[camera, camera])
+    with pytest.raises(InputError, match=r"names must differ; received \['0', '0'\]"):
+        Capture.load(tmp_path)
+
+
+def test_a_missing_image_says_how_to_declare_it(tmp_path):
+    capture = write(tmp_path)
+    capture.path("color", "0", 3).unlink()
+    with pytest.raises(
+        InputError, match=r"00003\.png: this image must exist; received no such file\. List the frame in cameras\.0\.missing"
+    ):
+        Capture.load(tmp_path).colour("0", 3)
+
+
+def test_depth_of_another_size_than_colour_is_refused(tmp_path):
+    capture = write(tmp_path)
+    cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((12, 16), np.uint16))
+    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to colour"):
+        capture.depth("0", 1)
+
+
+def test_depth_must_have_sixteen_bits(tmp_path):
+    capture = write(tmp_path)
+    cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((24, 32), np.uint8))
+    with pytest.raises(InputError, match="depth must be 16-bit integers"):
+        capture.depth("0", 1)
+
+
+def test_damaged_files_and_unknown_labels_are_refused(tmp_path):
+    capture = write(tmp_path)
+    capture.path("color", "0", 2).write_bytes(b"no picture")
+    with pytest.raises(InputError, match="must be a readable PNG"):
+        capture.colour("0", 2)
+    cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 255, np.uint8))
+    with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received 255"):
+        capture.mask("0", 2)
+
+
+def test_a_folder_that_is_still_being_written_is_no_capture(tmp_path):
+    write(tmp_path)
+    Writer(tmp_path, describe())
+    with pytest.raises(InputError, match=r"capture\.json: this file must be readable"):
+        Capture.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("[[[0, 0]]]", "x, y, z"), ("[[[0, 0, 0]]]", "every track needs 5 entries"), ("{", "JSON")]
+)
+def test_bad_tracks_are_refused(tmp_path, text, message):
+    capture = write(tmp_path)
+    (tmp_path / "tracks.json").write_text(text)
+    with pytest.raises(InputError, match=message):
+        capture.tracks()

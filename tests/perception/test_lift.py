@@ -1,0 +1,190 @@
+"""From pixels to the world: cleaned masks, agreement of motion, controllers; each against what it says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neuspring.config_perception import Lift
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.errors import InputError
+from neuspring.perception import lift as lifting
+from neuspring.perception.controllers import choose_controllers, farthest, fill_rigidly, hands_of, rigid_motion
+from neuspring.perception.results import Masks, PixelTracks
+from tests.data.test_capture import FRAMES, describe, entry
+
+SETTINGS = Lift(neighbourhood=0.03, outlier_neighbours=460.0, least_neighbours=3, least_controllers=3, controllers=4)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Capture:
+    """One camera that looks straight down at 0.9 m: an object on the left, a hand on the right, both half a pixel further right
+    in every frame. Depth is 0.8 m there, 0.9 m on the table."""
+    writer = Writer(tmp_path, describe())
+    for frame in range(FRAMES):
+        labels = np.zeros((24, 32), np.uint8)
+        labels[6:16, 4 + frame // 2 : 14 + frame // 2] = OBJECT
+        labels[6:16, 18 + frame // 2 : 28 + frame // 2] = HANDS
+        depth = np.where(labels > 0, 800, 900).astype(np.uint16)
+        writer.frame("0", frame, np.full((24, 32, 3), 40 * labels[..., None], np.uint8), depth, labels)
+    return writer.finish()
+
+
+def masks_of(capture: Capture) -> dict[str, Masks]:
+    return {"0": Masks(labels=np.stack([capture.mask("0", f) for f in range(FRAMES)]), backend="given")}
+
+
+def tracks_of(capture: Capture) -> dict[str, PixelTracks]:
+    y, x = np.nonzero(capture.mask("0", 0))
+    start = np.stack([x, y], axis=1).astype(float)
+    pixels = start + np.arange(FRAMES)[:, None, None] // 2 * [1.0, 0.0]
+    return {"0": PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="opencv")}
+
+
+def test_points_lie_where_the_camera_saw_them(scene):
+    lifted = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS)
+    assert lifted.object_points.shape == (FRAMES, 100, 3)
+    assert lifted.object_visibility.all()
+    assert lifted.object_motion_valid[:-1].all()
+    assert not lifted.object_motion_valid[-1].any()
+    camera = scene.cameras["0"]
+    np.testing.assert_allclose(lifted.object_points[0].min(axis=0), camera.lift(np.array([4.0, 15.0]), np.array(0.8)), atol=1e-6)
+    moved = lifted.object_points[-1] - lifted.object_points[0]
+    np.testing.assert_allclose(moved, np.tile([2 * 0.8 / 40, 0, 0], (100, 1)), atol=1e-6)
+    np.testing.assert_allclose(lifted.object_colours, 40 / 255, atol=1e-6)
+    assert lifted.controller_points.shape == (FRAMES, 4, 3)
+    assert len(lifted.cloud) == 100
+
+
+def test_a_track_that_leaves_the_mask_is_invisible_and_zero(scene):
+    tracks = tracks_of(scene)["0"]
+    pixels = tracks.pixels.copy()
+    pixels[2, 0] = [31.0, 23.0]
+    lifted = lifting.lift(scene, masks_of(scene), {"0": PixelTracks(pixels=pixels, visible=tracks.visible, backend="x")}, SETTINGS)
+    assert not lifted.object_visibility[2, 0]
+    np.testing.assert_array_equal(lifted.object_points[2, 0], 0.0)
+    assert lifted.object_visibility[3, 0]
+    assert not lifted.object_motion_valid[[1, 2], 0].any()
+
+
+def test_specks_and_depth_out_of_range_are_cleaned_away(scene):
+    masks = masks_of(scene)["0"]
+    labels = masks.labels.copy()
+    labels[:, 20, 3] = OBJECT
+    kept, cloud, _ = lifting.clean_masks(scene, scene.cameras, {"0": Masks(labels=labels, backend="x")}, SETTINGS)
+    assert not kept["0"][:, 20, 3].any()
+    np.testing.assert_array_equal(kept["0"], masks.labels)
+    kept, cloud, _ = lifting.clean_masks(scene, scene.cameras, masks_of(scene), replace(SETTINGS, depth_range=(0.2, 0.7)))
+    assert not kept["0"].any()
+    assert not len(cloud)
+
+
+def test_no_object_and_no_hand_are_named(scene):
+    for label, message in (
+        (OBJECT, "at least one tracked point must lie on the object"),
+        (HANDS, "at least 3 points of the hands"),
+    ):
+        labels = np.where(masks_of(scene)["0"].labels == label, 0, masks_of(scene)["0"].labels).astype(np.uint8)
+        with pytest.raises(InputError, match=message):
+            lifting.lift(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)
+
+
+def test_a_missing_frame_leaves_points_invisible(tmp_path):
+    writer = Writer(tmp_path, describe(cameras=(entry(missing=(2,)),)))
+    labels = np.zeros((24, 32), np.uint8)
+    labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
+    for frame in set(range(FRAMES)) - {2}:
+        writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
+    capture = writer.finish()
+    masks = Masks(labels=np.stack([labels * capture.has("0", f) for f in range(FRAMES)]), backend="x")
+    y, x = np.nonzero(labels)
+    pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), FRAMES, axis=0)
+    visible = np.ones(pixels.shape[:2], bool)
+    visible[2] = False
+    tracks = {"0": PixelTracks(pixels=pixels, visible=visible, backend="x")}
+    lifted = lifting.lift(capture, {"0": masks}, tracks, replace(SETTINGS, controller_gaps="rigid"))
+    np.testing.assert_array_equal(lifted.object_visibility.all(axis=1), [True, True, False, True, True])
+    np.testing.assert_allclose(lifted.controller_points, np.repeat(lifted.controller_points[:1], FRAMES, axis=0), atol=1e-6)
+
+
+def grid(count: int = 6) -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(count) * 0.004] * 2, [0.0]), axis=-1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("sequential", [False, True])
+def test_a_point_that_moves_alone_is_not_trusted(sequential):
+    points = np.stack([grid(), grid() + np.array([0.002, 0, 0])])
+    points[1, 7] += [0.0, 0.0, 0.02]
+    seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((36, 3)))
+    valid = lifting.agreeing_motion(seen, Lift(sequential_motion_filter=sequential))
+    assert np.flatnonzero(~valid[0]).tolist() == [7]
+
+
+def test_the_order_of_points_does_not_matter():
+    rng = np.random.default_rng(0)
+    points = np.stack([grid(8), grid(8) + rng.normal(0, 0.002, (64, 3))])
+    order = rng.permutation(64)
+    first, second = (lifting.Seen(p, np.ones(p.shape[:2], bool), np.zeros((64, 3))) for p in (points, points[:, order]))
+    valid = lifting.agreeing_motion(first, Lift())
+    assert 0 < valid[0].sum() < 64
+    np.testing.assert_array_equal(valid[:, order], lifting.agreeing_motion(second, Lift()))
+
+
+def test_few_neighbours_are_not_enough():
+    points = np.stack([grid(2), grid(2)])
+    seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((4, 3)))
+    assert not lifting.agreeing_motion(seen, Lift()).any()
+    assert lifting.agreeing_motion(seen, Lift(least_neighbours=4))[0].all()
+
+
+def test_depth_at_an_edge_comes_from_the_same_mask():
+    depth, inside = np.full((5, 5), 0.9), np.zeros((5, 5), bool)
+    depth[:, :2], inside[:, :2] = 0.5, True
+    depth[2, 1] = 0.53
+    found = lifting.local_depth(depth, inside, np.array([1]), np.array([2]), 3)
+    assert found[0] == pytest.approx(0.5)
+
+
+def test_rigid_motions_are_recovered_and_fill_gaps():
+    rng = np.random.default_rng(0)
+    start = rng.uniform(-0.02, 0.02, (12, 3))
+    rotation, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.0, 0.2])
+    found, by = rigid_motion(start, rotation.apply(start) + shift)
+    np.testing.assert_allclose(found.as_matrix(), rotation.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(by, shift, atol=1e-9)
+    points = np.stack([start, rotation.apply(start) + shift, start])
+    trusted = np.ones((3, 12), bool)
+    trusted[1, :5] = False
+    damaged = np.where(trusted[..., None], points, 0.0)
+    np.testing.assert_allclose(fill_rigidly(damaged, trusted), points, atol=1e-9)
+
+
+def test_hands_apart_move_apart():
+    rng = np.random.default_rng(0)
+    start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), rng.uniform(0, 0.03, (8, 3)) + np.array([0.3, 0, 0])])
+    assert [len(hand) for hand in hands_of(start)] == [8, 8]
+    moved = start + np.repeat([[0, 0, 0.1], [0, 0, -0.05]], 8, axis=0)
+    points, trusted = np.stack([start, moved]), np.ones((2, 16), bool)
+    trusted[1, [0, 9]] = False
+    np.testing.assert_allclose(fill_rigidly(np.where(trusted[..., None], points, 0.0), trusted), points, atol=1e-9)
+
+
+def test_released_controllers_are_visible_throughout():
+    points = np.repeat(grid(6)[None], 4, axis=0)
+    visible, valid = np.ones((4, 36), bool), np.ones((4, 36), bool)
+    visible[2, :10], valid[1, 10:20] = False, False
+    found, facts = choose_controllers(points, visible, valid, Lift(controllers=30, least_controllers=16), "here")
+    assert facts["hand_tracks_kept"] == 16
+    assert found.shape == (4, 16, 3)
+    with pytest.raises(InputError, match=r"here: at least 17 points of the hands.*received 16 of 36"):
+        choose_controllers(points, visible, valid, Lift(least_controllers=17), "here")
+    # With gaps filled, everything that is seen in enough frames counts.
+    _, facts = choose_controllers(points, visible, valid, Lift(controller_gaps="rigid", controller_share=0.7), "here")
+    assert facts["hand_tracks_kept"] == 36
+
+
+def test_farthest_points_are_spread():
+    line = np.stack([np.linspace(0, 1, 101), np.zeros(101), np.zeros(101)], axis=1)
+    assert farthest(line, 3).tolist() == [0, 100, 50]
+    assert farthest(line[:2], 5).tolist() == [0, 1]

@@ -1,0 +1,169 @@
+"""The visual hull of known bodies, alignment of meshes, and structure points one per voxel."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.config_perception import Sampling, ShapePriorSettings
+from neuspring.data.capture import OBJECT, CameraEntry, Writer
+from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
+from neuspring.data.synthetic.make import looking
+from neuspring.data.synthetic.render import HAND, Part, Renderer
+from neuspring.data.synthetic.sensor import quantised
+from neuspring.errors import InputError
+from neuspring.perception import shape_mesh, shape_prior
+from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
+from neuspring.perception.sample import inside, on_table, structure
+from tests.data.synthetic.test_camera import K
+from tests.data.test_capture import FRAMES, describe
+
+BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
+EYES = ((0.45, -0.35, 0.4), (-0.2, 0.55, 0.4), (-0.4, -0.4, 0.45))
+
+
+def film(folder, cameras: int, with_hand: bool = False):
+    """A still body of known shape, seen by cameras around it; a ball before the first camera is a hand."""
+    vertices, faces = surface(BODY, (-0.08, -0.08, -0.01), (0.15, 0.08, 0.13), 0.004)
+    ball, ball_faces = surface(sphere((0, 0, 0), 0.02), (-0.03,) * 3, (0.03,) * 3, 0.004)
+    parts = [Part(vertices, faces, np.full((len(vertices), 3), 0.5), OBJECT, (30.0, 0.3))]
+    moved = [vertices]
+    if with_hand:
+        parts.append(Part(ball, ball_faces, np.full((len(ball), 3), 0.5), HAND, (30.0, 0.3)))
+        moved.append(ball + np.array([0.12, -0.1, 0.16]))
+    renderer = Renderer(parts)
+    renderer.move(moved)
+    poses = [looking(np.array(eye), np.array([0.03, 0, 0.06])) for eye in EYES[:cameras]]
+    rows = [tuple(map(tuple, pose.tolist())) for pose in poses]
+    entries = tuple(
+        CameraEntry(name=str(k), width=120, height=68, intrinsics=tuple(map(tuple, K.tolist())), camera_to_world=row)
+        for k, row in enumerate(rows)
+    )
+    writer = Writer(folder, describe(cameras=entries))
+    cloud, masks = [], {}
+    for name, camera in writer.capture.cameras.items():
+        view = renderer.render(camera)
+        for frame in range(FRAMES):
+            writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
+        y, x = np.nonzero(view.label == OBJECT)
+        cloud.append(camera.lift(np.stack([x, y], axis=1).astype(float), view.depth[y, x].astype(float)))
+        masks[name] = Masks(labels=np.repeat(view.label[None], FRAMES, axis=0), backend="given")
+    truth = ShapePrior(vertices=vertices, faces=faces, backend="truth")
+    return writer.finish(), masks, np.concatenate(cloud), truth
+
+
+def overlap(first: ShapePrior, second: ShapePrior) -> float:
+    points = np.random.default_rng(0).uniform((-0.1, -0.1, -0.02), (0.17, 0.1, 0.15), (20000, 3))
+    a, b = inside(first, points), inside(second, points)
+    return float((a & b).sum() / (a | b).sum())
+
+
+def closed(faces: np.ndarray) -> bool:
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return {tuple(e) for e in directed.tolist()} == {tuple(e[::-1]) for e in directed.tolist()}
+
+
+def test_the_hull_is_closed_and_near_the_truth(tmp_path):
+    capture, masks, cloud, truth = film(tmp_path, 3)
+    hull = shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004))
+    assert closed(hull.faces)
+    assert hull.vertices[:, 2].min() > -0.004
+    assert overlap(hull, truth) > 0.8
+
+
+def test_more_cameras_make_a_better_hull(tmp_path):
+    quality = []
+    for cameras in (1, 2, 3):
+        capture, masks, cloud, truth = film(tmp_path / str(cameras), cameras)
+        quality.append(overlap(shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth))
+    assert quality[0] < quality[1] < quality[2]
+
+
+def test_a_hand_before_the_object_does_not_carve_it(tmp_path):
+    capture, masks, cloud, truth = film(tmp_path, 3, with_hand=True)
+    assert (masks["0"].labels == HAND).any()
+    assert overlap(shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth) > 0.8
+
+
+def test_contradicting_views_are_refused(tmp_path):
+    capture, masks, cloud, _ = film(tmp_path, 2)
+    masks["1"] = Masks(labels=np.roll(masks["1"].labels, 55, axis=2), backend="given")
+    with pytest.raises(InputError, match="at least one voxel must be consistent with all cameras"):
+        shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings())
+
+
+def test_a_mesh_in_any_pose_and_size_finds_its_place(tmp_path):
+    _, _, cloud, truth = film(tmp_path, 3)
+    other = 7.0 * Rotation.from_rotvec([1.0, 0.4, -2.0]).apply(truth.vertices) + [3.0, -2.0, 1.0]
+    placed, rms = shape_mesh.place(other, truth.faces, cloud)
+    assert rms < 0.003
+    assert overlap(ShapePrior(vertices=placed, faces=truth.faces, backend="mesh"), truth) > 0.9
+
+
+def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):
+    capture, masks, cloud, truth = film(tmp_path, 3)
+    bent = truth.vertices + np.array([0, 0, 0.008]) * np.sin(np.pi * (truth.vertices[:, :1] / 0.1))
+    found = shape_mesh.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings(bend_reach=0.02))
+    before, after = (np.median(cKDTree(v).query(cloud)[0]) for v in (bent, found))
+    assert after < 0.75 * before
+
+
+def test_inside_is_where_the_distance_is_negative(tmp_path):
+    _, _, _, truth = film(tmp_path, 1)
+    points = np.random.default_rng(1).uniform((-0.1, -0.1, 0.0), (0.17, 0.1, 0.15), (2000, 3))
+    clear = np.abs(BODY(points)) > 0.002
+    np.testing.assert_array_equal(inside(truth, points)[clear], (BODY(points) < 0)[clear])
+
+
+def tracked(points: np.ndarray) -> LiftedTracks:
+    count = len(points)
+    return LiftedTracks(
+        object_points=np.repeat(points[None], 3, axis=0),
+        object_visibility=np.ones((3, count), bool),
+        object_motion_valid=np.ones((3, count), bool),
+        object_colours=np.zeros((count, 3)),
+        controller_points=np.zeros((3, 1, 3)),
+        cloud=points,
+        cloud_colours=np.zeros((count, 3)),
+        backend="x",
+    )
+
+
+def test_one_point_per_voxel():
+    points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3))
+    points[0] = 0.0
+    kept, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
+    cells = np.floor(points[kept] / 0.02).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(cells) == 125
+
+
+def test_observed_points_come_before_the_surface_and_it_before_the_inside(tmp_path):
+    _, _, cloud, truth = film(tmp_path, 3)
+    everything = tracked(cloud[::3])
+    kept, outer, inner = structure(everything, truth, Sampling(voxel=0.01), 1.0, 0)
+    alone, bare, _ = structure(tracked(cloud[:1]), truth, Sampling(voxel=0.01), 1.0, 0)
+    assert len(kept) > 50
+    assert 10 < len(outer) < len(bare)
+    assert len(alone) == 1
+    assert inside(truth, inner).mean() > 0.98
+    assert cKDTree(everything.object_points[0, kept]).query(outer)[0].min() > 1e-4
+
+
+def test_sampling_follows_the_seed(tmp_path):
+    _, _, cloud, truth = film(tmp_path, 3)
+    first, second, third = (structure(tracked(cloud[::5]), truth, Sampling(voxel=0.01), 1.0, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first[2], second[2])
+    assert first[2].shape != third[2].shape or not np.array_equal(first[2], third[2])
+
+
+def test_without_a_prior_only_what_was_seen_remains():
+    points = np.array([[0.0, 0, 0.01], [0.0, 0, 0.01], [0.05, 0, -0.01], [0.1, 0, 0.02]])
+    kept, outer, inner = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
+    assert kept.tolist() == [0, 2, 3]
+    assert not len(outer)
+    assert not len(inner)
+
+
+@pytest.mark.parametrize(("up", "expected"), [(1.0, 0.0), (-1.0, -0.01)])
+def test_points_below_the_table_are_lifted_to_it(up, expected):
+    assert on_table(np.array([[0.0, 0.0, -0.01]]), up)[0, 2] == expected

@@ -1,0 +1,142 @@
+"""Tracking of known motion, and the contract of CoTracker3 with a stand-in."""
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.config_perception import CoTracker3, OpenCvTracking
+from neuspring.data.capture import Writer
+from neuspring.errors import InputError
+from neuspring.perception import track_cotracker, track_opencv
+from tests.data.test_capture import describe, entry
+
+SHIFT = np.array([1.5, -0.75])
+"""Pixels per frame."""
+
+
+def texture(size: int = 300) -> np.ndarray:
+    noise = np.random.default_rng(0).normal(size=(size, size))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return cv2.normalize(smooth, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+@pytest.fixture
+def video(tmp_path):
+    """A textured square that moves before a textured wall; it is hidden by a bar in frames 3 and 4, which camera "late" lacks."""
+    wall, patch = texture()[:96, :128], texture()[150:190, 150:190]
+    cameras = (entry("0", 128, 96), entry("late", 128, 96, missing=(3, 4)))
+    writer = Writer(tmp_path, describe(frame_count=8, cameras=cameras))
+    labels0 = None
+    for frame in range(8):
+        image, labels = np.repeat(wall[..., None], 3, axis=2), np.zeros((96, 128), np.uint8)
+        place = np.array([[1, 0, 40 + SHIFT[0] * frame], [0, 1, 30 + SHIFT[1] * frame]], float)
+        moved = cv2.warpAffine(patch, place, (128, 96))
+        own = cv2.warpAffine(np.full_like(patch, 255), place, (128, 96)) > 250
+        image[own] = moved[own, None]
+        labels[own] = 1
+        if frame in (3, 4):
+            image[30:60, 50:62] = 128
+        for camera in cameras:
+            if frame not in camera.missing:
+                writer.frame(camera.name, frame, image, np.full((96, 128), 800, np.uint16), labels)
+        labels0 = labels if labels0 is None else labels0
+    capture = writer.finish()
+    return capture, np.repeat(labels0[None], 8, axis=0)
+
+
+def error(found: track_opencv.Followed, frame: int) -> np.ndarray:
+    return np.linalg.norm(found.pixels[frame] - found.pixels[0] - SHIFT * frame, axis=1)
+
+
+@pytest.mark.parametrize("method", ["lucas_kanade", "dis"])
+def test_points_move_with_the_texture(video, method):
+    capture, labels = video
+    found = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200, window=9), 0)
+    seen = found.visible[2]
+    assert seen.mean() > 0.8
+    assert np.median(error(found, 2)[seen]) < 0.25
+
+
+def test_hidden_points_are_lost_and_found_again(video):
+    capture, labels = video
+    found = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9), 0)
+    without = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9, reacquire=False), 0)
+    behind = (np.abs(found.pixels[0, :, 0] + 3 * SHIFT[0] - 56) < 4) & (np.abs(found.pixels[0, :, 1] + 3 * SHIFT[1] - 45) < 10)
+    assert behind.sum() > 10
+    assert found.visible[3][behind].mean() < 0.3
+    again = found.visible[7] & behind
+    assert again.sum() > 0.6 * behind.sum() > without.visible[7][behind].sum()
+    assert np.median(error(found, 7)[again]) < 0.5
+
+
+def test_missing_frames_are_bridged(video):
+    capture, labels = video
+    found = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200, window=15), 0)
+    assert not found.visible[[3, 4]].any()
+    seen = found.visible[5]
+    assert seen.mean() > 0.5
+    assert np.median(error(found, 5)[seen]) < 0.5
+
+
+def test_points_start_in_the_mask_and_follow_the_seed(video):
+    _, labels = video
+    first, second, other = (track_opencv.choose(labels[0], 50, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, other)
+    x, y = first.astype(int).T
+    assert labels[0, y, x].all()
+    assert len(track_opencv.choose(labels[0], 10**6, 0)) == (labels[0] > 0).sum()
+
+
+def test_an_empty_mask_is_refused(video):
+    capture, labels = video
+    with pytest.raises(InputError, match="camera 0: masks of frame 0 must show object or hands"):
+        track_opencv.track(capture, "0", labels * 0, OpenCvTracking(), 0)
+
+
+class StandIn:
+    """Implements the interface of CoTracker3's online predictor: points move by SHIFT; it insists on windows of 2 step frames."""
+
+    step = 3
+
+    def __init__(self) -> None:
+        self.frames, self.queries = 0, None
+        self.windows: list[tuple[int, ...]] = []
+
+    def to(self, device: str) -> "StandIn":
+        return self
+
+    def __call__(self, video_chunk, is_first_step=False, queries=None):
+        import torch
+
+        assert video_chunk.dtype == torch.float32
+        assert video_chunk.shape[1] == 2 * self.step
+        if is_first_step:
+            self.queries = queries
+            return None, None
+        self.windows.append(tuple(video_chunk.shape))
+        self.frames = self.frames + self.step if self.frames else 2 * self.step
+        time = torch.arange(self.frames)[:, None, None]
+        tracks = self.queries[0, :, 1:] + time * torch.tensor(SHIFT, dtype=torch.float32)
+        return tracks[None], torch.ones(1, self.frames, tracks.shape[1], dtype=torch.bool)
+
+
+def test_cotracker_is_called_as_its_online_predictor_wants(video):
+    capture, labels = video
+    model = StandIn()
+    found = track_cotracker.track(capture, "0", labels, CoTracker3(points=30), 0, "cpu", model)
+    assert tuple(model.queries.shape) == (1, 30, 3)
+    assert not model.queries[0, :, 0].any()
+    assert model.windows == [(1, 6, 3, 96, 128)] * 2
+    assert found.visible.all()
+    assert error(found, 7).max() < 1e-4
+    found = track_cotracker.track(capture, "late", labels, CoTracker3(points=30), 0, "cpu", StandIn())
+    assert not found.visible[[3, 4]].any()
+
+
+def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_path):
+    import torch
+
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    with pytest.raises(InputError, match=r"CoTracker3 must be in the torch\.hub cache.*download: true"):
+        track_cotracker.load(CoTracker3())

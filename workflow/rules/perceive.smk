@@ -1,0 +1,106 @@
+rule capture:
+    output:
+        f"{RESULTS}/{{scenario}}/capture/capture.json",
+    input:
+        raw_files,
+    log:
+        f"{RESULTS}/logs/capture/{{scenario}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=4000,
+        runtime=120,
+    params:
+        settings=capture_settings,
+        row=scenario_row,
+        code=capture_digest,
+    shell:
+        "python -m neuspring capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
+        " 2>&1 | tee -a {log:q}"
+
+
+rule segment:
+    input:
+        capture=capture_file,
+    output:
+        f"{RESULTS}/{{scenario}}/perception/{{camera}}/masks.json",
+    log:
+        f"{RESULTS}/logs/segment/{{scenario}}/{{camera}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/segment/{{scenario}}/{{camera}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        device=DEVICE,
+        gpu=needs_gpu("segment", "grounded_sam2"),
+        mem_mb=8000,
+        runtime=120,
+    params:
+        settings=perception_settings("segment"),
+        code=backend_digest("segment"),
+    shell:
+        "python -m neuspring segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
+        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+
+
+rule track:
+    input:
+        capture=capture_file,
+        masks=rules.segment.output,
+    output:
+        f"{RESULTS}/{{scenario}}/perception/{{camera}}/tracks.json",
+    log:
+        f"{RESULTS}/logs/track/{{scenario}}/{{camera}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/track/{{scenario}}/{{camera}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        device=DEVICE,
+        gpu=needs_gpu("track", "cotracker3"),
+        mem_mb=8000,
+        runtime=120,
+    params:
+        settings=perception_settings("track", "seed"),
+        code=backend_digest("track"),
+    shell:
+        "python -m neuspring track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
+        " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+
+
+rule lift:
+    input:
+        capture=capture_file,
+        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
+        tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
+    output:
+        f"{RESULTS}/{{scenario}}/perception/lifted.json",
+    log:
+        f"{RESULTS}/logs/lift/{{scenario}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/lift/{{scenario}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=perception_settings("lift", "shape"),
+        code=code_digest(
+            "neuspring.perception.lift",
+            "neuspring.perception.shape_prior",
+            stage="perceive.lift",
+        ),
+    shell:
+        "python -m neuspring lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+        " --settings {params.settings:q} --output {output:q} 2>&1 | tee -a {log:q}"
