@@ -57,14 +57,16 @@ class OpenCvTracking:
     """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
     """Most pixels followed per camera, random ones of the masks of frame 0."""
-    window: Annotated[int, Field(ge=5)] = 15
-    """Side of the Lucas-Kanade window, pixels."""
+    local_contrast: NonNegative = 2.0
+    """Width, pixels, over which brightness and contrast are made equal for Lucas-Kanade, so that shading does not pull; 0: not."""
+    window: Annotated[int, Field(ge=5)] = 9
+    """Side of the Lucas-Kanade window, pixels. A large one averages over what deforms and over the background."""
     levels: Annotated[int, Field(ge=0)] = 3
     """Of the image pyramid, beside the image itself."""
-    forward_backward: Positive = 0.7
+    forward_backward: Positive = 0.5
     """Pixels by which a point may miss its start when followed there and back."""
-    anchor: bool = True
-    """Correct drift by fitting the patch of frame 0 at each place."""
+    consensus: Positive = 4.0
+    """Pixels by which a point's motion since frame 0 may differ from the median of its nearest neighbours'."""
     reacquire: bool = True
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
@@ -148,11 +150,11 @@ class ShapePriorSettings:
     mesh: a file, aligned to what was seen."""
     thin: tuple[str, ...] = ("cloth", "package")
     """Categories that need no prior."""
-    voxel: Positive = 0.004
+    voxel: Positive = 0.003
     """m."""
     margin: Positive = 0.02
     """m around the cloud of frame 0 that is carved."""
-    tolerance: Positive = 0.006
+    tolerance: Positive = 0.004
     """m by which measured depth may lie behind a voxel before it is carved."""
     smoothing: Positive = 1.0
     """Width, voxels, by which the hull is smoothed."""

@@ -1,7 +1,8 @@
 """What the cameras do not see of the object in frame 0: a closed surface by carving voxels, or none.
 
 A voxel belongs to the hull if every camera that has it in its image sees the object there, or a hand before it, and does not look
-through it: the measured depth is not behind the voxel. What is under the table does not belong.
+through it: the measured depth is not behind the voxel. At least one camera must see the object there, else a hand seen by all would
+belong. What is under the table does not belong.
 """
 
 from __future__ import annotations
@@ -47,8 +48,11 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     low, high = cloud.min(axis=0) - margin, cloud.max(axis=0) + margin
     grid = _grid(low, high, settings.voxel)
     inside = sign * grid[..., 2] > 0
+    shown = np.zeros_like(inside)
     for name, camera in capture.cameras.items():
-        inside &= _consistent(grid, camera, masks[name].labels[0], capture.depth(name, 0), settings.tolerance)
+        admitted, shows = _consistent(grid, camera, masks[name].labels[0], capture.depth(name, 0), settings.tolerance)
+        inside, shown = inside & admitted, shown | shows
+    inside &= shown
     if settings.symmetry:
         inside |= _mirrored(inside, grid, cloud, settings.voxel)
     inside = _largest(inside)
@@ -62,17 +66,19 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     )
 
 
-def _consistent(grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether one camera admits each voxel [nx, ny, nz] bool."""
+def _consistent(
+    grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether one camera admits each voxel [nx, ny, nz] bool, and whether it shows the object there, not a hand before it."""
     pixels, distance = camera.project(grid.reshape(-1, 3))
-    admitted = np.ones(len(distance), dtype=bool)
+    admitted, shows = np.ones(len(distance), dtype=bool), np.zeros(len(distance), dtype=bool)
     seen = np.flatnonzero(camera.sees(pixels) & (distance > 0))
     x, y = np.round(pixels[seen]).astype(int).T
     label, measured = labels[y, x], depth[y, x]
-    in_front = (measured > 0) & (distance[seen] < measured - tolerance)
-    hidden_by_hand = (label == HANDS) & ~in_front
-    admitted[seen] = ((label == OBJECT) & ~in_front) | hidden_by_hand
-    return admitted.reshape(grid.shape[:-1])
+    behind = (measured <= 0) | (distance[seen] >= measured - tolerance)
+    admitted[seen] = behind & ((label == OBJECT) | (label == HANDS))
+    shows[seen] = behind & (label == OBJECT)
+    return admitted.reshape(grid.shape[:-1]), shows.reshape(grid.shape[:-1])
 
 
 def _mirrored(inside: np.ndarray, grid: np.ndarray, cloud: np.ndarray, voxel: float) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Dense tracking without a network: pyramidal Lucas-Kanade, or DIS optical flow, both with a forward-backward check.
 
-Points start in frame 0 on a grid of random pixels inside the masks. A point that fails the check, leaves the image or jumps is
-lost. Lost points are looked for again from their first appearance: where their neighbours of frame 0 went, by Lucas-Kanade from
-frame 0, accepted if the patch looks alike.
+Points start in frame 0 on a grid of random pixels inside the masks. A point that fails the check, leaves the image or its mask, or
+moves otherwise than its neighbours is lost. Lost points are looked for again from their first appearance: where their neighbours
+of frame 0 went, by Lucas-Kanade from frame 0, accepted if the patch looks alike.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ from neuspring.errors import InputError
 
 PATCH = 9
 """Side of compared patches, pixels."""
-MOST_DRIFT = 3.0
-"""Pixels by which the patch of frame 0 may correct a place."""
 GUIDES = 6
 """Nearest living points of frame 0, whose motion says where a lost point may be."""
+NEIGHBOURS = 8
+"""That vote on a point's motion."""
+FAINT = 4.0
+"""Grey levels of deviation below which contrast is not raised further: noise."""
+CONTRAST = 40.0
+"""Grey levels that one local deviation becomes."""
 STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
@@ -42,16 +46,17 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
     if not len(start):
         raise InputError(f"{capture.folder}, camera {camera}", "masks of frame 0 must show object or hands", "nothing")
     frames, count = capture.frame_count, len(start)
+    own = _labels_at(labels[0], start)
     found = Followed(np.repeat(start[None], frames, axis=0), np.zeros((frames, count), dtype=bool))
     found.visible[0] = True
-    first = before = _grey(capture, camera, 0)
+    first = before = _seen(capture, camera, 0, settings)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) if settings.method == "dis" else None
     last = 0
     for frame in range(1, frames):
         found.pixels[frame] = found.pixels[frame - 1]
         if not capture.has(camera, frame):
             continue
-        now = _grey(capture, camera, frame)
+        now = _seen(capture, camera, frame, settings)
         alive = found.visible[last]
         place = found.pixels[last].copy()
         if alive.any():
@@ -59,10 +64,11 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
             place[alive] = moved
             alive = _put(alive, kept)
         alive &= _inside(place, now.shape)
-        if settings.anchor:
-            _hold_to_anchor(first, now, start, place, alive, settings)
         if settings.reacquire:
             alive |= _reacquire(first, now, start, place, alive, settings)
+        alive &= _labels_at(labels[frame], place) == own
+        for label in np.unique(own):
+            _outvote(start, place, alive, own == label, settings)
         found.pixels[frame], found.visible[frame] = np.where(alive[:, None], place, found.pixels[last]), alive
         before, last = now, frame
     return found
@@ -117,21 +123,6 @@ def _pyramidal(
     return np.asarray(moved), np.asarray(ok).ravel().astype(bool)
 
 
-def _hold_to_anchor(
-    first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray, settings: OpenCvTracking
-) -> None:
-    """Remove drift: move each living point of `place` to where its patch of frame 0 fits, if that is near and looks alike."""
-    points = np.flatnonzero(alive)
-    if not len(points):
-        return
-    moved, ok = _lucas_kanade(first, now, start[points], place[points], settings)
-    ok &= np.linalg.norm(moved - place[points], axis=1) < MOST_DRIFT
-    ok &= _inside(moved, now.shape)
-    if ok.any():
-        ok[ok] = _alike(first, now, start[points][ok], moved[ok]) > settings.likeness
-        place[points[ok]] = moved[ok]
-
-
 def _reacquire(
     first: np.ndarray,
     now: np.ndarray,
@@ -156,6 +147,23 @@ def _reacquire(
     place[searched[ok]] = moved[ok]
     found[searched[ok]] = True
     return found
+
+
+def _outvote(start: np.ndarray, place: np.ndarray, alive: np.ndarray, group: np.ndarray, settings: OpenCvTracking) -> None:
+    """Points of the group that move otherwise than their neighbours of frame 0 are no longer alive."""
+    points = np.flatnonzero(alive & group)
+    if len(points) <= NEIGHBOURS:
+        return
+    motion = (place - start)[points]
+    near = cKDTree(start[points]).query(start[points], k=NEIGHBOURS + 1)[1][:, 1:]
+    off = np.linalg.norm(motion - np.median(motion[near], axis=1), axis=1)
+    alive[points[off > settings.consensus]] = False
+
+
+def _labels_at(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Labels [n] of the pixels nearest to points (x, y)."""
+    x, y = np.round(points).astype(int).T
+    return np.asarray(labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)])
 
 
 def _alike(first: np.ndarray, now: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -193,5 +201,12 @@ def _put(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     return result
 
 
-def _grey(capture: Capture, camera: str, frame: int) -> np.ndarray:
-    return cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+def _seen(capture: Capture, camera: str, frame: int, settings: OpenCvTracking) -> np.ndarray:
+    """The grey image [H, W] uint8; for Lucas-Kanade less its local mean and divided by its local deviation."""
+    grey = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+    if settings.method == "dis" or not settings.local_contrast:
+        return np.asarray(grey)
+    width = settings.local_contrast
+    centred = grey.astype(np.float32) - cv2.GaussianBlur(grey.astype(np.float32), (0, 0), width)
+    deviation = np.sqrt(cv2.GaussianBlur(centred**2, (0, 0), width) + FAINT**2)
+    return np.asarray(np.clip(128.0 + CONTRAST * centred / deviation, 0, 255).astype(np.uint8))

@@ -44,7 +44,7 @@ CHAOS = 3.0
 CERTIFIED_FRAMES = 20
 GRAINS = {"cloth": (45.0, 0.5), "rope": (70.0, 0.5), "package": (35.0, 0.5)}
 """Frequency, 1/m, and contrast of the fine texture by category."""
-PLUSH_GRAIN, HAND_GRAIN = (32.0, 0.7), (45.0, 0.6)
+PLUSH_GRAIN, HAND_GRAIN = (36.0, 1.1), (45.0, 0.6)
 
 
 @dataclass(frozen=True)
