@@ -20,6 +20,7 @@ rule all:
     default_target: True
     input:
         tables=TABLES,
+        perception=perception_tables(),
         tracked=tracked_runs(),
 
 

@@ -99,6 +99,21 @@ def _lift(a: argparse.Namespace) -> int:
     return 0
 
 
+def _judge(a: argparse.Namespace) -> int:
+    from neuspring import perceive
+
+    perceive.judge(a.capture.parent, a.masks, a.tracks, a.lifted, a.truth, _settings(a.settings), a.output)
+    return 0
+
+
+def _perception_table(a: argparse.Namespace) -> int:
+    from neuspring import tables_perception
+
+    scenarios = [(name, str(category)) for name, category in _json_mapping("--scenarios", a.scenarios).items()]
+    print(tables_perception.write(tables_perception.collect(a.results, scenarios), a.output.parent))
+    return 0
+
+
 def _observe(a: argparse.Namespace) -> int:
     from neuspring import stages
 
@@ -221,8 +236,17 @@ def _parser() -> argparse.ArgumentParser:
     lift = add(
         "lift", _lift, "masks and tracks of all cameras -> points in the world, shape prior", "capture", "settings", "output"
     )
-    lift.add_argument("--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order")
-    lift.add_argument("--tracks", type=Path, nargs="+", required=True, help="tracks.json of every camera, in the same order")
+    judge = add("judge", _judge, "what perception made of a synthetic capture -> its errors", "capture", "settings", "output")
+    for command in (lift, judge):
+        command.add_argument(
+            "--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order"
+        )
+        command.add_argument("--tracks", type=Path, nargs="+", required=True, help="tracks.json of every camera, in the same order")
+    judge.add_argument("--lifted", type=Path, required=True, help="lifted.json")
+    judge.add_argument("--truth", type=Path, required=True, help="truth.npz of the synthetic scene")
+    judged = add("perception-table", _perception_table, "errors of perception, per category", "output")
+    judged.add_argument("--results", type=Path, required=True)
+    judged.add_argument("--scenarios", required=True, help="names and categories, as JSON")
 
     observe = add("observe", _observe, "capture -> observations.npz", "scenario", "settings", "output")
     observe.add_argument("--capture", type=Path, help="capture.json of raw video")

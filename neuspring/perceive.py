@@ -99,14 +99,7 @@ def lift(folder: Path, masks: Sequence[Path], tracks: Sequence[Path], settings: 
 
     clock = Stopwatch()
     capture, chosen = Capture.load(folder), settings.perception
-    if not len(masks) == len(tracks) == len(capture.cameras):
-        raise InputError(
-            "--masks, --tracks", f"one record per camera is required: {list(capture.cameras)}", (len(masks), len(tracks))
-        )
-    loaded = {n: Masks.load(StageRecord.load(path).file("masks", path)) for n, path in zip(capture.cameras, masks, strict=True)}
-    followed = {
-        n: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for n, path in zip(capture.cameras, tracks, strict=True)
-    }
+    loaded, followed = _of_cameras(capture, masks, tracks)
     lifted = run(capture, loaded, followed, chosen.lift)
     prior = shape_prior(capture, loaded, lifted.cloud, chosen.shape)
     paths = {"lifted": output.with_name("lifted.npz"), "shape": output.with_name("shape.npz")}
@@ -115,6 +108,26 @@ def lift(folder: Path, masks: Sequence[Path], tracks: Sequence[Path], settings: 
     paths["picture"] = figures.lifted_figure(lifted, prior, output.with_name("lifted.png"))
     facts = {**lifted.facts, **{f"shape_{name}": value for name, value in prior.facts.items()}}
     _record(clock, "lift", paths, facts, (chosen.lift, chosen.shape), folder).save(output)
+
+
+def judge(
+    folder: Path, masks: Sequence[Path], tracks: Sequence[Path], lifted_record: Path, truth: Path, settings: Config, output: Path
+) -> None:
+    """What perception made of a synthetic capture -> its errors against the truth, judged.json."""
+    from neuspring.data.synthetic.truth import Truth
+    from neuspring.perception import judge as judges
+
+    clock, capture = Stopwatch(), Capture.load(folder)
+    loaded, followed = _of_cameras(capture, masks, tracks)
+    lifted = LiftedTracks.load(StageRecord.load(lifted_record).file("lifted", lifted_record))
+    known = Truth.load(truth)
+    facts = judges.judge(capture, known, loaded, followed, lifted, settings.perception.shape)
+    backends = {"segment": next(iter(loaded.values())).backend, "track": next(iter(followed.values())).backend}
+    clip = {"certificate_mm": 1e3 * known.certificate, "sensitivity_mm": 1e3 * known.sensitivity}
+    clip |= {"least_jacobian": float(known.least_jacobian.min()), "frames": float(capture.frame_count)}
+    _record(
+        clock, "judge", {}, {**facts, **clip, **backends, **capture.description.provenance}, settings.perception.shape, folder
+    ).save(output)
 
 
 def assemble(row: ScenarioRow, folder: Path, lifted_record: Path, settings: Config) -> Observations:
@@ -150,6 +163,19 @@ def assemble(row: ScenarioRow, folder: Path, lifted_record: Path, settings: Conf
         interior_points=interior,
         tracks=capture.tracks(),
     )
+
+
+def _of_cameras(capture: Capture, masks: Sequence[Path], tracks: Sequence[Path]) -> tuple[dict[str, Masks], dict[str, PixelTracks]]:
+    """Masks and tracks by camera, from records in the capture's order."""
+    if not len(masks) == len(tracks) == len(capture.cameras):
+        raise InputError(
+            "--masks, --tracks", f"one record per camera is required: {list(capture.cameras)}", (len(masks), len(tracks))
+        )
+    loaded = {n: Masks.load(StageRecord.load(path).file("masks", path)) for n, path in zip(capture.cameras, masks, strict=True)}
+    followed = {
+        n: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for n, path in zip(capture.cameras, tracks, strict=True)
+    }
+    return loaded, followed
 
 
 def _given(capture: Capture, camera: str) -> np.ndarray:

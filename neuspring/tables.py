@@ -226,7 +226,7 @@ def _method_table(
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
         cells.append(f"{status.get('ok', 0)}/{sum(status.values())}{failed}")
         rows.append(cells)
-    return _markdown(["Method", *headings.values(), "Runs"], rows)
+    return markdown(["Method", *headings.values(), "Runs"], rows)
 
 
 def _difference_table(
@@ -239,7 +239,7 @@ def _difference_table(
             found = part[(part["task"] == task) & (part["metric"] == metric)]
             cells.append("–" if not len(found) else (cell or _interval)(found.iloc[0]))
         rows.append(cells)
-    return _markdown(["Method", *headings.values()], rows)
+    return markdown(["Method", *headings.values()], rows)
 
 
 def _interval(row: Any) -> str:
@@ -262,7 +262,7 @@ def per_scenario_text(scores: pd.DataFrame) -> str:
     for (scenario, method), part in scores.groupby(["scenario", "method"], sort=False):
         means = part.groupby(["task", "metric"])["value"].mean()
         rows.append([str(scenario), str(method), *(f"{MM * means[key]:.2f}" if key in means else "–" for key in HEADINGS)])
-    return "\n".join(_markdown(["Scenario", "Method", *HEADINGS.values()], rows)) + "\n"
+    return "\n".join(markdown(["Scenario", "Method", *HEADINGS.values()], rows)) + "\n"
 
 
 def timing_text(runs: pd.DataFrame) -> str:
@@ -277,7 +277,7 @@ def timing_text(runs: pd.DataFrame) -> str:
             text = f"{seconds.median():.1f} s" if len(seconds) else "–"
             cells.append(text + (f", {memory.median():.0f} MB" if len(memory) else ""))
         rows.append(cells)
-    return "\n".join(_markdown(["Method", *stages], rows)) + "\n"
+    return "\n".join(markdown(["Method", *stages], rows)) + "\n"
 
 
 def write_clusters(collected: Collected, folder: Path) -> str:
@@ -329,7 +329,8 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _markdown(header: list[str], rows: list[list[str]]) -> list[str]:
+def markdown(header: list[str], rows: list[list[str]]) -> list[str]:
+    """Lines of a table whose columns are as wide as their widest cell."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
 
     def line(cells: list[str]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from neuspring import config
+from neuspring import config, config_perception
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -64,6 +64,17 @@ KEYS = {
     "released_quirks": config.ReleasedQuirks,
     "toy": config.Toy,
     "mocap": config.Mocap,
+    "synthetic": config_perception.Synthetic,
+    "perception": config_perception.Perception,
+    "perception.segment": config_perception.Segmentation,
+    "perception.segment.opencv": config_perception.OpenCvSegmentation,
+    "perception.segment.grounded_sam2": config_perception.GroundedSam2,
+    "perception.track": config_perception.PointTracking,
+    "perception.track.opencv": config_perception.OpenCvTracking,
+    "perception.track.cotracker3": config_perception.CoTracker3,
+    "perception.lift": config_perception.Lift,
+    "perception.shape": config_perception.ShapePriorSettings,
+    "perception.sample": config_perception.Sampling,
     "tracking": config.Tracking,
 }
 ROWS = {"rows of methods.yaml": config.Method, "rows of searches.yaml": config.SearchRow}
@@ -92,7 +103,7 @@ def section(title: str, kind: type) -> str:
 
 def fields(kind: type) -> list[tuple[str, str, str, str]]:
     """(key, allowed, default, meaning) of every field; the meaning is the text below its declaration."""
-    hints, meanings = typing.get_type_hints(kind, include_extras=True), declared_meanings(kind.__name__)
+    hints, meanings = typing.get_type_hints(kind, include_extras=True), declared_meanings(kind)
     found = []
     for spec in dataclasses.fields(kind):
         is_section = dataclasses.is_dataclass(hints[spec.name])
@@ -102,10 +113,10 @@ def fields(kind: type) -> list[tuple[str, str, str, str]]:
     return found
 
 
-def declared_meanings(name: str) -> dict[str, str]:
-    """Key -> the text below its declaration, of a class of `neuspring.config`."""
-    tree = ast.parse((ROOT / "neuspring" / "config.py").read_text())
-    node = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+def declared_meanings(kind: type) -> dict[str, str]:
+    """Key -> the text below its declaration in the class's module."""
+    tree = ast.parse((ROOT / f"{kind.__module__.replace('.', '/')}.py").read_text())
+    node = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__)
     found = {}
     for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):

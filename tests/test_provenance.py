@@ -85,10 +85,13 @@ def test_declarations_and_reporting_do_not_count(copy):
 
 LEVELS = [
     {"errors"},
+    {"config_types"},
+    {"config_perception"},
     {"artifacts", "config", "progress"},
-    {"benchmark", "records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
+    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
     {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios"},
-    {"search", "fit", "carry", "figures", "tables"},
+    {"benchmark", "perception", "search", "fit", "carry", "figures", "tables"},
+    {"perceive", "tables_perception"},
     {"stages"},
     {"cli"},
     {"__main__"},

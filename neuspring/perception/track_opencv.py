@@ -50,7 +50,7 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
     found = Followed(np.repeat(start[None], frames, axis=0), np.zeros((frames, count), dtype=bool))
     found.visible[0] = True
     first = before = _seen(capture, camera, 0, settings)
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) if settings.method == "dis" else None
+    flow = _dense_flow() if settings.method == "dis" else None
     last = 0
     for frame in range(1, frames):
         found.pixels[frame] = found.pixels[frame - 1]
@@ -81,6 +81,13 @@ def choose(labels: np.ndarray, count: int, seed: int) -> np.ndarray:
     if len(pixels) <= count:
         return pixels
     return pixels[np.sort(np.random.default_rng(seed).choice(len(pixels), count, replace=False))]
+
+
+def _dense_flow() -> cv2.DISOpticalFlow:
+    """DIS flow down to whole pixels; its presets stop at every second or fourth."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    return flow
 
 
 def _follow(

@@ -47,6 +47,7 @@ CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 DEVICE = CONFIG.device
 TABLES = f"{RESULTS}/{CONFIG.tables}/summary.md"
+PERCEPTION_TABLE = f"{RESULTS}/{CONFIG.tables}/perception.md"
 
 
 # Only for `--software-deployment-method conda`; without it the running environment is used.
@@ -109,7 +110,9 @@ def raw_files(wildcards):
     if BENCHMARK.scenarios[wildcards.scenario].source != "phystwin_raw":
         return []
     folder = BENCHMARK.data_path(wildcards.scenario)
-    return [str(folder / name) for name in phystwin_raw.FILES if (folder / name).exists()]
+    return [
+        str(folder / name) for name in phystwin_raw.FILES if (folder / name).exists()
+    ]
 
 
 def camera_files(wildcards, name):
@@ -118,6 +121,22 @@ def camera_files(wildcards, name):
         f"{RESULTS}/{wildcards.scenario}/perception/{camera}/{name}"
         for camera in cameras
     ]
+
+
+def judged_scenarios():
+    """Scenarios of this run whose truth is known, and their categories."""
+    rows = {name: BENCHMARK.scenarios[name] for name in CONFIG.scenarios}
+    return {
+        name: row.category for name, row in rows.items() if row.source == "synthetic"
+    }
+
+
+def judged_records():
+    return [f"{RESULTS}/{name}/perception/judged.json" for name in judged_scenarios()]
+
+
+def perception_tables():
+    return [PERCEPTION_TABLE] if judged_scenarios() else []
 
 
 def capture_settings(wildcards):

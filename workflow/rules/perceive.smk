@@ -1,8 +1,8 @@
 rule capture:
-    output:
-        f"{RESULTS}/{{scenario}}/capture/capture.json",
     input:
         raw_files,
+    output:
+        f"{RESULTS}/{{scenario}}/capture/capture.json",
     log:
         f"{RESULTS}/logs/capture/{{scenario}}.log",
     benchmark:
@@ -104,3 +104,57 @@ rule lift:
     shell:
         "python -m neuspring lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
         " --settings {params.settings:q} --output {output:q} 2>&1 | tee -a {log:q}"
+
+
+rule judge:
+    input:
+        capture=capture_file,
+        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
+        tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
+        lifted=rules.lift.output,
+    output:
+        f"{RESULTS}/{{scenario}}/perception/judged.json",
+    log:
+        f"{RESULTS}/logs/judge/{{scenario}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/judge/{{scenario}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        truth=lambda wildcards: f"{RESULTS}/{wildcards.scenario}/truth.npz",
+        settings=perception_settings("shape"),
+        code=code_digest("neuspring.perception.judge", stage="perceive.judge"),
+    shell:
+        "python -m neuspring judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+        " --lifted {input.lifted:q} --truth {params.truth:q} --settings {params.settings:q} --output {output:q}"
+        " 2>&1 | tee -a {log:q}"
+
+
+rule perception_table:
+    input:
+        judged_records(),
+    output:
+        PERCEPTION_TABLE,
+    log:
+        f"{RESULTS}/logs/{CONFIG.tables}_perception.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/{CONFIG.tables}_perception.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    params:
+        results=RESULTS,
+        scenarios=json.dumps(judged_scenarios()),
+        code=code_digest("neuspring.tables_perception"),
+    shell:
+        "python -m neuspring perception-table --results {params.results:q} --scenarios {params.scenarios:q} --output {output:q}"
+        " > {log:q} 2>&1"

@@ -91,21 +91,3 @@ def cast(
             slope[y, x] = wp.abs(wp.dot(normal, ray))
     for k in range(3):
         colour[y, x, k] = wp.uint8(wp.clamp(wp.pow(wp.max(total[k], 0.0), gamma) * 255.0 + 0.5, 0.0, 255.0))
-
-
-@wp.kernel(enable_backward=False)
-def first_hit(
-    mesh: wp.uint64,
-    origin: wp.vec3,
-    rays: wp.array[wp.vec3],
-    farthest: float,
-    face: wp.array[int],
-    weights: wp.array[wp.vec3],
-):
-    """The triangle that a ray meets first, -1 for none, and the weights of its corners."""
-    i = wp.tid()
-    hit = wp.mesh_query_ray(mesh, origin, rays[i], farthest)
-    face[i] = -1
-    if hit.result:
-        face[i] = hit.face
-        weights[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)

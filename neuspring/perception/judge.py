@@ -1,0 +1,131 @@
+"""How well perception did on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.config_perception import ShapePriorSettings
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.synthetic.correspond import at_points, under_pixels
+from neuspring.data.synthetic.truth import Truth
+from neuspring.errors import InputError
+from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.perception.sample import inside
+from neuspring.perception.shape_prior import visual_hull
+
+MM = 1e3
+GRID = 0.003
+"""m, of the points that volumes are compared on."""
+SURFACE_POINTS = 4000
+
+
+def judge(
+    capture: Capture,
+    truth: Truth,
+    masks: Mapping[str, Masks],
+    tracks: Mapping[str, PixelTracks],
+    lifted: LiftedTracks,
+    settings: ShapePriorSettings,
+) -> dict[str, float]:
+    """Quality numbers; lengths in mm, image errors in pixels, shares and IoU in 0 to 1."""
+    facts = mask_quality(capture, masks) | track_quality(capture, truth, tracks) | lifted_quality(truth, lifted)
+    if len(truth.tetrahedra):
+        facts |= hull_quality(capture, truth, masks, lifted.cloud, settings)
+    return facts
+
+
+def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, float]:
+    """Mean intersection over union with the true masks, over cameras and frames that show the thing."""
+    facts = {}
+    for name, label in (("object", OBJECT), ("hands", HANDS)):
+        found = []
+        for camera in capture.cameras:
+            for frame in range(capture.frame_count):
+                if capture.has(camera, frame):
+                    own, true = masks[camera].labels[frame] == label, capture.mask(camera, frame) == label
+                    if true.any():
+                        found.append(float((own & true).sum() / (own | true).sum()))
+        facts[f"mask_iou_{name}"] = float(np.mean(found))
+    return facts
+
+
+def track_quality(capture: Capture, truth: Truth, tracks: Mapping[str, PixelTracks]) -> dict[str, float]:
+    """Error in pixels of visible points on the object after frame 0, and the share that is still followed in the last frame."""
+    errors, alive = [], []
+    for name, camera in capture.cameras.items():
+        start = tracks[name].pixels[0]
+        x, y = np.round(start).astype(int).T
+        material = under_pixels(truth, camera, start)
+        own = (material.face >= 0) & (capture.mask(name, 0)[y, x] == OBJECT)
+        off = np.linalg.norm(camera.project(material.places)[0] - tracks[name].pixels, axis=2)
+        errors.append(off[1:][tracks[name].visible[1:] & own])
+        alive.append(tracks[name].visible[-1, own])
+    facts = _spread("track", np.concatenate(errors), "px")
+    return facts | {"track_points": float(sum(map(len, alive))), "track_survival": float(np.concatenate(alive).mean())}
+
+
+def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
+    """Distance in mm of lifted points from the material that they were nearest to in frame 0, and of controllers from the rigid
+    motion of their hand."""
+    places = at_points(truth, lifted.object_points[0]).places
+    off = np.linalg.norm(places - lifted.object_points, axis=2)
+    kept = lifted.object_visibility[1:]
+    trusted = lifted.object_motion_valid[:-1] & kept
+    facts = _spread("lifted", MM * off[1:][kept], "mm") | _spread("trusted", MM * off[1:][trusted], "mm")
+    facts |= {"lifted_share": float(kept.mean()), "trusted_share": float(trusted.mean())}
+    return facts | _spread("controllers", MM * _controller_errors(truth, lifted.controller_points), "mm")
+
+
+def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
+    """[T - 1, C], m; a controller belongs to the hand whose motion it follows best."""
+    off = []
+    for hand in range(truth.hand_poses.shape[1]):
+        poses = truth.hand_poses[:, hand].astype(float)
+        local = Rotation.from_quat(poses[0, 3:]).inv().apply(controllers[0] - poses[0, :3])
+        moved = np.stack([Rotation.from_quat(pose[3:]).apply(local) + pose[:3] for pose in poses])
+        off.append(np.linalg.norm(moved - controllers, axis=2)[1:])
+    best = np.argmin([errors.mean(axis=0) for errors in off], axis=0)
+    return np.stack(off)[best, :, np.arange(controllers.shape[1])]
+
+
+def hull_quality(
+    capture: Capture, truth: Truth, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings
+) -> dict[str, float]:
+    """Volume IoU and mean surface distance of the visual hull of all cameras, and of the first one and two."""
+    surface = ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    facts = {}
+    for count in range(1, len(capture.cameras) + 1):
+        names = list(capture.cameras)[:count]
+        seen = Capture(capture.folder, replace(capture.description, cameras=capture.description.cameras[:count]))
+        try:
+            hull = visual_hull(seen, {name: masks[name] for name in names}, cloud, settings)
+        except InputError:
+            facts[f"hull_iou_{count}"] = 0.0
+            continue
+        least, most = (np.minimum, np.maximum)
+        corners = (least(low, hull.vertices.min(axis=0)), most(high, hull.vertices.max(axis=0)))
+        grid = np.stack(np.meshgrid(*[np.arange(a, b, GRID) for a, b in zip(*corners, strict=True)], indexing="ij"), axis=-1)
+        ours, true = (inside(prior, grid.reshape(-1, 3)) for prior in (hull, surface))
+        facts[f"hull_iou_{count}"] = float((ours & true).sum() / (ours | true).sum())
+        facts[f"hull_distance_{count}_mm"] = MM * _apart(hull.vertices, surface.vertices)
+    return facts
+
+
+def _apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Mean of both mean nearest distances between vertices, m."""
+    rng = np.random.default_rng(0)
+    a, b = (rng.permutation(points)[:SURFACE_POINTS] for points in (first, second))
+    return float((cKDTree(second).query(a)[0].mean() + cKDTree(first).query(b)[0].mean()) / 2.0)
+
+
+def _spread(name: str, values: np.ndarray, unit: str) -> dict[str, float]:
+    """Median and 95th percentile; neither where there is nothing."""
+    if not values.size:
+        return {}
+    return {f"{name}_median_{unit}": float(np.median(values)), f"{name}_p95_{unit}": float(np.percentile(values, 95))}

@@ -1,0 +1,72 @@
+"""Segmentation without a network on a film whose masks are known, and the plumbing of the network's."""
+
+import numpy as np
+import pytest
+
+from neuspring.config_perception import OpenCvSegmentation
+from neuspring.data.capture import HANDS, OBJECT, Writer
+from neuspring.errors import InputError
+from neuspring.perception import segment_opencv
+from tests.data.test_capture import describe, entry
+
+from .filmed import FRAMES, film
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return film(tmp_path_factory.mktemp("film"), cameras=2, missing={1: (3,)})
+
+
+def overlap(capture, labels, camera: str, frame: int, label: int) -> float:
+    own, true = labels[frame] == label, capture.mask(camera, frame) == label
+    return float((own & true).sum() / (own | true).sum())
+
+
+@pytest.mark.parametrize("camera", ["0", "1"])
+def test_object_and_hand_are_found_and_told_apart(capture, camera):
+    labels = segment_opencv.segment(capture, camera, OpenCvSegmentation())
+    for frame in range(FRAMES):
+        if capture.has(camera, frame):
+            assert overlap(capture, labels, camera, frame, OBJECT) > 0.9
+            assert overlap(capture, labels, camera, frame, HANDS) > 0.85
+
+
+def test_a_frame_that_is_missing_has_no_labels(capture):
+    labels = segment_opencv.segment(capture, "1", OpenCvSegmentation())
+    assert not labels[3].any()
+    assert labels[2].any()
+    assert labels[4].any()
+
+
+def test_an_empty_table_has_no_object(tmp_path):
+    writer = Writer(tmp_path, describe(cameras=(entry("0", 64, 48),), masks=False))
+    for frame in range(5):
+        writer.frame("0", frame, np.full((48, 64, 3), 120, np.uint8), np.full((48, 64), 900, np.uint16))
+    with pytest.raises(InputError, match=r"an object more than 12 mm above the table z = 0 is required; received nothing"):
+        segment_opencv.segment(writer.finish(), "0", OpenCvSegmentation())
+
+
+def test_without_a_hand_s_colour_the_settings_are_named(capture):
+    with pytest.raises(InputError, match=r"hands need a hue in \[100\.0, 110\.0\] degrees.*Set perception\.segment\.opencv"):
+        segment_opencv.segment(capture, "0", OpenCvSegmentation(hand_hue=(100.0, 110.0)))
+
+
+def test_small_pieces_of_hand_colour_belong_to_the_object():
+    labels = np.zeros((40, 60), np.uint8)
+    labels[10:30, 5:35] = OBJECT
+    labels[10:14, 5:9] = HANDS
+    labels[5:25, 40:55] = HANDS
+    tidy = segment_opencv._tidy(labels, OpenCvSegmentation())
+    assert (tidy[10:14, 5:9] == OBJECT).all()
+    assert (tidy[5:25, 40:55] == HANDS).all()
+
+
+def test_holes_are_filled_up_to_a_size():
+    seen = np.zeros((40, 60), bool)
+    seen[5:35, 5:55] = True
+    seen[10:12, 10:12] = False
+    seen[20:30, 20:40] = False
+    filled = seen | segment_opencv._holes(seen, 0.01)
+    assert filled[10:12, 10:12].all()
+    assert not filled[20:30, 20:40].any()
+    assert not filled[:5].any()
