@@ -145,9 +145,9 @@ class ShapePriorSettings:
     """What the cameras do not see of the object in frame 0."""
 
     __pydantic_config__ = STRICT
-    backend: Literal["auto", "none", "visual_hull", "mesh"] = "auto"
+    backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
     """auto: none for `thin` categories, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
-    mesh: a file, aligned to what was seen."""
+    mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure what perception costs."""
     thin: tuple[str, ...] = ("cloth", "package")
     """Categories that need no prior."""
     voxel: Positive = 0.003
@@ -199,8 +199,9 @@ class PointTracking:
     """Where the pixels of frame 0 go."""
 
     __pydantic_config__ = STRICT
-    backend: Literal["opencv", "cotracker3"] = "opencv"
-    """opencv: Lucas-Kanade or DIS flow. cotracker3: the online CoTracker3 of torch.hub."""
+    backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
+    """opencv: Lucas-Kanade or DIS flow. cotracker3: the online CoTracker3 of torch.hub. truth: exact, of synthetic captures, to
+    measure what perception costs; as many points as opencv."""
     opencv: OpenCvTracking = field(default_factory=OpenCvTracking)
     """See [perception.track.opencv](#perceptiontrackopencv)."""
     cotracker3: CoTracker3 = field(default_factory=CoTracker3)

@@ -76,6 +76,10 @@ def track(folder: Path, camera: str, masks_record: Path, settings: Config, devic
         from neuspring.perception import track_opencv
 
         found = track_opencv.track(capture, camera, masks.labels, chosen.opencv, settings.perception.seed)
+    elif chosen.backend == "truth":
+        from neuspring.perception import track_truth
+
+        found = track_truth.track(capture, camera, masks.labels, chosen.opencv.points, settings.perception.seed)
     else:
         from neuspring.perception import track_cotracker
         from neuspring.physics.solver import resolve_device

@@ -159,6 +159,7 @@ BACKENDS = {
     ("segment", "grounded_sam2"): "neuspring.perception.segment_sam2",
     ("track", "opencv"): "neuspring.perception.track_opencv",
     ("track", "cotracker3"): "neuspring.perception.track_cotracker",
+    ("track", "truth"): "neuspring.perception.track_truth",
 }
 
 
@@ -175,10 +176,12 @@ def perception_settings(*names):
     for name in ("segment", "track"):
         if name in chosen:
             backend = chosen[name]["backend"]
+            # The truth takes its count of points from the settings of opencv.
+            own = "opencv" if backend == "truth" else backend
             chosen[name] = {
                 key: value
                 for key, value in chosen[name].items()
-                if key in ("backend", backend)
+                if key in ("backend", own)
             }
     return json.dumps({"perception": chosen}, sort_keys=True)
 

@@ -1,0 +1,83 @@
+"""Raw RGBD through the real workflow: a synthetic package at the smallest size, and a folder of the user's own."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from tests.perception.filmed import film
+
+from .project import copy_workflow, jobs, run
+
+PACKAGE = "synthetic_weird_package"
+PERCEPTION = {
+    "lift": {"controller_gaps": "rigid", "controller_share": 0.5, "least_controllers": 5, "neighbourhood": 0.03},
+    "sample": {"voxel": 0.02},
+}
+SYNTHETIC = {
+    "scenarios": [PACKAGE],
+    "methods": ["search_only"],
+    "compare_with": "search_only",
+    "synthetic": {"size": "tiny", "frames": 8},
+    "perception": {"segment": {"backend": "opencv"}, **PERCEPTION},
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    project = copy_workflow(tmp_path_factory.mktemp("perception") / "project")
+    result = run(project, SYNTHETIC)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return project
+
+
+def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(finished):
+    results = finished / "results"
+    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    assert set(scores["scenario"]) == {PACKAGE}
+    assert scores["value"].notna().all()
+    table = pd.read_csv(results / "tables" / "perception.csv")
+    # At 120 x 68 pixels, one of which is 5 mm wide.
+    assert table["mask_iou_object"][0] > 0.85
+    assert table["lifted_median_mm"][0] < 6
+    assert table["hull_iou_3"][0] > 0.6
+    assert "| package " in (results / "tables" / "perception.md").read_text()
+
+
+def test_cameras_are_perceived_by_jobs_of_their_own_and_nothing_reruns(finished):
+    assert "Nothing to be done" in (again := run(finished, SYNTHETIC, "--dry-run")).stdout + again.stderr
+    planned = jobs(run(finished, SYNTHETIC | {"results": "other"}, "--dry-run"))
+    assert (planned["capture"], planned["segment"], planned["track"], planned["lift"], planned["observe"]) == (1, 3, 3, 1, 1)
+    # A change of the last step leaves the steps before it alone.
+    changed = SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}}
+    planned = jobs(run(finished, changed, "--dry-run"))
+    assert "lift" not in planned
+    assert planned["observe"] == 1
+
+
+def test_the_truth_lies_beside_the_capture_and_not_in_it(finished):
+    folder = finished / "results" / PACKAGE
+    assert (folder / "truth.npz").is_file()
+    assert {path.name for path in (folder / "capture").iterdir()} == {"capture.json", "color", "depth", "mask", "tracks.json"}
+
+
+def test_a_folder_of_the_user_s_own(place):
+    film(place / "mine" / "film", cameras=2)
+    table = place / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + "film\tcapture\ttoy\tfilm\tfalse\ttrue\n")
+    changes = {"scenarios": ["film"], "methods": ["search_only"], "compare_with": "search_only", "data_root": str(place / "mine")}
+    result = run(place, changes | {"perception": PERCEPTION})
+    assert result.returncode == 0, result.stdout + result.stderr
+    record = json.loads((place / "results" / "film" / "search_only" / "0" / "run.json").read_text())
+    assert record["status"] == "ok"
+    # No truth, no table of perception.
+    assert not (place / "results" / "tables" / "perception.md").exists()
+
+
+def test_a_capture_that_is_not_there_is_named_before_any_job(place):
+    table = place / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + "film\tcapture\ttoy\tfilm\tfalse\ttrue\n")
+    result = run(place, {"scenarios": ["film"], "methods": ["search_only"], "data_root": str(place)}, "--dry-run")
+    assert result.returncode != 0
+    assert "film" in result.stdout + result.stderr
+    assert "Traceback" not in result.stdout + result.stderr
