@@ -23,9 +23,9 @@ snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
 ```
 
 The "default" column below is the program's: what holds where neither `config.yaml` nor an overlay sets a key. `config.yaml` sets
-`search.rollouts`, `search.start` and `fit.epochs` for its toy scenes, so overlays for other data set them anew. `--config` on the
-command line is for single values and lists of names at the top level; Snakemake hands numbers in lists over as text, which is
-refused, so `seeds` and nested keys are set in an overlay.
+`synthetic`, `perception`, `search.rollouts`, `search.start` and `fit.epochs` for its scenes, so overlays for other data set them
+anew. `--config` on the command line is for single values and lists of names at the top level; Snakemake hands numbers in lists
+over as text, which is refused, so `seeds` and nested keys are set in an overlay.
 
 | overlays, in this order | what they measure |
 |---|---|
@@ -37,6 +37,12 @@ refused, so `seeds` and nested keys are set in an overlay.
 | `mocap.yaml`, `mocap_prediction.yaml` | correcting the state at the last training frame; averages over seeds |
 | `mocap.yaml`, `mocap_fine.yaml` | two recordings at 50 Hz with twice the rings |
 | `mocap.yaml`, `mocap_eval.yaml` | twins fitted on the six evaluation recordings |
+| `toy.yaml` | three toy scenes without images, the smallest run |
+| `synthetic.yaml` | the 22 synthetic scenes at full length, three seeds; alone it is the whole benchmark from raw video |
+| `perception.yaml`; then `clean_depth.yaml` | errors of perception, one scene per category; with a depth camera without flaws |
+| `true_observations.yaml` | the demo's scenes observed perfectly |
+| `raw.yaml` | your own RGBD video, or PhysTwin's raw layout, with the networks and settings of the released processing |
+| `heldout.yaml` | four scenes moved by another engine |
 | `clusters.yaml`, alone or after `mocap.yaml` | 1 to 10 regions |
 | `phystwin.yaml` | the 22 released cases |
 | ..., `one_seed.yaml` | seed 0 of any of them, no transfers |

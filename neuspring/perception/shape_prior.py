@@ -60,10 +60,11 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     if settings.symmetry:
         inside |= _mirrored(inside, grid, cloud, settings.voxel)
     inside = _largest(inside)
-    if not inside.any():
-        remedy = "Masks, depth and calibration of frame 0 contradict each other; or take shape_prior.backend: none."
-        raise InputError(f"{capture.folder}, visual hull", "at least one voxel must be consistent with all cameras", "none", remedy)
     vertices, faces = _surface(inside, low, settings.voxel, settings.smoothing)
+    if not len(faces):
+        rule = f"more than specks of {1e3 * settings.voxel:g} mm must be consistent with all cameras"
+        remedy = "Masks, depth and calibration of frame 0 contradict each other; or take perception.shape.backend: none."
+        raise InputError(f"{capture.folder}, visual hull", rule, f"{inside.sum()} voxels", remedy)
     volume = float(inside.sum() * settings.voxel**3)
     return ShapePrior(
         vertices=vertices, faces=faces, backend="visual_hull", facts={"volume": volume, "cameras": len(capture.cameras)}

@@ -88,7 +88,7 @@ def test_a_hand_before_the_object_does_not_carve_it(tmp_path):
 def test_contradicting_views_are_refused(tmp_path):
     capture, masks, cloud, _ = film(tmp_path, 2)
     masks["1"] = Masks(labels=np.roll(masks["1"].labels, 55, axis=2), backend="given")
-    with pytest.raises(InputError, match="at least one voxel must be consistent with all cameras"):
+    with pytest.raises(InputError, match="must be consistent with all cameras"):
         shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings())
 
 

@@ -1,0 +1,141 @@
+"""A synthetic capture, its truth, perfect perception of it, and the judge that tells perfect from spoilt."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from neuspring.config import ScenarioRow
+from neuspring.config_perception import Lift, ShapePriorSettings, Synthetic
+from neuspring.data.capture import OBJECT, Capture
+from neuspring.data.synthetic import make as making
+from neuspring.data.synthetic.correspond import at_points, under_pixels
+from neuspring.errors import InputError, NumericalFailure
+from neuspring.perception import track_truth
+from neuspring.perception.judge import judge
+from neuspring.perception.lift import lift
+from neuspring.perception.results import Masks, PixelTracks
+
+from .filmed import film
+
+ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)
+TINY = Synthetic(size="tiny", frames=6, cameras=2)
+SETTINGS = Lift(neighbourhood=0.03, controller_gaps="rigid", controller_share=0.5, least_controllers=3)
+
+
+def create(folder, settings: Synthetic = TINY) -> Capture:
+    capture, truth = making.make(ROW, settings, folder / "capture")
+    truth.save(folder / "truth.npz")
+    return capture
+
+
+@pytest.fixture(scope="module")
+def perfect(tmp_path_factory):
+    """The capture, its truth, and what perfect masks and tracks become."""
+    capture = create(tmp_path_factory.mktemp("box"))
+    frames = range(capture.frame_count)
+    masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
+    tracks = {}
+    for camera in capture.cameras:
+        found = track_truth.track(capture, camera, masks[camera].labels, 500, 0)
+        tracks[camera] = PixelTracks(pixels=found.pixels, visible=found.visible, backend="truth")
+    lifted = lift(capture, masks, tracks, SETTINGS)
+    return SimpleNamespace(capture=capture, truth=track_truth.load(capture), masks=masks, tracks=tracks, lifted=lifted)
+
+
+def verdict(found, **changes) -> dict[str, float]:
+    one = SimpleNamespace(**(vars(found) | changes))
+    return judge(one.capture, one.truth, one.masks, one.tracks, one.lifted, ShapePriorSettings())
+
+
+def test_perfect_tracks_have_no_error_and_the_rest_is_the_sensor_s(perfect):
+    facts = verdict(perfect)
+    assert facts["mask_iou_object"] == facts["mask_iou_hands"] == 1.0
+    assert facts["track_p95_px"] < 1e-3
+    # Depth noise of 1 mm, pixels of 5 mm.
+    assert facts["lifted_median_mm"] < 3
+    assert facts["controllers_median_mm"] < 3
+    assert 0 < facts["hull_iou_1"] < facts["hull_iou_2"] < 1
+
+
+def test_spoilt_perception_is_told_from_perfect(perfect):
+    shifted = {name: replace(t, pixels=t.pixels + np.array([3.0, 4.0], np.float32)) for name, t in perfect.tracks.items()}
+    shifted = {
+        name: replace(t, pixels=np.concatenate([perfect.tracks[name].pixels[:1], t.pixels[1:]])) for name, t in shifted.items()
+    }
+    assert verdict(perfect, tracks=shifted)["track_median_px"] == pytest.approx(5.0, abs=1e-3)
+    half = {name: replace(m, labels=np.where(np.arange(m.labels.shape[2]) % 2, m.labels, 0)) for name, m in perfect.masks.items()}
+    assert verdict(perfect, masks=half)["mask_iou_object"] == pytest.approx(0.5, abs=0.05)
+    moved = perfect.lifted.object_points.copy()
+    moved[1:, :, 2] += 0.02
+    assert verdict(perfect, lifted=replace(perfect.lifted, object_points=moved))["lifted_median_mm"] == pytest.approx(20, abs=2)
+
+
+def test_correspondences_stay_with_the_material(perfect):
+    truth = perfect.truth
+    chosen = np.arange(0, len(truth.surface_nodes), 7)
+    followed = at_points(truth, truth.surface(0)[chosen]).places
+    np.testing.assert_allclose(followed[-1], truth.surface(len(truth.nodes) - 1)[chosen], atol=2e-5)
+    camera = perfect.capture.cameras["0"]
+    y, x = np.nonzero(perfect.capture.mask("0", 0) == OBJECT)
+    pixels = np.stack([x, y], axis=1).astype(float)
+    material = under_pixels(truth, camera, pixels)
+    assert (material.face >= 0).mean() > 0.98
+    own = material.face >= 0
+    np.testing.assert_allclose(camera.project(material.places[0, own])[0], pixels[own], atol=1e-3)
+
+
+def test_annotated_tracks_are_material_points(perfect):
+    tracks = perfect.capture.tracks()
+    np.testing.assert_allclose(at_points(perfect.truth, tracks[0]).places, tracks, atol=3e-5)
+
+
+def test_a_clip_knows_its_numerics(perfect):
+    truth = perfect.truth
+    assert truth.certificate < 1e-3
+    assert truth.least_jacobian.min() > 0.5
+    assert truth.youngs_modulus.max() / truth.youngs_modulus.min() == pytest.approx(20)
+    assert (truth.held >= 0).any()
+    assert truth.touches[0].any()
+    assert (np.diff(truth.kinetic[:2]) > 0).all()
+
+
+def test_a_capture_follows_its_seed(perfect, tmp_path):
+    again, other = (create(tmp_path / str(seed), replace(TINY, seed=seed)) for seed in (0, 1))
+    for kind in ("color", "depth", "mask"):
+        assert again.path(kind, "1", 4).read_bytes() == perfect.capture.path(kind, "1", 4).read_bytes()
+    assert other.path("color", "1", 4).read_bytes() == perfect.capture.path("color", "1", 4).read_bytes()
+    assert other.path("depth", "1", 4).read_bytes() != perfect.capture.path("depth", "1", 4).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("single_lift_slot", "must be a scene, or vbd/<scene>"),
+        ("mpm/weird_package", "must be a scene, or vbd/<scene>"),
+        ("vbd/single_lift_cloth", "the held-out engine has solids that hands grip, no cloths and no pushes"),
+        ("vbd/single_push_rope", "no cloths and no pushes"),
+    ],
+)
+def test_scenes_that_there_are_not(tmp_path, monkeypatch, path, message):
+    monkeypatch.setattr(making, "settle", lambda body, rate: body.nodes)
+    with pytest.raises(InputError, match=message):
+        making.make(replace(ROW, path=path), TINY, tmp_path)
+
+
+def test_clips_that_fail_are_refused(perfect):
+    crushed = replace(perfect.truth, least_jacobian=np.full_like(perfect.truth.least_jacobian, -0.1))
+    with pytest.raises(NumericalFailure, match=r"box: an element is crushed \(det F < 0\.02\) in 100% of the frames"):
+        making._refuse("box", crushed)
+    with pytest.raises(
+        NumericalFailure, match=r"move the mean node by 5\.00 mm, a start that is 1 um off by 0\.10 mm; not converged"
+    ):
+        making._refuse("box", replace(perfect.truth, certificate=0.005, sensitivity=0.0001))
+    making._refuse("cloth", replace(perfect.truth, certificate=0.005, sensitivity=0.004))
+
+
+def test_the_backend_truth_needs_a_synthetic_capture(tmp_path):
+    capture = film(tmp_path / "film", cameras=1)
+    with pytest.raises(InputError, match="the backend truth needs the truth of a synthetic scene"):
+        track_truth.load(capture)
