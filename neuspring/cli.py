@@ -118,7 +118,7 @@ def _observe(a: argparse.Namespace) -> int:
     from neuspring import stages
 
     settings = _settings(a.settings)
-    stages.observe(_row(a, settings), settings, a.capture and a.capture.parent, a.lifted, a.output)
+    stages.observe(_row(a, settings), settings, a.output, a.capture and a.capture.parent, a.lifted)
     return 0
 
 

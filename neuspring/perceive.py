@@ -12,7 +12,8 @@ import numpy as np
 from neuspring import config
 from neuspring.artifacts import Observations, Scenario
 from neuspring.config import Config, ScenarioRow
-from neuspring.data.capture import CAPTURE, Capture
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.data.check_capture import objects
 from neuspring.errors import InputError
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.records import StageRecord, Stopwatch, digest_file
@@ -28,6 +29,10 @@ def make_capture(row: ScenarioRow, settings: Config, output: Path) -> None:
 
         _, truth = make(row, settings.synthetic, output.parent)
         truth.save(output.parent.with_name("truth.npz"))
+        moved = f"{1e3 * truth.certificate:.2g} mm by twice as many, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
+        energy = truth.kinetic[-1] + truth.potential[-1]
+        print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
+        print(f"{row.scenario}: smallest det F {truth.least_jacobian.min():.2f}; energy at the end {energy:.3f} J", flush=True)
     elif row.source == "phystwin_raw":
         from neuspring.data import phystwin_raw
 
@@ -56,7 +61,7 @@ def segment(folder: Path, camera: str, settings: Config, device: str, output: Pa
         from neuspring.physics.solver import resolve_device
 
         labels = segment_sam2.segment(capture, camera, chosen.grounded_sam2, resolve_device(device))
-    facts = {"object_share": float((labels == 1).mean()), "hand_share": float((labels == 2).mean())}
+    facts = _mask_facts(capture, camera, labels)
     masks = Masks(labels=labels, backend=chosen.backend, facts=facts)
     path = output.with_name("masks.npz")
     masks.save(path)
@@ -180,6 +185,28 @@ def _of_cameras(capture: Capture, masks: Sequence[Path], tracks: Sequence[Path])
         n: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for n, path in zip(capture.cameras, tracks, strict=True)
     }
     return loaded, followed
+
+
+def _mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
+    """Quality numbers of masks; what makes a result worse is also said."""
+    there = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    gone = [frame for frame in there if not (labels[frame] == OBJECT).any()]
+    count = objects(labels[0])
+    if count > 1:
+        print(
+            f"camera {camera}: the object's mask of frame 0 has {count} pieces far apart; two objects become one twin", flush=True
+        )
+    if gone:
+        print(
+            f"camera {camera}: no object in {len(gone)} frames, first in frame {gone[0]}; its points are invisible there",
+            flush=True,
+        )
+    shares = {"object_share": float((labels == OBJECT).mean()), "hand_share": float((labels == HANDS).mean())}
+    return shares | {
+        "objects": float(count),
+        "frames_without_object": float(len(gone)),
+        "frames_missing": float(len(labels) - len(there)),
+    }
 
 
 def _given(capture: Capture, camera: str) -> np.ndarray:

@@ -32,7 +32,9 @@ def write_table(table: pd.DataFrame, path: Path) -> Path:
     return path
 
 
-def observe(row: ScenarioRow, settings: Config, capture: Path | None, lifted_record: Path | None, output: Path) -> None:
+def observe(
+    row: ScenarioRow, settings: Config, output: Path, capture: Path | None = None, lifted_record: Path | None = None
+) -> None:
     """Capture -> observations.npz; for toy scenes also truth.npz beside it (never read by a method).
 
     Raw video has been perceived before: `capture` is its folder, `lifted_record` its lifted.json.

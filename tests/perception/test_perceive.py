@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -39,7 +40,7 @@ def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config
         perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
         perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
     perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    stages.observe(row, settings, capture.folder, folder / "lifted.json", folder / "observations.npz")
+    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
     return Observations.load(folder / "observations.npz")
 
 
@@ -150,6 +151,21 @@ def test_given_masks_must_be_there(tmp_path):
         perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
 
 
+def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
+    capture = film(tmp_path / "capture", cameras=1)
+    for frame in range(FRAMES):
+        labels = capture.mask("0", frame)
+        labels[2:22, 2:22] = 1
+        labels = np.where((labels == 1) & (frame > 3), 0, labels).astype(np.uint8)
+        cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
+    perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+    said = capsys.readouterr().out
+    assert "the object's mask of frame 0 has 2 pieces far apart; two objects become one twin" in said
+    assert "no object in 2 frames, first in frame 4" in said
+    facts = StageRecord.load(tmp_path / "masks.json").facts
+    assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
+
+
 def test_an_unknown_camera_is_named(tmp_path, whole):
     with pytest.raises(InputError, match=r"must have a camera left; received \['0', '1', '2'\]"):
         perceive.segment(whole[0].folder, "left", SETTINGS, "cpu", tmp_path / "masks.json")
@@ -171,7 +187,7 @@ def test_too_few_controllers_say_what_to_change(tmp_path, whole):
 
 def test_raw_video_must_be_perceived_first(tmp_path):
     with pytest.raises(InputError, match="need --capture and --lifted"):
-        stages.observe(ROW, SETTINGS, None, None, tmp_path / "observations.npz")
+        stages.observe(ROW, SETTINGS, tmp_path / "observations.npz")
 
 
 def test_records_are_plain_json(whole):
