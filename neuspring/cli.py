@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuspring import __version__
-from neuspring.errors import InputError
+from neuspring.errors import InputError, NumericalFailure
 
 if TYPE_CHECKING:
     from neuspring.config import Config, ScenarioRow
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, threads)
     try:
         status: int = parsed.run(parsed)
-    except InputError as error:
+    except (InputError, NumericalFailure) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
@@ -102,7 +102,7 @@ def _lift(a: argparse.Namespace) -> int:
 def _judge(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    perceive.judge(a.capture.parent, a.masks, a.tracks, a.lifted, a.truth, _settings(a.settings), a.output)
+    perceive.judge(a.capture.parent, a.masks, a.tracks, a.lifted, _settings(a.settings), a.output)
     return 0
 
 
@@ -243,7 +243,6 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.add_argument("--tracks", type=Path, nargs="+", required=True, help="tracks.json of every camera, in the same order")
     judge.add_argument("--lifted", type=Path, required=True, help="lifted.json")
-    judge.add_argument("--truth", type=Path, required=True, help="truth.npz of the synthetic scene")
     judged = add("perception-table", _perception_table, "errors of perception, per category", "output")
     judged.add_argument("--results", type=Path, required=True)
     judged.add_argument("--scenarios", required=True, help="names and categories, as JSON")

@@ -22,13 +22,12 @@ from neuspring.records import StageRecord, Stopwatch, digest_file
 def make_capture(row: ScenarioRow, settings: Config, output: Path) -> None:
     """A capture folder, whose capture.json is `output`, of a synthetic scene or of PhysTwin's raw layout.
 
-    The truth of a synthetic scene lies beside the folder (truth.npz) and is never read by a method.
+    The truth of a synthetic scene lies beside the folder and is never read by a method.
     """
     if row.source == "synthetic":
         from neuspring.data.synthetic.make import make
 
         _, truth = make(row, settings.synthetic, output.parent)
-        truth.save(output.parent.with_name("truth.npz"))
         moved = f"{1e3 * truth.certificate:.2g} mm by twice as many, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
         energy = truth.kinetic[-1] + truth.potential[-1]
         print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
@@ -92,7 +91,10 @@ def track(folder: Path, camera: str, masks_record: Path, settings: Config, devic
         found = track_cotracker.track(
             capture, camera, masks.labels, chosen.cotracker3, settings.perception.seed, resolve_device(device)
         )
-    facts = {"points": float(found.pixels.shape[1]), "visible_share": float(found.visible.mean())}
+    count = found.pixels.shape[1]
+    if not count:
+        print(f"camera {camera}: neither object nor hands in frame 0; it is not used", flush=True)
+    facts = {"points": float(count), "visible_share": float(found.visible.mean()) if count else 0.0}
     tracks = PixelTracks(pixels=found.pixels, visible=found.visible, backend=chosen.backend, facts=facts)
     path = output.with_name("tracks.npz")
     tracks.save(path)
@@ -119,17 +121,15 @@ def lift(folder: Path, masks: Sequence[Path], tracks: Sequence[Path], settings: 
     _record(clock, "lift", paths, facts, (chosen.lift, chosen.shape), folder).save(output)
 
 
-def judge(
-    folder: Path, masks: Sequence[Path], tracks: Sequence[Path], lifted_record: Path, truth: Path, settings: Config, output: Path
-) -> None:
+def judge(folder: Path, masks: Sequence[Path], tracks: Sequence[Path], lifted_record: Path, settings: Config, output: Path) -> None:
     """What perception made of a synthetic capture -> its errors against the truth, judged.json."""
-    from neuspring.data.synthetic.truth import Truth
+    from neuspring.data.synthetic.truth import truth_of
     from neuspring.perception import judge as judges
 
     clock, capture = Stopwatch(), Capture.load(folder)
     loaded, followed = _of_cameras(capture, masks, tracks)
     lifted = LiftedTracks.load(StageRecord.load(lifted_record).file("lifted", lifted_record))
-    known = Truth.load(truth)
+    known = truth_of(capture)
     facts = judges.judge(capture, known, loaded, followed, lifted, settings.perception.shape)
     backends = {"segment": next(iter(loaded.values())).backend, "track": next(iter(followed.values())).backend}
     clip = {"certificate_mm": 1e3 * known.certificate, "sensitivity_mm": 1e3 * known.sensitivity}

@@ -14,8 +14,9 @@ and has no files.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -29,6 +30,7 @@ from neuspring.config import parse
 from neuspring.config_types import STRICT, Finite, Name, Positive
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.errors import InputError
+from neuspring.records import digest_file
 
 CAPTURE, TRACKS = "capture.json", "tracks.json"
 FORMAT = 1
@@ -177,7 +179,9 @@ class Capture:
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
         path = self.path("mask", camera, frame)
-        labels = _image(path, self.cameras[camera], cv2.IMREAD_GRAYSCALE)
+        labels = _image(path, self.cameras[camera], cv2.IMREAD_UNCHANGED)
+        if labels.dtype != np.uint8 or labels.ndim != 2:
+            raise InputError(path, "masks are grey images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
         if labels.max() > HANDS:
             raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
         return labels
@@ -188,14 +192,18 @@ class Capture:
         if not path.exists():
             return np.zeros((self.frame_count, 0, 3))
         listed = _json(path)
+        if listed == []:
+            return np.zeros((self.frame_count, 0, 3))
+        if not isinstance(listed, list):
+            raise InputError(path, "a list of tracks is required", type(listed).__name__)
         try:
             rows = [[[np.nan] * 3 if point is None else point for point in track] for track in listed]
             tracks = np.array(rows, dtype=float).reshape(len(rows), -1, 3)
         except (TypeError, ValueError) as error:
             raise InputError(path, "a list of tracks of [x, y, z] or null is required", str(error)) from error
-        if len(rows) and tracks.shape[1] != self.frame_count:
+        if tracks.shape[1] != self.frame_count:
             raise InputError(path, f"every track needs {self.frame_count} entries", tracks.shape[1])
-        return np.swapaxes(tracks, 0, 1) if len(rows) else np.zeros((self.frame_count, 0, 3))
+        return np.swapaxes(tracks, 0, 1)
 
 
 class Writer:
@@ -203,7 +211,8 @@ class Writer:
 
     def __init__(self, folder: Path, description: Description) -> None:
         self.capture = Capture(Path(folder), description)
-        (self.capture.folder / CAPTURE).unlink(missing_ok=True)
+        for name in (CAPTURE, TRACKS):
+            (self.capture.folder / name).unlink(missing_ok=True)
 
     def frame(self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray, mask: np.ndarray | None = None) -> None:
         """RGB uint8 [H, W, 3], depth as stored [H, W], labels uint8 [H, W]."""
@@ -212,7 +221,7 @@ class Writer:
         if path.suffix == ".png":
             _write_png(path, depth)
         else:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _make_way(path)
             np.save(path, depth, allow_pickle=False)
         if mask is not None:
             self.mask(camera, frame, mask)
@@ -221,18 +230,27 @@ class Writer:
         """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""
         _write_png(self.capture.path("mask", camera, frame), labels)
 
-    def finish(self, tracks: np.ndarray | None = None) -> Capture:
-        """Write tracks [T, K, 3], m, NaN where not annotated, and capture.json."""
-        folder = self.capture.folder
+    def finish(self, tracks: np.ndarray | None = None, **provenance: str) -> Capture:
+        """Write tracks [T, K, 3], m, NaN where not annotated, and capture.json, with a digest of all images in its provenance."""
+        folder, before = self.capture.folder, self.capture.description
+        description = replace(before, provenance={**before.provenance, "images": images_digest(folder), **provenance})
         if tracks is not None:
             listed = [
                 [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
                 for track in np.swapaxes(tracks, 0, 1)
             ]
             write_text(folder / TRACKS, json.dumps(listed) + "\n")
-        plain = TypeAdapter(Description).dump_python(self.capture.description, mode="json")
+        plain = TypeAdapter(Description).dump_python(description, mode="json")
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
-        return self.capture
+        return Capture(folder, description)
+
+
+def images_digest(folder: Path) -> str:
+    """SHA-256 over names and contents of all images of a capture's folder."""
+    digest = hashlib.sha256()
+    for path in sorted(path for kind in ("color", "depth", "mask") for path in (folder / kind).rglob("*") if path.is_file()):
+        digest.update(f"{path.relative_to(folder)} {digest_file(path)}\n".encode())
+    return f"sha256:{digest.hexdigest()}"
 
 
 def read_description(path: Path) -> Description:
@@ -320,7 +338,13 @@ def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
         raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to colour.")
 
 
-def _write_png(path: Path, image: np.ndarray) -> None:
+def _make_way(path: Path) -> None:
+    """A file in the way may be a link to the original of an imported capture: it is replaced, never written into."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    _make_way(path)
     if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
         raise InputError(path, "this file must be writable")

@@ -15,7 +15,7 @@ import numpy as np
 
 from neuspring.config import ScenarioRow
 from neuspring.data import phystwin
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer, description_departures
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
@@ -60,6 +60,7 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         masks=has_masks,
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (phystwin.METADATA, CALIBRATION)},
     )
+    refuse(description_departures(case / CALIBRATION, description))
     writer = Writer(folder, description)
     capture = writer.capture
     for camera in capture.cameras:

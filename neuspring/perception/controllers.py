@@ -70,11 +70,16 @@ def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[Rotation, np.n
 
 
 def hands_of(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points [n, 3] of each hand: pieces that lie HAND_GAP or more apart."""
+    """Indices of the points [n, 3] of each hand: pieces that lie HAND_GAP or more apart. Pieces too small to have a pose belong to
+    the nearest one that has."""
     pairs = cKDTree(points).query_pairs(HAND_GAP, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     count, labels = connected_components(graph, directed=False)
-    return [np.flatnonzero(labels == k) for k in range(count)]
+    sizes = np.bincount(labels, minlength=count)
+    if sizes.max(initial=0) >= LEAST_FOR_POSE:
+        known = np.flatnonzero(sizes[labels] >= LEAST_FOR_POSE)
+        labels = labels[known][cKDTree(points[known]).query(points)[1]]
+    return [np.flatnonzero(labels == k) for k in np.unique(labels)]
 
 
 def farthest(points: np.ndarray, count: int) -> np.ndarray:

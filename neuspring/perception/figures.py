@@ -39,7 +39,7 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
     drawn = np.random.default_rng(0).permutation(count)[:DRAWN]
     start = tracks.pixels[0, drawn]
     hue = start @ [1.0, 0.6]
-    shade = (hue - hue.min()) / max(float(np.ptp(hue)), 1e-6)
+    shade = (hue - hue.min(initial=0.0)) / max(float(np.ptp(hue)) if count else 0.0, 1e-6)
     colours = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int)
     tiles = []
     for frame in _frames(capture, camera):

@@ -52,7 +52,11 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     where = f"{capture.folder}, perception"
     objects, hands = seen[OBJECT], seen[HANDS]
     if not objects.points.shape[1]:
-        raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
+        shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
+        left = sum(int((labels[0] == OBJECT).sum()) for labels in kept.values())
+        found = f"{shown} pixels of the object's masks, {left} of them with depth in range and enough neighbours, no track"
+        remedy = "Look at masks and tracks; perception.lift has depth_range, neighbourhood and outlier_neighbours."
+        raise InputError(where, "at least one tracked point must lie on the object in frame 0", found, remedy)
     valid = agreeing_motion(objects, settings)
     hand_valid = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, hand_valid, settings, where)
@@ -82,8 +86,8 @@ def clean_masks(
     with its colours."""
     kept = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
     cloud, colours = np.zeros((0, 3)), np.zeros((0, 3))
-    focal = np.mean([camera.intrinsics[0, 0] ** 2 for camera in cameras.values()])
-    least = settings.outlier_neighbours * focal / REFERENCE_FOCAL**2
+    # A camera sees a surface with a density of points that goes with the square of its focal length.
+    least = {n: settings.outlier_neighbours * (c.intrinsics[0, 0] / REFERENCE_FOCAL) ** 2 for n, c in cameras.items()}
     for frame in range(capture.frame_count):
         there = [name for name in cameras if capture.has(name, frame)]
         if not there:
@@ -92,7 +96,8 @@ def clean_masks(
         for label in (OBJECT, HANDS):
             pixels = {name: _usable(masks[name].labels[frame] == label, depths[name], settings) for name in there}
             points = [_cloud(cameras[name], pixels[name], depths[name]) for name in there]
-            stays = _crowded(np.concatenate(points), settings.neighbourhood, least, settings.coordinate_outliers)
+            needed = np.concatenate([np.full(len(p), least[name]) for name, p in zip(there, points, strict=True)])
+            stays = _crowded(np.concatenate(points), settings.neighbourhood, needed, settings.coordinate_outliers)
             for name, own in zip(there, np.split(stays, np.cumsum([len(p) for p in points])[:-1]), strict=True):
                 y, x = (axis[own] for axis in pixels[name])
                 kept[name][frame, y, x] = label
@@ -179,8 +184,8 @@ def _cloud(camera: Camera, pixels: tuple[np.ndarray, np.ndarray], depth: np.ndar
     return camera.lift(np.stack([x, y], axis=1).astype(float), depth[y, x])
 
 
-def _crowded(points: np.ndarray, radius: float, least: float, by_coordinate: bool) -> np.ndarray:
-    """Whether more than `least` points, itself included, lie within `radius` of each [n] bool.
+def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate: bool) -> np.ndarray:
+    """Whether more than `least` [n] points, itself included, lie within `radius` of each [n] bool.
 
     `by_coordinate`, as released: a point is also dropped if any one of its coordinates equals that of a dropped point.
     """

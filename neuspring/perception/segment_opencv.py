@@ -58,7 +58,7 @@ class Palette:
 
 
 def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError where nothing rises above the table or no hand is found."""
+    """Labels [T, H, W]. Raises InputError where nothing rises above the table."""
     palette = learn(capture, camera, settings)
     of = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, of.height, of.width), dtype=np.uint8)
@@ -71,7 +71,7 @@ def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.n
 def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palette:
     """Histograms of table, risen things, hands and object over frames of the whole video.
 
-    Raises InputError where nothing rises above the table or nothing has the colour of hands.
+    Raises InputError where nothing rises above the table. Without the colour of hands all that rises is the object.
     """
     frames = [f for f in range(capture.frame_count) if capture.has(camera, f)]
     counts = {name: np.zeros(BINS) for name in ("table", "risen", "hands", "object")}
@@ -90,8 +90,8 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
         raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
     _divide(counts, [(lab, risen, _skin(lab, settings)) for lab, risen in views], settings)
     if not counts["hands"].sum():
-        rule = f"hands need a hue in {list(settings.hand_hue)} degrees and a chroma in {list(settings.hand_chroma)} (Lab)"
-        raise InputError(where, rule, "no such colour above the table", "Set perception.segment.opencv, or use masks of your own.")
+        wanted = f"hue in {list(settings.hand_hue)} degrees, chroma in {list(settings.hand_chroma)} (Lab)"
+        print(f"{where}: nothing above the table has the colour of hands ({wanted}); all of it is the object", flush=True)
     first = _palette(counts)
     _divide(counts, [(lab, risen, first.hand(lab) > 0) for lab, risen in views], settings)
     return _palette(counts)

@@ -44,7 +44,7 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     images = [capture.colour(camera, frame) for frame in frames]
     prompt = settings.prompt or capture.description.category
     found = detect(images[0], prompt, settings, models, device)
-    hands = [d for d in found if settings.hand_prompt in d.words]
+    hands = [d for d in found if settings.hand_prompt.lower() in d.words.replace(".", " ").split()]
     objects = [d for d in found if d not in hands]
     where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
     for what, detections in (("object", objects), ("hand", hands)):

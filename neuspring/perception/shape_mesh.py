@@ -48,11 +48,12 @@ def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[n
     rng = np.random.default_rng(0)
     target = cloud[rng.permutation(len(cloud))[:SAMPLES]].astype(float)
     source = _sample(vertices, faces, SAMPLES, rng)
-    centre, spread = source.mean(axis=0), source.std()
+    centre = source.mean(axis=0)
+    spread = (source - centre).std()
     unit = (source - centre) / spread
     tried = []
     # The cloud is a part of the surface, so its spread is a little less than the body's.
-    scale = 1.05 * target.std()
+    scale = 1.05 * (target - target.mean(axis=0)).std()
     for rotation in Rotation.random(POSES, rng=rng):
         tried.append(_icp(unit, target, rotation, scale, target.mean(axis=0), ITERATIONS // 8))
     tried.sort(key=lambda fit: fit[0])

@@ -54,6 +54,9 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     inside = sign * grid[..., 2] > 0
     shown = np.zeros_like(inside)
     for name, camera in capture.cameras.items():
+        if not (masks[name].labels[0] == OBJECT).any():
+            # A camera that does not have the object in view says nothing about it.
+            continue
         admitted, shows = _consistent(grid, camera, masks[name].labels[0], capture.depth(name, 0), settings.tolerance)
         inside, shown = inside & admitted, shown | shows
     inside &= shown

@@ -15,6 +15,9 @@ from neuspring.data.capture import Capture
 from neuspring.errors import InputError
 from neuspring.perception.track_opencv import Followed, choose
 
+WEIGHTS = "scaled_online.pth"
+"""Checkpoint of the online predictor."""
+
 
 def track(
     capture: Capture, camera: str, labels: np.ndarray, settings: CoTracker3, seed: int, device: str, model: Any = None
@@ -23,13 +26,14 @@ def track(
 
     `model` is called as CoTracker3's online predictor is: once with is_first_step and the queries [1, Q, 3] (frame, x, y), then
     with the latest 2 * step frames of the video [1, t, 3, H, W], 0 to 255, every `step` frames; it returns tracks [1, t, Q, 2] and
-    visibility [1, t, Q] of all frames so far. Raises InputError where frame 0 has no mask or the model cannot be loaded.
+    visibility [1, t, Q] of all frames so far. Without pixels in frame 0 there are
+    no points. Raises InputError where the model cannot be loaded.
     """
     import torch
 
     start = choose(labels[0], settings.points, seed)
     if not len(start):
-        raise InputError(f"{capture.folder}, camera {camera}", "masks of frame 0 must show object or hands", "nothing")
+        return Followed(np.zeros((capture.frame_count, 0, 2), np.float32), np.zeros((capture.frame_count, 0), dtype=bool))
     model = (load(settings) if model is None else model).to(device)
     frames = [f for f in range(capture.frame_count) if capture.has(camera, f)]
     video = torch.from_numpy(np.stack([capture.colour(camera, f) for f in frames])).permute(0, 3, 1, 2)[None]
@@ -64,10 +68,12 @@ def load(settings: CoTracker3) -> Any:
     import torch
 
     cached = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
-    if not cached and not settings.download:
-        rule = "CoTracker3 must be in the torch.hub cache"
+    # The hub's own code would fetch weights that are not there.
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
+    if not (cached and weights.is_file()) and not settings.download:
+        rule = f"CoTracker3's code and checkpoints/{WEIGHTS} must be in the torch.hub cache"
         remedy = "Set perception.track.cotracker3.download: true once (mind its licence), or use the backend opencv."
-        raise InputError("perception.track.cotracker3", rule, f"nothing in {torch.hub.get_dir()}", remedy)
+        raise InputError("perception.track.cotracker3", rule, f"not both in {torch.hub.get_dir()}", remedy)
     if cached:
         return torch.hub.load(str(cached[-1]), "cotracker3_online", source="local")
     return torch.hub.load("facebookresearch/co-tracker", "cotracker3_online", trust_repo=True)

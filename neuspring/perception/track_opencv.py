@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from neuspring.config_perception import OpenCvTracking
 from neuspring.data.capture import Capture
-from neuspring.errors import InputError
 
 PATCH = 9
 """Side of compared patches, pixels."""
@@ -30,7 +29,7 @@ CONTRAST = 40.0
 STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Followed:
     """Points so far."""
 
@@ -41,10 +40,8 @@ class Followed:
 
 
 def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
-    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]. Raises InputError if frame 0 has no mask."""
+    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
     start = choose(labels[0], settings.points, seed)
-    if not len(start):
-        raise InputError(f"{capture.folder}, camera {camera}", "masks of frame 0 must show object or hands", "nothing")
     frames, count = capture.frame_count, len(start)
     own = _labels_at(labels[0], start)
     found = Followed(np.repeat(start[None], frames, axis=0), np.zeros((frames, count), dtype=bool))
@@ -57,7 +54,7 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
         if not capture.has(camera, frame):
             continue
         now = _seen(capture, camera, frame, settings)
-        alive = found.visible[last]
+        alive = found.visible[last].copy()
         place = found.pixels[last].copy()
         if alive.any():
             moved, kept = _follow(before, now, place[alive], settings, flow)
@@ -141,10 +138,12 @@ def _reacquire(
     """Look for lost points; writes the places of those found into `place` and returns which they are."""
     searched, guides = np.flatnonzero(~alive), np.flatnonzero(alive)
     found = np.zeros(len(start), dtype=bool)
-    if not len(searched) or len(guides) < GUIDES:
+    if not len(searched):
         return found
-    nearest = guides[cKDTree(start[guides]).query(start[searched], k=GUIDES)[1]]
-    guess = start[searched] + np.median((place - start)[nearest], axis=1)
+    guess = place[searched]
+    if len(guides) >= GUIDES:
+        nearest = guides[cKDTree(start[guides]).query(start[searched], k=GUIDES)[1]]
+        guess = start[searched] + np.median((place - start)[nearest], axis=1)
     moved, ok = _lucas_kanade(first, now, start[searched], guess, settings)
     ok &= np.linalg.norm(moved - guess, axis=1) < settings.window
     ok &= _inside(moved, now.shape)

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.data.synthetic.correspond import under_pixels
-from neuspring.data.synthetic.truth import Truth
-from neuspring.errors import InputError
+from neuspring.data.synthetic.truth import Truth, truth_of
 from neuspring.perception.results import ShapePrior
 from neuspring.perception.track_opencv import Followed, choose
 
@@ -17,18 +16,9 @@ SEEN = 0.01
 """m by which the depth image may differ from a point's depth for the point to count as seen."""
 
 
-def load(capture: Capture) -> Truth:
-    """truth.npz beside the capture. Raises InputError for captures that are not synthetic."""
-    path = capture.folder.with_name("truth.npz")
-    if not path.is_file():
-        rule = "the backend truth needs the truth of a synthetic scene"
-        raise InputError(path, rule, "no such file", "Choose another backend of perception.track or perception.shape.")
-    return Truth.load(path)
-
-
 def track(capture: Capture, camera: str, labels: np.ndarray, count: int, seed: int) -> Followed:
     """Exact places [T, Q, 2] of up to `count` pixels of the masks, and whether depth and mask show them there."""
-    truth, of = load(capture), capture.cameras[camera]
+    truth, of = truth_of(capture), capture.cameras[camera]
     start = choose(labels[0], count, seed)
     x, y = start.astype(int).T
     own = labels[0, y, x]
@@ -49,7 +39,7 @@ def track(capture: Capture, camera: str, labels: np.ndarray, count: int, seed: i
 
 def surface(capture: Capture) -> ShapePrior:
     """The visible surface of frame 0."""
-    truth = load(capture)
+    truth = truth_of(capture)
     return ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
 
 

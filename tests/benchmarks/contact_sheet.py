@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.data.synthetic.truth import Truth
+from neuspring.data.synthetic.truth import Truth, truth_path
 
 SIZE = (212, 120)
 LABEL = 14
@@ -35,7 +35,7 @@ def strip(capture: Capture) -> np.ndarray:
 def facts(capture: Capture, results: Path) -> dict[str, object]:
     """What a capture took, from its files and the workflow's own timing."""
     folder = capture.folder.parent
-    truth = Truth.load(folder / "truth.npz")
+    truth = Truth.load(truth_path(capture.folder))
     with (results / "benchmarks" / "capture" / f"{folder.name}.tsv").open() as file:
         seconds = float(next(csv.DictReader(file, delimiter="\t"))["s"])
     size = sum(path.stat().st_size for path in capture.folder.rglob("*") if path.is_file())

@@ -47,7 +47,7 @@ def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(finished):
 def test_cameras_are_perceived_by_jobs_of_their_own_and_nothing_reruns(finished):
     assert "Nothing to be done" in (again := run(finished, SYNTHETIC, "--dry-run")).stdout + again.stderr
     planned = jobs(run(finished, SYNTHETIC | {"results": "other"}, "--dry-run"))
-    assert (planned["capture"], planned["segment"], planned["track"], planned["lift"], planned["observe"]) == (1, 3, 3, 1, 1)
+    assert (planned["synthesise"], planned["segment"], planned["track"], planned["lift"], planned["observe"]) == (1, 3, 3, 1, 1)
     # A change of the last step leaves the steps before it alone.
     changed = SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}}
     planned = jobs(run(finished, changed, "--dry-run"))
@@ -57,7 +57,7 @@ def test_cameras_are_perceived_by_jobs_of_their_own_and_nothing_reruns(finished)
 
 def test_the_truth_lies_beside_the_capture_and_not_in_it(finished):
     folder = finished / "results" / PACKAGE
-    assert (folder / "truth.npz").is_file()
+    assert (folder / "capture_truth.npz").is_file()
     assert {path.name for path in (folder / "capture").iterdir()} == {"capture.json", "color", "depth", "mask", "tracks.json"}
 
 
@@ -72,6 +72,19 @@ def test_a_folder_of_the_user_s_own(place):
     assert record["status"] == "ok"
     # No truth, no table of perception.
     assert not (place / "results" / "tables" / "perception.md").exists()
+
+
+def test_masks_that_the_user_repairs_are_read_again(place):
+    capture = film(place / "mine" / "film", cameras=2)
+    table = place / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + "film\tcapture\ttoy\tfilm\tfalse\ttrue\n")
+    changes = {"scenarios": ["film"], "data_root": str(place / "mine"), "perception": PERCEPTION}
+    target = "results/film/perception/1/masks.json"
+    assert run(place, changes, "--", target).returncode == 0
+    assert "Nothing to be done" in (again := run(place, changes, "--dry-run", "--", target)).stdout + again.stderr
+    path = capture.path("mask", "1", 2)
+    path.write_bytes(path.read_bytes())
+    assert jobs(run(place, changes, "--dry-run", "--", target)) == {"segment": 1}
 
 
 def test_a_capture_that_is_not_there_is_named_before_any_job(place):

@@ -176,6 +176,40 @@ def test_damaged_files_and_unknown_labels_are_refused(tmp_path):
         capture.mask("0", 2)
 
 
+def test_writing_never_reaches_through_links(tmp_path):
+    """Imported images are links to the user's own."""
+    capture = write(tmp_path / "capture")
+    original = tmp_path / "original.png"
+    original.hardlink_to(capture.path("color", "0", 0))
+    before = original.read_bytes()
+    Writer(capture.folder, describe()).frame("0", 0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.uint16))
+    assert original.read_bytes() == before
+
+
+def test_tracks_do_not_outlive_their_capture_and_may_be_none(tmp_path):
+    write(tmp_path, tracks=np.zeros((FRAMES, 2, 3)))
+    assert write(tmp_path).tracks().shape == (FRAMES, 0, 3)
+    (tmp_path / "tracks.json").write_text("[]")
+    assert Capture.load(tmp_path).tracks().shape == (FRAMES, 0, 3)
+    (tmp_path / "tracks.json").write_text("{}")
+    with pytest.raises(InputError, match="a list of tracks is required; received dict"):
+        Capture.load(tmp_path).tracks()
+
+
+def test_masks_of_sixteen_bits_are_refused(tmp_path):
+    capture = write(tmp_path)
+    cv2.imwrite(str(capture.path("mask", "0", 2)), np.ones((24, 32), np.uint16))
+    with pytest.raises(InputError, match="masks are grey images of 8 bits; received uint16"):
+        capture.mask("0", 2)
+
+
+def test_a_capture_names_the_digest_of_its_images(tmp_path):
+    first = write(tmp_path / "a").description.provenance["images"]
+    assert write(tmp_path / "b").description.provenance["images"] == first
+    capture = write(tmp_path / "c", describe(depth_format="npy"))
+    assert capture.description.provenance["images"] != first
+
+
 def test_a_folder_that_is_still_being_written_is_no_capture(tmp_path):
     write(tmp_path)
     Writer(tmp_path, describe())

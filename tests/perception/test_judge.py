@@ -11,6 +11,7 @@ from neuspring.config_perception import Lift, ShapePriorSettings, Synthetic
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
 from neuspring.data.synthetic.correspond import at_points, under_pixels
+from neuspring.data.synthetic.truth import truth_of, truth_path
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.perception import track_truth
 from neuspring.perception.judge import judge
@@ -25,9 +26,7 @@ SETTINGS = Lift(neighbourhood=0.03, controller_gaps="rigid", controller_share=0.
 
 
 def create(folder, settings: Synthetic = TINY) -> Capture:
-    capture, truth = making.make(ROW, settings, folder / "capture")
-    truth.save(folder / "truth.npz")
-    return capture
+    return making.make(ROW, settings, folder / "capture")[0]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def perfect(tmp_path_factory):
         found = track_truth.track(capture, camera, masks[camera].labels, 500, 0)
         tracks[camera] = PixelTracks(pixels=found.pixels, visible=found.visible, backend="truth")
     lifted = lift(capture, masks, tracks, SETTINGS)
-    return SimpleNamespace(capture=capture, truth=track_truth.load(capture), masks=masks, tracks=tracks, lifted=lifted)
+    return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)
 
 
 def verdict(found, **changes) -> dict[str, float]:
@@ -137,5 +136,12 @@ def test_clips_that_fail_are_refused(perfect):
 
 def test_the_backend_truth_needs_a_synthetic_capture(tmp_path):
     capture = film(tmp_path / "film", cameras=1)
-    with pytest.raises(InputError, match="the backend truth needs the truth of a synthetic scene"):
-        track_truth.load(capture)
+    with pytest.raises(InputError, match=r"film_truth\.npz: this needs the truth of a synthetic scene"):
+        truth_of(capture)
+
+
+def test_another_capture_s_truth_is_refused(perfect, tmp_path):
+    other = create(tmp_path, replace(TINY, frames=5))
+    truth_path(other.folder).write_bytes(truth_path(perfect.capture.folder).read_bytes())
+    with pytest.raises(InputError, match="another capture's"):
+        truth_of(other)

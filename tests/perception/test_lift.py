@@ -170,6 +170,35 @@ def test_hands_apart_move_apart():
     np.testing.assert_allclose(fill_rigidly(np.where(trusted[..., None], points, 0.0), trusted), points, atol=1e-9)
 
 
+def test_two_points_apart_follow_the_nearest_hand():
+    rng = np.random.default_rng(0)
+    start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), [[0.17, 0, 0], [0.18, 0, 0]]])
+    points = start + np.linspace(0, 0.2, 6)[:, None, None] * [0, 0, 1.0]
+    trusted = np.ones((6, 10), bool)
+    trusted[3:, 8:] = False
+    assert [len(hand) for hand in hands_of(start)] == [10]
+    np.testing.assert_allclose(fill_rigidly(np.where(trusted[..., None], points, 0.0), trusted), points, atol=1e-9)
+
+
+def test_a_small_camera_keeps_what_it_alone_sees(tmp_path):
+    """Beside a camera of many pixels one of few would lose its view, were both held to the same number of neighbours."""
+    few, many = entry("few", 32, 24), entry("many", 32, 24)
+    large = (*(tuple(4 * v for v in row) for row in many.intrinsics[:2]), many.intrinsics[2])
+    many = replace(many, width=128, height=96, intrinsics=large)
+    writer = Writer(tmp_path, describe(cameras=(few, many)))
+    labels = np.zeros((24, 32), np.uint8)
+    labels[6:16, 4:14] = OBJECT
+    for frame in range(FRAMES):
+        writer.frame("few", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
+        writer.frame(
+            "many", frame, np.zeros((96, 128, 3), np.uint8), np.full((96, 128), 800, np.uint16), np.zeros((96, 128), np.uint8)
+        )
+    capture = writer.finish()
+    masks = {n: Masks(labels=np.stack([capture.mask(n, f) for f in range(FRAMES)]), backend="given") for n in capture.cameras}
+    kept, _, _ = lifting.clean_masks(capture, capture.cameras, masks, SETTINGS)
+    assert kept["few"][0].sum() == labels.sum()
+
+
 def test_released_controllers_are_visible_throughout():
     points = np.repeat(grid(6)[None], 4, axis=0)
     visible, valid = np.ones((4, 36), bool), np.ones((4, 36), bool)

@@ -17,7 +17,7 @@ from neuspring.errors import InputError
 from neuspring.records import StageRecord
 
 from ..data.phystwin_case import dump, write_json
-from .filmed import FLIP, FRAMES, STEP, film, write_raw
+from .filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
 
 ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
 SETTINGS = Config(
@@ -164,6 +164,14 @@ def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
     assert "no object in 2 frames, first in frame 4" in said
     facts = StageRecord.load(tmp_path / "masks.json").facts
     assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
+
+
+def test_a_camera_without_object_and_hand_in_frame_0_is_not_used(tmp_path, capsys):
+    capture = film(tmp_path / "capture", cameras=2)
+    cv2.imwrite(str(capture.path("mask", "1", 0)), np.zeros(SIZE[::-1], np.uint8))
+    observations = perceived(capture, tmp_path)
+    assert "camera 1: neither object nor hands in frame 0; it is not used" in capsys.readouterr().out
+    assert np.median(motion_error(observations)) < 0.003
 
 
 def test_an_unknown_camera_is_named(tmp_path, whole):

@@ -100,6 +100,14 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place(tmp_path):
     assert overlap(ShapePrior(vertices=placed, faces=truth.faces, backend="mesh"), truth) > 0.9
 
 
+def test_a_mesh_finds_its_place_wherever_the_object_lies(tmp_path):
+    _, _, cloud, truth = film(tmp_path, 3)
+    far = np.array([1.0, 0.5, 0.0])
+    placed, rms = shape_mesh.place(truth.vertices - np.array([2.0, 0, 0]), truth.faces, cloud + far)
+    assert rms < 0.003
+    assert overlap(ShapePrior(vertices=placed - far, faces=truth.faces, backend="mesh"), truth) > 0.9
+
+
 def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3)
     bent = truth.vertices + np.array([0, 0, 0.008]) * np.sin(np.pi * (truth.vertices[:, :1] / 0.1))

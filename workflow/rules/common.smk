@@ -1,4 +1,6 @@
 # Validates the configuration before any job, and holds the helpers that rules use.
+import functools
+import hashlib
 import json
 import shlex
 import subprocess
@@ -139,18 +141,35 @@ def perception_tables():
     return [PERCEPTION_TABLE] if judged_scenarios() else []
 
 
-def capture_settings(wildcards):
-    source = BENCHMARK.scenarios[wildcards.scenario].source
-    return section("synthetic" if source == "synthetic" else "data_root")
+def of_source(source):
+    """Pattern of the scenarios of one source; where there are none it matches nothing."""
+    rows = BENCHMARK.scenarios.values()
+    names = [re.escape(row.scenario) for row in rows if row.source == source]
+    return "|".join(names) or "(?!)"
 
 
-def capture_digest(wildcards):
-    source = BENCHMARK.scenarios[wildcards.scenario].source
-    return code_digest(
-        "neuspring.data.synthetic.make"
-        if source == "synthetic"
-        else "neuspring.data.phystwin_raw"
-    )
+def truth_file(step):
+    """The truth of a synthetic scene, if the step's backend reads it."""
+    if getattr(CONFIG.perception, step).backend != "truth":
+        return []
+    return f"{RESULTS}/{{scenario}}/capture_truth.npz"
+
+
+def image_stamps(wildcards):
+    """A digest of names, sizes and times of the images that the user may change, so that changed ones are read again."""
+    row = BENCHMARK.scenarios[wildcards.scenario]
+    folder = BENCHMARK.data_path(wildcards.scenario)
+    return stamps(str(folder)) if row.source in ("capture", "phystwin_raw") else ""
+
+
+@functools.cache
+def stamps(folder):
+    digest = hashlib.sha256()
+    kinds = [Path(folder) / kind for kind in ("color", "depth", "mask")]
+    for path in sorted(path for kind in kinds for path in kind.rglob("*")):
+        facts = path.stat()
+        digest.update(f"{path} {facts.st_size} {facts.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
 
 
 BACKENDS = {

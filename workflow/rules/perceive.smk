@@ -1,4 +1,4 @@
-rule capture:
+rule synthesise:
     input:
         raw_files,
     output:
@@ -15,9 +15,37 @@ rule capture:
         mem_mb=4000,
         runtime=120,
     params:
-        settings=capture_settings,
+        settings=section("synthetic"),
         row=scenario_row,
-        code=capture_digest,
+        code=code_digest("neuspring.data.synthetic.make", stage="perceive.make_capture"),
+    shell:
+        "python -m neuspring capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
+        " 2>&1 | tee -a {log:q}"
+
+
+rule capture:
+    input:
+        raw_files,
+    output:
+        f"{RESULTS}/{{scenario}}/capture/capture.json",
+    log:
+        f"{RESULTS}/logs/capture/{{scenario}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
+    wildcard_constraints:
+        scenario=of_source("phystwin_raw"),
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=4000,
+        runtime=120,
+    params:
+        settings=section("data_root"),
+        row=scenario_row,
+        images=image_stamps,
+        code=code_digest("neuspring.data.phystwin_raw", stage="perceive.make_capture"),
     shell:
         "python -m neuspring capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
         " 2>&1 | tee -a {log:q}"
@@ -43,6 +71,7 @@ rule segment:
         runtime=120,
     params:
         settings=perception_settings("segment"),
+        images=image_stamps,
         code=backend_digest("segment"),
     shell:
         "python -m neuspring segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
@@ -53,6 +82,7 @@ rule track:
     input:
         capture=capture_file,
         masks=rules.segment.output,
+        truth=truth_file("track"),
     output:
         f"{RESULTS}/{{scenario}}/perception/{{camera}}/tracks.json",
     log:
@@ -70,6 +100,7 @@ rule track:
         runtime=120,
     params:
         settings=perception_settings("track", "seed"),
+        images=image_stamps,
         code=backend_digest("track"),
     shell:
         "python -m neuspring track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
@@ -81,6 +112,8 @@ rule lift:
         capture=capture_file,
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
         tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
+        truth=truth_file("shape"),
+        mesh=CONFIG.perception.shape.mesh or [],
     output:
         f"{RESULTS}/{{scenario}}/perception/lifted.json",
     log:
@@ -96,6 +129,7 @@ rule lift:
         runtime=60,
     params:
         settings=perception_settings("lift", "shape"),
+        images=image_stamps,
         code=code_digest(
             "neuspring.perception.lift",
             "neuspring.perception.shape_prior",
@@ -112,6 +146,7 @@ rule judge:
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
         tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
         lifted=rules.lift.output,
+        truth=f"{RESULTS}/{{scenario}}/capture_truth.npz",
     output:
         f"{RESULTS}/{{scenario}}/perception/judged.json",
     log:
@@ -126,12 +161,11 @@ rule judge:
         mem_mb=4000,
         runtime=30,
     params:
-        truth=lambda wildcards: f"{RESULTS}/{wildcards.scenario}/truth.npz",
         settings=perception_settings("shape"),
         code=code_digest("neuspring.perception.judge", stage="perceive.judge"),
     shell:
         "python -m neuspring judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
-        " --lifted {input.lifted:q} --truth {params.truth:q} --settings {params.settings:q} --output {output:q}"
+        " --lifted {input.lifted:q} --settings {params.settings:q} --output {output:q}"
         " 2>&1 | tee -a {log:q}"
 
 

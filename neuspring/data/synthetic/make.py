@@ -17,10 +17,11 @@ from neuspring.data.synthetic.hands import SKIN, Hand, place
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
 from neuspring.data.synthetic.scenes import SCENES
 from neuspring.data.synthetic.sensor import measured, quantised
-from neuspring.data.synthetic.truth import Truth
+from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.data.synthetic.vbd import VertexBlockDescent
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.progress import Progress
+from neuspring.records import digest_file
 
 FRAME_RATE = 30.0
 DEPTH_UNIT = 0.001
@@ -63,7 +64,7 @@ SIZES = {"tiny": Size(120, 68, 0.02, 0.008), "demo": Size(424, 240, 0.014, 0.004
 
 
 def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, Truth]:
-    """Write the capture of scene `row.path` to `folder`; returns it with its truth. Deterministic in the settings' seed.
+    """Write the capture of scene `row.path` to `folder` and its truth beside it; returns both. Deterministic in the settings' seed.
 
     Raises InputError for an unknown scene, NumericalFailure for a clip that must not be shipped.
     """
@@ -103,7 +104,9 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     )
     writer = Writer(folder, description)
     _film(writer, body, clip, hands, cameras, row, settings, size)
-    return writer.finish(_annotate(truth, cameras[0], writer.capture)), truth
+    path = truth_path(folder)
+    truth.save(path)
+    return writer.finish(_annotate(truth, cameras[0], writer.capture), truth=f"sha256:{digest_file(path)}"), truth
 
 
 def _truth(body: Body, hands: Sequence[Hand], clip: Clip, held: np.ndarray, deviations: tuple[float, float]) -> Truth:

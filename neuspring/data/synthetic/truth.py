@@ -1,13 +1,20 @@
-"""What a synthetic capture knows and methods may not read: motion of every node, correspondences, materials, contact."""
+"""What a synthetic capture knows and methods may not read: motion of every node, correspondences, materials, contact.
+
+It lies beside the capture's folder, and the capture's provenance holds its digest.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from neuspring.artifacts import Artifact, array
+from neuspring.data.capture import CAPTURE, Capture
+from neuspring.errors import InputError
+from neuspring.records import digest_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,3 +46,21 @@ class Truth(Artifact):
     def surface(self, frame: int) -> np.ndarray:
         """Visible vertices [V, 3], m, in one frame."""
         return np.asarray(np.einsum("vkc,vk->vc", self.nodes[frame][self.surface_nodes], self.surface_weights))
+
+
+def truth_path(folder: Path) -> Path:
+    """Where the truth of the capture in `folder` lies."""
+    folder = Path(folder).resolve()
+    return folder.with_name(f"{folder.name}_truth.npz")
+
+
+def truth_of(capture: Capture) -> Truth:
+    """The truth of a synthetic capture. Raises InputError if there is none, or another capture's."""
+    path = truth_path(capture.folder)
+    if not path.is_file():
+        remedy = "Only synthetic scenes have one; choose other backends of perception.track and perception.shape."
+        raise InputError(path, "this needs the truth of a synthetic scene", "no such file", remedy)
+    if capture.description.provenance.get("truth") != f"sha256:{digest_file(path)}":
+        rule = f"must be the truth that {capture.folder / CAPTURE} names"
+        raise InputError(path, rule, "another capture's", "Delete both and make the capture again.")
+    return Truth.load(path)
