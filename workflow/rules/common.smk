@@ -137,6 +137,10 @@ def judged_records():
     return [f"{RESULTS}/{name}/perception/judged.json" for name in judged_scenarios()]
 
 
+def perception_arguments():
+    return ["--results", RESULTS, "--scenarios", json.dumps(judged_scenarios())]
+
+
 def perception_tables():
     return [PERCEPTION_TABLE] if judged_scenarios() else []
 

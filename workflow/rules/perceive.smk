@@ -186,9 +186,8 @@ rule perception_table:
         mem_mb=2000,
         runtime=10,
     params:
-        results=RESULTS,
-        scenarios=json.dumps(judged_scenarios()),
+        arguments=perception_arguments(),
         code=code_digest("neuspring.tables_perception"),
     shell:
-        "python -m neuspring perception-table --results {params.results:q} --scenarios {params.scenarios:q} --output {output:q}"
+        "python -m neuspring perception-table {params.arguments:q} --output {output:q}"
         " > {log:q} 2>&1"
