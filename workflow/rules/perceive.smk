@@ -1,12 +1,13 @@
 rule synthesise:
-    input:
-        raw_files,
     output:
-        f"{RESULTS}/{{scenario}}/capture/capture.json",
+        capture=f"{RESULTS}/{{scenario}}/capture/capture.json",
+        truth=f"{RESULTS}/{{scenario}}/capture_truth.npz",
     log:
         f"{RESULTS}/logs/capture/{{scenario}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
+    wildcard_constraints:
+        scenario=of_source("synthetic"),
     retries: 1
     conda:
         ENVIRONMENT
