@@ -88,7 +88,7 @@ LEVELS = [
     {"config_types"},
     {"config_perception"},
     {"artifacts", "config", "progress"},
-    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "figures_views"},
+    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views"},
     {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios"},
     {"benchmark", "perception", "search", "fit", "carry", "figures", "tables"},
     {"perceive", "tables_perception"},

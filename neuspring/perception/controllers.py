@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.config_perception import Lift
 from neuspring.errors import InputError
+from neuspring.points import farthest
 
 HAND_GAP = 0.04
 """m; points of one hand lie nearer to some other of it."""
@@ -80,14 +81,3 @@ def hands_of(points: np.ndarray) -> list[np.ndarray]:
         known = np.flatnonzero(sizes[labels] >= LEAST_FOR_POSE)
         labels = labels[known][cKDTree(points[known]).query(points)[1]]
     return [np.flatnonzero(labels == k) for k in np.unique(labels)]
-
-
-def farthest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most `count` points [n, 3], each the farthest from those before; the first is point 0."""
-    if not len(points):
-        return np.zeros(0, dtype=int)
-    chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)

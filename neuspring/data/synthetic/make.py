@@ -20,6 +20,7 @@ from neuspring.data.synthetic.sensor import measured, quantised
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.data.synthetic.vbd import VertexBlockDescent
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.points import farthest
 from neuspring.progress import Progress
 from neuspring.records import digest_file
 
@@ -229,12 +230,3 @@ def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
     visible = inside[(capture.mask(camera.name, 0)[y, x] == OBJECT) & (np.abs(seen - depth[inside]) < 0.004)]
     chosen = visible[farthest(vertices[visible], ANNOTATED)]
     return np.stack([truth.surface(frame)[chosen] for frame in range(len(truth.nodes))])
-
-
-def farthest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most `count` points, each the farthest from those before; the first is point 0."""
-    chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)
