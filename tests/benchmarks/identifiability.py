@@ -190,7 +190,7 @@ def report(table: pd.DataFrame) -> list[str]:
             cells = [cell(metric, values[of == metric].dropna(), sign) for metric in METRICS]
             rows.append([str(scene), f"{1e3 * float(noise):g}", str(kind), *cells])
     headings = [heading for heading, _, _ in METRICS.values()]
-    lines = tables._markdown(["scene", "noise [mm]", "kind", *headings], rows)
+    lines = tables.markdown(["scene", "noise [mm]", "kind", *headings], rows)
     fits = table[table["kind"].isin(list(RATES))].rename(columns={"scene": "scenario", "kind": "method"})
     both = pd.concat([fits.assign(task=[f"{1e3 * noise:g}" for noise in fits["noise"]]), fits.assign(task="all")])
     differences, rows = tables.paired_differences(both, "springs"), []
@@ -201,7 +201,7 @@ def report(table: pd.DataFrame) -> list[str]:
             cells.append("{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*(factor * of[["difference", "low", "high"]]), d=digits))
         rows.append(cells)
     lines += ["", "Field − springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
-    return lines + tables._markdown(["noise [mm]", *headings], rows)
+    return lines + tables.markdown(["noise [mm]", *headings], rows)
 
 
 def picture(found: dict[str, dict[str, np.ndarray]]) -> Figure:
