@@ -19,7 +19,7 @@ import json
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ from neuspring.artifacts import write_text
 from neuspring.config import parse
 from neuspring.config_types import STRICT, Finite, Name, Positive
 from neuspring.data.departure import Departure, broken, refuse
+from neuspring.data.json_file import load_json
 from neuspring.errors import InputError
 from neuspring.records import digest_file
 
@@ -191,7 +192,7 @@ class Capture:
         path = self.folder / TRACKS
         if not path.exists():
             return np.zeros((self.frame_count, 0, 3))
-        listed = _json(path)
+        listed = load_json(path)
         if listed == []:
             return np.zeros((self.frame_count, 0, 3))
         if not isinstance(listed, list):
@@ -255,7 +256,7 @@ def images_digest(folder: Path) -> str:
 
 def read_description(path: Path) -> Description:
     """capture.json, every key and type checked. Raises InputError that lists each problem."""
-    values = _json(path)
+    values = load_json(path)
     if not isinstance(values, dict):
         raise InputError(path, "a JSON object is required", type(values).__name__)
     return parse(Description, values, str(path))
@@ -299,15 +300,6 @@ def _calibration_departures(path: Path, where: str, camera: CameraEntry) -> list
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
         found.append(broken(path, f"{where}.camera_to_world", "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
     return found
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "this file must be readable", error.strerror) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "this file must be JSON", str(error)) from error
 
 
 def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:

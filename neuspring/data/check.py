@@ -14,6 +14,7 @@ import numpy as np
 from neuspring.data import conformance, mocap, phystwin
 from neuspring.data.check_capture import check_capture, is_capture
 from neuspring.data.departure import Case, Departure, broken, note, unusual
+from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
 
@@ -203,7 +204,7 @@ def _list(values: np.ndarray, most: int = 8) -> str:
 
 def _check_split(case: Case, frames: int | None) -> None:
     path = case.folder / phystwin.SPLIT
-    split = case.load(path, phystwin.load_json)
+    split = case.load(path, load_json)
     if split is None:
         return
     if frames is None:
@@ -271,7 +272,7 @@ def _check_metadata(case: Case, frames: int | None) -> dict[str, Any] | None:
     if not path.exists():
         case.skip(path, "the check of intrinsics and frame rate is")
         return None
-    metadata = case.load(path, phystwin.load_json)
+    metadata = case.load(path, load_json)
     if metadata is None:
         return None
     case.found += phystwin.frame_rate_departures(path, metadata)

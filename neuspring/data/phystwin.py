@@ -6,7 +6,6 @@ layout without harm (warnings); `read` raises the first error, `neuspring check-
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ import numpy as np
 from neuspring.artifacts import Observations, Scenario
 from neuspring.config import ScenarioRow
 from neuspring.data.departure import Departure, broken, refuse, unusual
+from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
 from neuspring.records import digest_file
 
 FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
@@ -102,16 +101,6 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
         interior_points=data["interior_points"],
         tracks=tracks,
     )
-
-
-def load_json(path: Path) -> Any:
-    """Parse a JSON file of the data set. Raises InputError."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "this file must be readable", error.strerror) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "this file must be JSON", str(error)) from error
 
 
 def final_data_departures(path: Path, data: Any) -> list[Departure]:

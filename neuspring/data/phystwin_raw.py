@@ -17,6 +17,7 @@ from neuspring.config import ScenarioRow
 from neuspring.data import phystwin
 from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer, description_departures
 from neuspring.data.departure import Departure, broken, refuse
+from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
 from neuspring.records import digest_file
@@ -31,7 +32,7 @@ HAND_PHRASE = "hand"
 def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     """Write `case` as a capture folder. Raises InputError naming file and key."""
     case = Path(case)
-    metadata, poses = phystwin.load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
+    metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
     refuse(raw_departures(case, metadata, poses))
     width, height = metadata["WH"]
     frames = int(metadata["frame_num"])
@@ -76,7 +77,7 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
 def camera_count(case: Path) -> int:
     """How many cameras metadata.json declares. Raises InputError."""
     path = Path(case) / phystwin.METADATA
-    metadata = phystwin.load_json(path)
+    metadata = load_json(path)
     intrinsics = metadata.get("intrinsics") if isinstance(metadata, dict) else None
     if not isinstance(intrinsics, list) or not intrinsics:
         raise InputError(path, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
@@ -108,7 +109,7 @@ def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
 def _detections(case: Path, camera: str) -> dict[int, list[str]]:
     """Label -> ids of the detections with it. Exactly one detection is not a hand."""
     path = case / "mask" / f"mask_info_{camera}.json"
-    info = phystwin.load_json(path)
+    info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
         raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
     objects = [key for key, phrase in info.items() if phrase != HAND_PHRASE]
@@ -147,7 +148,7 @@ def _train_end(case: Path, frames: int) -> int | None:
     path = case / phystwin.SPLIT
     if not path.exists():
         return None
-    split = phystwin.load_json(path)
+    split = load_json(path)
     refuse(phystwin.split_departures(path, split, frames))
     return int(split["train"][1])
 

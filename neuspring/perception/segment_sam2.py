@@ -68,12 +68,16 @@ def load(settings: GroundedSam2, device: str) -> Models:
     except ImportError as error:
         remedy = 'Install it: .venv/bin/pip install -e ".[perception]"'
         raise InputError("perception.segment.backend: grounded_sam2", "needs the extra `perception`", str(error), remedy) from error
-    detector, video_model, local = transformers.GroundingDinoForObjectDetection, transformers.Sam2VideoModel, not settings.download
+    local = not settings.download
+    # Safetensors alone: weights in a pickle are not read.
+    weights = {"local_files_only": local, "use_safetensors": True}
+    detector: Any = transformers.GroundingDinoForObjectDetection
+    video_model: Any = transformers.Sam2VideoModel
     try:
         return Models(
-            detector.from_pretrained(settings.detector, local_files_only=local).to(device).eval(),  # type: ignore[arg-type]
+            detector.from_pretrained(settings.detector, **weights).to(device).eval(),
             transformers.AutoProcessor.from_pretrained(settings.detector, local_files_only=local),
-            video_model.from_pretrained(settings.video_model, local_files_only=local).to(device).eval(),  # type: ignore[arg-type]
+            video_model.from_pretrained(settings.video_model, **weights).to(device).eval(),
             transformers.Sam2VideoProcessor.from_pretrained(settings.video_model, local_files_only=local),
         )
     except OSError as error:

@@ -17,6 +17,7 @@ from neuspring.perception.track_opencv import Followed, choose
 
 WEIGHTS = "scaled_online.pth"
 """Checkpoint of the online predictor."""
+ADDRESS = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS}"
 
 
 def track(
@@ -68,12 +69,15 @@ def load(settings: CoTracker3) -> Any:
     import torch
 
     cached = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
-    # The hub's own code would fetch weights that are not there.
     weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
     if not (cached and weights.is_file()) and not settings.download:
         rule = f"CoTracker3's code and checkpoints/{WEIGHTS} must be in the torch.hub cache"
         remedy = "Set perception.track.cotracker3.download: true once (mind its licence), or use the backend opencv."
         raise InputError("perception.track.cotracker3", rule, f"not both in {torch.hub.get_dir()}", remedy)
+    # The hub's own code would read the weights as any pickle; here they come as tensors alone.
     if cached:
-        return torch.hub.load(str(cached[-1]), "cotracker3_online", source="local")
-    return torch.hub.load("facebookresearch/co-tracker", "cotracker3_online", trust_repo=True)
+        predictor: Any = torch.hub.load(str(cached[-1]), "cotracker3_online", source="local", pretrained=False)
+    else:
+        predictor = torch.hub.load("facebookresearch/co-tracker", "cotracker3_online", trust_repo=True, pretrained=False)
+    predictor.model.load_state_dict(torch.hub.load_state_dict_from_url(ADDRESS, map_location="cpu", weights_only=True))
+    return predictor

@@ -1,5 +1,8 @@
 """Tracking of known motion, and the contract of CoTracker3 with a stand-in."""
 
+import os
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -152,3 +155,47 @@ def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_pat
         InputError, match=r"CoTracker3's code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
     ):
         track_cotracker.load(CoTracker3())
+
+
+HUB = """
+import torch
+
+class Predictor:
+    def __init__(self):
+        self.model = torch.nn.Linear(2, 1)
+
+def cotracker3_online(*, pretrained=True):
+    assert not pretrained, "the hub's own reader of weights must not be used"
+    return Predictor()
+"""
+
+
+def test_cotracker_s_weights_are_read_as_tensors_alone(monkeypatch, tmp_path):
+    """A stand-in hub folder: plain weights are loaded, a pickle that would run something is refused."""
+    import torch
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "_hub_dir", None)
+    code, weights = (
+        tmp_path / "hub" / "facebookresearch_co-tracker_main",
+        tmp_path / "hub" / "checkpoints" / track_cotracker.WEIGHTS,
+    )
+    code.mkdir(parents=True)
+    weights.parent.mkdir()
+    (code / "hubconf.py").write_text(HUB)
+    torch.save({"weight": torch.tensor([[3.0, 4.0]]), "bias": torch.zeros(1)}, weights)
+    assert track_cotracker.load(CoTracker3()).model.weight.tolist() == [[3.0, 4.0]]
+    torch.save({"weight": Harmful(tmp_path / "ran")}, weights)
+    with pytest.raises(pickle.UnpicklingError, match=r"[Ww]eights"):
+        track_cotracker.load(CoTracker3())
+    assert not (tmp_path / "ran").exists()
+
+
+class Harmful:
+    """Unpickled, it would make a folder."""
+
+    def __init__(self, place):
+        self.place = place
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.place),)
