@@ -1,0 +1,50 @@
+"""Drawing with gsplat (Apache-2.0), on CUDA. Its clamp of opacity is 0.99 since version 1.5, ours 0.999 (`Limits.alpha_max`)."""
+
+from __future__ import annotations
+
+import torch
+
+from neuspring.splats.view import Limits, View
+
+
+def draw(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colours: torch.Tensor,
+    view: View,
+    degree: int | None,
+    background: tuple[float, float, float],
+    limits: Limits,
+) -> tuple[torch.Tensor, ...]:
+    """rgb [H, W, 3], alpha [H, W], depth [H, W], index [M], means [M, 2] px and radii [M] px. Arguments as `rasterise`."""
+    from gsplat import rasterization
+
+    drawn, alpha, facts = rasterization(
+        means,
+        torch.nn.functional.normalize(quaternions, dim=-1),
+        scales,
+        opacities,
+        colours,
+        view.world_to_camera[None].to(means),
+        view.intrinsics[None].to(means),
+        view.width,
+        view.height,
+        near_plane=limits.near,
+        far_plane=limits.far,
+        eps2d=limits.blur,
+        sh_degree=degree,
+        packed=False,
+        render_mode="RGB+ED",
+    )
+    flat = facts["means2d"]
+    if flat.requires_grad:
+        flat.retain_grad()
+    # Radii are one per axis since gsplat 1.5, one before.
+    radii = facts["radii"][0].float()
+    radii = radii.amax(-1) if radii.ndim == 2 else radii
+    index = torch.nonzero(radii > 0).squeeze(1)
+    cover = alpha[0, ..., 0]
+    rgb = drawn[0, ..., :3] + (1 - cover)[..., None] * drawn.new_tensor(background)
+    return rgb, cover, drawn[0, ..., 3], index, flat, radii[index]

@@ -1,0 +1,146 @@
+"""One function that draws Gaussian splats, differentiably: colour, coverage and expected depth.
+
+Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gsplat` (Apache-2.0, extra `gpu`) on CUDA. `auto` takes
+gsplat where it works. Results name the backend.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from neuspring.errors import InputError
+from neuspring.splats import harmonics
+from neuspring.splats.project import boxes, project, radii
+from neuspring.splats.tiles import blend, tiles
+from neuspring.splats.view import LIMITS, Limits, View
+
+Backend = Literal["warp", "gsplat"]
+LEAST_ALPHA = 1e-10
+"""Floor of the divisor of expected depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A picture of splats."""
+
+    rgb: torch.Tensor
+    """[H, W, 3], over the background; not clamped."""
+    alpha: torch.Tensor
+    """[H, W], coverage: 1 - transmittance."""
+    depth: torch.Tensor
+    """[H, W] m along the optical axis, the mean over what covers the pixel; 0 where nothing does."""
+    index: torch.Tensor
+    """[M] int64: the splats that touch the picture."""
+    means: torch.Tensor
+    """[M, 2] px, where they lie; keeps its gradient after a backward pass, which tells where splats are too coarse."""
+    radii: torch.Tensor
+    """[M] px, three standard deviations."""
+    backend: Backend
+
+
+def rasterise(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colours: torch.Tensor,
+    view: View,
+    *,
+    degree: int | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    limits: Limits = LIMITS,
+    backend: Backend = "warp",
+) -> Rendered:
+    """Draw splats with means [N, 3] m, quaternions [N, 4] (w first, any length), standard deviations [N, 3] m, opacities [N].
+
+    colours: RGB [N, 3] as they are, or with a `degree` harmonics [N, K, 3] of which the bands up to it are used. Differentiable in
+    all five. Raises InputError for wrong shapes and for entries that are not finite.
+    """
+    view.require_valid()
+    _require_splats(means, quaternions, scales, opacities, colours, degree)
+    if backend == "gsplat":
+        from neuspring.splats.gsplat_backend import draw
+
+        rgb, alpha, depth, index, flat, size = draw(
+            means, quaternions, scales, opacities, colours, view, degree, background, limits
+        )
+        return Rendered(rgb, alpha, depth, index, flat, size, "gsplat")
+    ellipses = project(means, quaternions, scales, view, limits)
+    touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
+    kept = torch.nonzero(touching).squeeze(1)
+    index = ellipses.index[kept]
+    flat, depths = ellipses.means[kept], ellipses.depths[kept]
+    if flat.requires_grad:
+        flat.retain_grad()
+    shade = colours[index]
+    if degree is not None:
+        shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
+    lists = tiles(depths.detach(), rectangles[kept], view)
+    features = torch.cat([shade, depths[:, None]], dim=1)
+    total, left = blend(lists, view, limits, flat, ellipses.conics[kept], opacities[index], features)
+    alpha = 1 - left
+    rgb = total[..., :3] + left[..., None] * total.new_tensor(background)
+    depth = total[..., 3] / alpha.clamp_min(LEAST_ALPHA)
+    return Rendered(rgb, alpha, depth, index, flat, radii(ellipses)[kept], "warp")
+
+
+def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Backend:
+    """`auto` -> gsplat on CUDA where it works, else ours. Raises InputError for gsplat where it cannot work."""
+    if wanted == "warp" or (wanted == "auto" and not device.startswith("cuda")):
+        return "warp"
+    fault = _gsplat_fault(device)
+    if not fault:
+        return "gsplat"
+    if wanted == "auto":
+        return "warp"
+    raise InputError("images.backend", "gsplat must work on this machine", fault, "Take images.backend: auto or warp.")
+
+
+@functools.cache
+def _gsplat_fault(device: str) -> str:
+    """Why gsplat cannot draw on `device`; empty if it can: one splat is drawn to find out, since gsplat compiles at first use."""
+    if not device.startswith("cuda"):
+        return f"it needs CUDA, the device is {device}"
+    if importlib.util.find_spec("gsplat") is None:
+        return 'not installed (pip install -e ".[gpu]")'
+    try:
+        tensors = [torch.tensor(v, device=device) for v in ([[0.0, 0, 1]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[1.0] * 3])]
+        eye, size = torch.eye(4, device=device), 16
+        intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], device=device)
+        drawn = rasterise(*tensors, View(eye, intrinsics, size, size), backend="gsplat")
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    return "" if float(drawn.alpha.max()) > 0.4 else "it drew nothing"
+
+
+def _require_splats(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colours: torch.Tensor,
+    degree: int | None,
+) -> None:
+    count = len(means)
+    wanted: dict[str, tuple[torch.Tensor, tuple[int | None, ...]]] = {
+        "means": (means, (count, 3)),
+        "quaternions": (quaternions, (count, 4)),
+        "scales": (scales, (count, 3)),
+        "opacities": (opacities, (count,)),
+        "colours": (colours, (count, 3) if degree is None else (count, None, 3)),
+    }
+    for name, (tensor, shape) in wanted.items():
+        if tensor.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, tensor.shape, strict=False)):
+            raise InputError(f"splats, {name}", f"the shape must be {list(shape)}", tuple(tensor.shape))
+        if not torch.isfinite(tensor.detach()).all():
+            bad = int((~torch.isfinite(tensor.detach())).reshape(count, -1).any(1).sum())
+            raise InputError(f"splats, {name}", "every entry must be finite", f"{bad} of {count} splats are not")
+    if degree is not None and not 0 <= degree <= 3:
+        raise InputError("splats, degree", "harmonics of degree 0 to 3 can be drawn", degree)
+    if degree is not None and colours.shape[1] < (degree + 1) ** 2:
+        raise InputError("splats, colours", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colours.shape[1])

@@ -1,0 +1,48 @@
+"""Golden pictures of splats: inputs as tensors, and the view."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuspring.splats.view import Limits, View
+
+FOLDER = Path(__file__).parents[1] / "golden"
+CASES = sorted(path.stem for path in FOLDER.glob("r*.npz"))
+INPUTS = ("means", "quats", "scales", "opacities", "colours")
+
+
+class Golden:
+    def __init__(self, name: str, dtype: torch.dtype, device: str = "cpu") -> None:
+        with np.load(FOLDER / f"{name}.npz") as stored:
+            self.values = {key: stored[key] for key in stored.files}
+        v = self.values
+        self.degree = int(v["sh_degree"]) if int(v["sh_degree"]) >= 0 else None
+        self.colour_key = "colors" if self.degree is None else "sh_coeffs"
+        keys = ("means", "quats", "scales", "opacities", self.colour_key)
+        self.inputs = {
+            name: torch.tensor(v[key], dtype=dtype, device=device).requires_grad_() for name, key in zip(INPUTS, keys, strict=True)
+        }
+        matrices = (torch.tensor(v[key], dtype=dtype, device=device) for key in ("viewmat", "K"))
+        self.view = View(*matrices, int(v["width"]), int(v["height"]))
+        self.background = tuple(map(float, v["background"]))
+        self.limits = Limits(
+            near=float(v["near"]),
+            far=float(v["far"]),
+            blur=float(v["eps2d"]),
+            alpha_min=float(v["alpha_min"]),
+            alpha_max=float(v["alpha_max"]),
+            transmittance_min=float(v["t_stop"]),
+        )
+
+    @property
+    def options(self) -> dict[str, object]:
+        return {"degree": self.degree, "background": self.background, "limits": self.limits}
+
+    def expected_gradient(self, which: str, name: str) -> np.ndarray:
+        return self.values[f"grad{which}_{self.colour_key if name == 'colours' else name}"]
+
+    def loss(self, which: str, rgb: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+        weights = {key: torch.tensor(self.values[f"w_{key}"]).to(rgb) for key in ("rgb", "alpha", "depth")}
+        total = (weights["rgb"] * rgb).sum() + (weights["alpha"] * alpha).sum()
+        return total if which == "A" else total + (weights["depth"] * depth).sum()
