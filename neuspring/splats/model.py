@@ -1,0 +1,171 @@
+"""Gaussian splats as a noun: kept in the PLY layout that splat viewers read, and as tensors that can be drawn and trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+import torch
+
+from neuspring.artifacts import Artifact, array, write_atomically
+from neuspring.errors import InputError
+from neuspring.splats.project import degree_of
+from neuspring.splats.rasterise import Backend, Rendered, rasterise
+from neuspring.splats.view import LIMITS, Limits, View
+
+PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
+LONGEST_HEADER = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Splats(Artifact):
+    """Gaussians in the shape of frame 0. Unlike other artefacts they are stored as PLY (binary, little endian)."""
+
+    kind: ClassVar[str] = "splats"
+    means: np.ndarray = array("N,3", np.float32, "m", "centres in the world")
+    quaternions: np.ndarray = array("N,4", np.float32, "1", "orientations, w first, of any length but zero")
+    log_scales: np.ndarray = array("N,A", np.float32, "log m", "standard deviations: A = 1 isotropic, 3 one per axis")
+    opacity_logits: np.ndarray = array("N", np.float32, "1", "opacity = 1 / (1 + exp(-.))")
+    harmonics: np.ndarray = array("N,K,3", np.float32, "1", "colour, see `neuspring.splats.harmonics`; K = 1, 4, 9 or 16")
+
+    def check(self) -> None:
+        if self.log_scales.shape[1] not in (1, 3):
+            raise InputError("splats.log_scales", "one scale or three are required", self.log_scales.shape[1])
+        if self.harmonics.shape[1] not in (1, 4, 9, 16):
+            raise InputError("splats.harmonics", "1, 4, 9 or 16 coefficients are required", self.harmonics.shape[1])
+        if len(self.means) == 0:
+            raise InputError("splats", "at least one splat is required", "none")
+
+    def save(self, path: Path) -> None:
+        """Write `path` (.ply) atomically, with the properties and order of splat files."""
+        columns = _columns(self.log_scales.shape[1], self.harmonics.shape[1])
+        rest = self.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(self.means), -1)
+        parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], rest, self.opacity_logits[:, None])
+        table = np.concatenate([*parts, self.log_scales, self.quaternions], axis=1).astype("<f4")
+        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+        header = "\n".join([*lines, *(f"property float {name}" for name in columns), "end_header", ""])
+        write_atomically(Path(path), lambda temporary: temporary.write_bytes(header.encode() + table.tobytes()))
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a splat file, ours or another trainer's. Raises InputError if it is missing, truncated or holds something else."""
+        table = _read_ply(Path(path))
+        names = table.dtype.names or ()
+        rest = sum(name.startswith("f_rest_") for name in names)
+        scales = sum(name.startswith("scale_") for name in names)
+        wanted = _columns(scales, 1 + rest // 3)
+        missing = [name for name in wanted if name not in names and name not in ("nx", "ny", "nz")]
+        if missing:
+            raise InputError(path, "must hold the properties of Gaussian splats", f"no {', '.join(missing)}")
+
+        def stacked(prefix: str, count: int) -> np.ndarray:
+            values = [table[f"{prefix}{k}"] for k in range(count)]
+            return np.stack(values, axis=1).astype(np.float32) if values else np.zeros((len(table), 0), np.float32)
+
+        bands = stacked("f_rest_", rest).reshape(len(table), 3, -1).transpose(0, 2, 1)
+        try:
+            return cls(
+                means=np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float32),
+                quaternions=stacked("rot_", 4),
+                log_scales=stacked("scale_", scales),
+                opacity_logits=table["opacity"].astype(np.float32),
+                harmonics=np.concatenate([stacked("f_dc_", 3)[:, None], bands], axis=1),
+            )
+        except InputError as error:
+            raise InputError(path, "must hold usable splats", error) from error
+
+
+def _columns(scales: int, coefficients: int) -> list[str]:
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{k}" for k in range(3)),
+        *(f"f_rest_{k}" for k in range(3 * (coefficients - 1))),
+        "opacity",
+        *(f"scale_{k}" for k in range(scales)),
+        *(f"rot_{k}" for k in range(4)),
+    ]
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    """The vertices of a binary PLY as a structured array."""
+    rule = "must be a binary little-endian PLY of splats"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
+    head, found, body = content[:LONGEST_HEADER].partition(b"end_header\n")
+    lines = head.decode("ascii", errors="replace").splitlines()
+    if not found or lines[0] != "ply" or "format binary_little_endian 1.0" not in lines:
+        raise InputError(path, rule, repr(content[:40]))
+    words = [line.split() for line in lines]
+    elements = [word for word in words if word[:1] == ["element"]]
+    properties = [word for word in words if word[:1] == ["property"]]
+    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][2].isdigit():
+        raise InputError(path, f"{rule}, with vertices alone", elements)
+    unknown = [word for word in properties if len(word) != 3 or word[1] not in PLY_TYPES]
+    if unknown:
+        raise InputError(path, f"{rule}, with properties of type {', '.join(PLY_TYPES)}", " ".join(unknown[0]))
+    layout = np.dtype([(word[2], PLY_TYPES[word[1]]) for word in properties])
+    count = int(elements[0][2])
+    available = len(content) - len(head) - len(found)
+    if available < count * layout.itemsize:
+        held = f"{available // max(layout.itemsize, 1)} whole ones: the file is truncated"
+        raise InputError(path, f"the header promises {count} splats", held, "Delete it and re-run its step.")
+    return np.frombuffer(content, layout, count, offset=len(head) + len(found))
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """Splats as tensors on a device, in the form that is trained. Shapes as in `Splats`."""
+
+    means: torch.Tensor
+    quaternions: torch.Tensor
+    log_scales: torch.Tensor
+    opacity_logits: torch.Tensor
+    harmonics: torch.Tensor
+
+    @classmethod
+    def of(cls, splats: Splats, device: str = "cpu") -> Gaussians:
+        """From stored splats."""
+        names = ("means", "quaternions", "log_scales", "opacity_logits", "harmonics")
+        return cls(**{name: torch.tensor(getattr(splats, name), device=device) for name in names})
+
+    def stored(self) -> Splats:
+        """As an artefact."""
+        return Splats(**{name: tensor.detach().cpu().numpy() for name, tensor in vars(self).items()})
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[N]."""
+        return torch.sigmoid(self.opacity_logits)
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """Standard deviations [N, 3], m."""
+        return torch.exp(self.log_scales).expand(-1, 3)
+
+    def draw(
+        self,
+        view: View,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        degree: int | None = None,
+        limits: Limits = LIMITS,
+        backend: Backend = "warp",
+    ) -> Rendered:
+        """A picture; `degree` limits the bands that are used."""
+        most = degree_of(self.harmonics.shape[1])
+        return rasterise(
+            self.means,
+            self.quaternions,
+            self.scales,
+            self.opacities,
+            self.harmonics,
+            view,
+            degree=most if degree is None else min(degree, most),
+            background=background,
+            limits=limits,
+            backend=backend,
+        )

@@ -1,0 +1,107 @@
+"""Linear blend skinning: the nodes of a twin carry the splats from frame to frame.
+
+Every node b has a rotation R_b between two frames, the one that best maps the offsets to its 16 nearest nodes of frame 0 (Kabsch).
+A splat at x follows its 16 nearest nodes (at their places before) with weights w_b ~ 1 / (|x - p_b| + 1e-6 m):
+
+    x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalise(sum_b w_b q(R_b)) q.
+
+Frame to frame, accumulated, as in the released evaluation. Nearest nodes come from a hash grid: time and memory do not grow as nodes
+times splats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from scipy.spatial import cKDTree
+
+from neuspring.errors import InputError
+from neuspring.physics.solver import start_warp
+from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
+
+NEIGHBOURS = 16
+GRID = 64
+"""Cells of the hash grid along each axis."""
+
+
+class Skin:
+    """Carries splats by nodes whose frame 0 is `nodes` [N, 3], m.
+
+    frozen: keep the nodes that each splat is bound to in its first step (weights follow), for real time.
+    released_degeneracy: as released, one node on a line of neighbours turns all nodes as itself, several turn none.
+    """
+
+    def __init__(
+        self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False, released_degeneracy: bool = False
+    ) -> None:
+        start_warp()
+        if len(nodes) == 0 or not np.isfinite(nodes).all():
+            raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
+        self._device, self._frozen, self._released = device, frozen, released_degeneracy
+        self._bound: Any = None
+        self._count = min(NEIGHBOURS, len(nodes))
+        # The usual distance of nodes; the search radius doubles where it is too small.
+        spacing = np.median(cKDTree(nodes).query(nodes, k=min(2, len(nodes)))[0]) if len(nodes) > 1 else 1.0
+        self._radius = float(max(2.5 * spacing, 1e-4))
+        self._grid = wp.HashGrid(GRID, GRID, GRID, device=device)
+        start = self._vectors(nodes)
+        self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
+
+    def step(
+        self, before: np.ndarray, after: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Means [S, 3] m and quaternions [S, 4] (w first) after the nodes moved from `before` to `after` [N, 3], m."""
+        old, new = self._vectors(before), self._vectors(after)
+        rotations = self._rotations(old, new)
+        start = wp.from_torch(means.detach().float().contiguous(), dtype=wp.vec3)
+        if self._bound is None or not self._frozen:
+            self._bound = self._nearest(old, start, own=False, wanted=self._count)
+        moved, turned = torch.empty_like(means), torch.empty_like(quaternions)
+        orientation = wp.from_torch(quaternions.detach().float().contiguous(), dtype=wp.vec4)
+        outputs = [wp.from_torch(moved, dtype=wp.vec3), wp.from_torch(turned, dtype=wp.vec4)]
+        self._launch(move_splats, len(means), [old, new, rotations, self._bound, start, orientation, *outputs])
+        return moved, turned
+
+    def carry(
+        self, positions: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
+    ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """(means, quaternions) in every frame of a trajectory [F, N, 3], m, whose frame 0 they were made in."""
+        yield means, quaternions
+        for before, after in zip(positions[:-1], positions[1:], strict=True):
+            means, quaternions = self.step(before, after, means, quaternions)
+            yield means, quaternions
+
+    def _rotations(self, before: Any, after: Any) -> Any:
+        count = len(before)
+        rotations = wp.zeros(count, dtype=wp.mat33, device=self._device)
+        ranks = wp.zeros(count, dtype=int, device=self._device)
+        self._launch(turn_nodes, count, [before, after, self._relations, rotations, ranks])
+        if self._released:
+            poor = np.flatnonzero(ranks.numpy() < 2)
+            if len(poor):
+                values = rotations.numpy()
+                alone = len(poor) == 1 and ranks.numpy()[poor[0]] == 1
+                values[:] = values[poor[0]] if alone else np.eye(3)
+                rotations.assign(values)
+        return rotations
+
+    def _nearest(self, points: Any, queries: Any, *, own: bool, wanted: int) -> Any:
+        found = wp.zeros((len(queries), wanted), dtype=int, device=self._device)
+        if wanted:
+            distances = wp.zeros((len(queries), wanted), dtype=float, device=self._device)
+            self._grid.build(points, self._radius)
+            arguments = [self._grid.id, points, queries, own, wanted, self._radius, found, distances]
+            self._launch(nearest, len(queries), arguments)
+        return found
+
+    def _vectors(self, values: np.ndarray) -> Any:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self._device)
+
+    def _launch(self, kernel: Any, size: int, arguments: list[Any]) -> None:
+        on_gpu = self._device != "cpu"
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self._device)) if on_gpu else None
+        wp.launch(kernel, size, arguments, device=self._device, stream=stream)

@@ -1,0 +1,83 @@
+"""Splat files: what is written is read back, other trainers' files are read, damaged ones are named."""
+
+import numpy as np
+import pytest
+
+from neuspring.errors import InputError
+from neuspring.splats.model import Gaussians, Splats
+
+
+def some(count: int = 7, axes: int = 1, coefficients: int = 4) -> Splats:
+    rng = np.random.default_rng(0)
+    shapes = {
+        "means": (count, 3),
+        "quaternions": (count, 4),
+        "log_scales": (count, axes),
+        "opacity_logits": (count,),
+        "harmonics": (count, coefficients, 3),
+    }
+    return Splats(**{name: rng.normal(size=shape) for name, shape in shapes.items()})
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_what_is_written_is_read_back(tmp_path, axes, coefficients):
+    splats = some(axes=axes, coefficients=coefficients)
+    splats.save(tmp_path / "splats.ply")
+    again = Splats.load(tmp_path / "splats.ply")
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "harmonics"):
+        assert np.array_equal(getattr(again, name), getattr(splats, name))
+    stored = Gaussians.of(again).stored()
+    assert np.array_equal(stored.harmonics, splats.harmonics)
+
+
+def test_the_layout_is_that_of_splat_viewers(tmp_path):
+    """Bands above the first are stored channel by channel; written here by hand, with normals and another order."""
+    splats = some(count=2)
+    rest = {f"f_rest_{3 * channel + band}": splats.harmonics[:, 1 + band, channel] for channel in range(3) for band in range(3)}
+    columns = {f"rot_{k}": splats.quaternions[:, k] for k in range(4)} | rest
+    columns |= {axis: splats.means[:, k] for k, axis in enumerate("xyz")} | {f"n{axis}": np.zeros(2) for axis in "xyz"}
+    columns |= {f"f_dc_{k}": splats.harmonics[:, 0, k] for k in range(3)}
+    columns |= {"opacity": splats.opacity_logits, "scale_0": splats.log_scales[:, 0]}
+    header = "\n".join(["ply", "format binary_little_endian 1.0", "comment by hand", "element vertex 2"])
+    header += "".join(f"\nproperty float {name}" for name in columns) + "\nend_header\n"
+    path = tmp_path / "hand.ply"
+    path.write_bytes(header.encode() + np.stack(list(columns.values()), axis=1).astype("<f4").tobytes())
+    again = Splats.load(path)
+    assert np.array_equal(again.harmonics, splats.harmonics)
+    assert np.array_equal(again.quaternions, splats.quaternions)
+
+
+def test_a_truncated_file_says_how_much_is_there(tmp_path):
+    path = tmp_path / "splats.ply"
+    some(count=50).save(path)
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(InputError, match=r"splats\.ply.*promises 50 splats.*truncated"):
+        Splats.load(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "must be a binary little-endian PLY"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "must be a binary"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0", "no y, z, f_dc_0"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "properties of type"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nelement face 2\nend_header\n", "vertices alone"),
+    ],
+)
+def test_other_files_are_named(tmp_path, content, message):
+    path = tmp_path / "other.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        Splats.load(path)
+
+
+def test_a_file_with_values_that_are_not_finite_is_named(tmp_path):
+    path = tmp_path / "splats.ply"
+    some().save(path)
+    content = bytearray(path.read_bytes())
+    content[-4:] = np.float32(np.nan).tobytes()
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"splats\.ply.*usable.*quaternions.*finite"):
+        Splats.load(path)

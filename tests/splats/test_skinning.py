@@ -1,0 +1,146 @@
+"""Skinning against golden rollouts (`tests/golden/l*.npz`), rigid motions and degenerate neighbourhoods.
+
+Tolerances of the golden data in single precision: 5e-6 m and 2e-5 per component of a quaternion; neighbours equal as sets.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.errors import InputError
+from neuspring.splats.skinning import Skin
+
+FOLDER = Path(__file__).parents[1] / "golden"
+CASES = sorted(path.stem for path in FOLDER.glob("l*.npz"))
+METRES, COMPONENTS = 5e-6, 2e-5
+DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
+
+
+def as_tensor(values: np.ndarray, device: str = "cpu") -> torch.Tensor:
+    return torch.tensor(np.asarray(values, np.float32), device=device)
+
+
+def same_sign(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    return found * np.sign((found * wanted).sum(-1, keepdims=True))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("frozen", [False, True], ids=["rebound", "frozen"])
+@pytest.mark.parametrize("case", CASES)
+def test_rollouts_are_the_golden_ones(case, frozen, device):
+    with np.load(FOLDER / f"{case}.npz") as golden:
+        skin = Skin(golden["points"][0], device=device, frozen=frozen)
+        ending = "_frozen" if frozen else ""
+        wanted = zip(golden[f"exp_means{ending}"], golden[f"exp_quats{ending}"], strict=True)
+        start = (as_tensor(golden[name], device) for name in ("means0", "quats0"))
+        for (means, quaternions), (places, turns) in zip(skin.carry(golden["points"], *start), wanted, strict=True):
+            assert np.abs(means.cpu().numpy() - places).max() <= METRES
+            assert np.abs(same_sign(quaternions.cpu().numpy(), turns) - turns).max() <= COMPONENTS
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_neighbours_and_rotations_are_the_golden_ones(case):
+    with np.load(FOLDER / f"{case}.npz") as golden:
+        points = golden["points"]
+        skin = Skin(points[0])
+        assert np.array_equal(np.sort(skin._relations.numpy(), axis=1), golden["relations"])
+        for step, means in enumerate(golden["exp_means"][:-1]):
+            before, after = skin._vectors(points[step]), skin._vectors(points[step + 1])
+            assert np.abs(skin._rotations(before, after).numpy() - golden["exp_bone_R"][step]).max() <= COMPONENTS
+            bound = skin._nearest(before, skin._vectors(means), own=False, wanted=16)
+            assert np.array_equal(np.sort(bound.numpy(), axis=1), golden["knn_idx"][step])
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(2, 60))
+def test_nearest_nodes_are_those_of_a_tree(seed, count):
+    rng = np.random.default_rng(seed)
+    # Clumps and strays: the search radius must grow for some and not for others.
+    points = rng.normal(size=(count, 3)) * rng.choice([0.01, 1.0], (count, 1))
+    queries = rng.normal(size=(40, 3)) * rng.choice([0.01, 5.0], (40, 1))
+    wanted = min(16, count)
+    skin = Skin(points)
+    found = skin._nearest(skin._vectors(points), skin._vectors(queries), own=False, wanted=wanted).numpy()
+    points, queries = points.astype(np.float32), queries.astype(np.float32)
+    distances = np.linalg.norm(points[found] - queries[:, None], axis=2)
+    expected = cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0]
+    assert np.allclose(distances, expected, atol=1e-5)
+    assert all(len(set(row)) == wanted for row in found.tolist())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), shape=st.sampled_from(["solid", "sheet"]))
+def test_a_rigid_motion_moves_splats_rigidly(seed, shape):
+    rng = np.random.default_rng(seed)
+    nodes = rng.uniform(-0.1, 0.1, (80, 3)) * ([1, 1, 0] if shape == "sheet" else [1, 1, 1])
+    means, turns = rng.uniform(-0.12, 0.12, (50, 3)), Rotation.random(50, random_state=seed)
+    motion, shift = Rotation.from_rotvec(rng.normal(size=3)), rng.normal(size=3)
+    quaternions = as_tensor(turns.as_quat(scalar_first=True))
+    moved, turned = Skin(nodes).step(nodes, motion.apply(nodes) + shift, as_tensor(means), quaternions)
+    assert np.abs(moved.numpy() - (motion.apply(means) + shift)).max() < METRES
+    expected = (motion * turns).as_quat(scalar_first=True)
+    assert np.abs(same_sign(turned.numpy(), expected) - expected).max() < COMPONENTS
+
+
+def rope(count: int = 40) -> np.ndarray:
+    """Nodes on one line: every neighbourhood is degenerate."""
+    return np.stack([np.linspace(0, 0.4, count), np.zeros(count), np.zeros(count)], axis=1)
+
+
+def test_nodes_on_a_line_turn_by_the_least_angle():
+    nodes, quarter = rope(), Rotation.from_euler("z", 90, degrees=True)
+    beside = nodes[10:30] + [0, 0.004, 0]
+    identity = as_tensor(np.tile([1.0, 0, 0, 0], (20, 1)))
+    moved, turned = Skin(nodes).step(nodes, quarter.apply(nodes), as_tensor(beside), identity)
+    assert np.abs(moved.numpy() - quarter.apply(beside)).max() < METRES
+    assert np.abs(turned.numpy() - quarter.as_quat(scalar_first=True)).max() < COMPONENTS
+
+
+def test_a_line_turned_round_stays_finite_and_rigid():
+    nodes = rope()
+    moved, _ = Skin(nodes).step(nodes, -nodes, as_tensor(nodes + [0, 0.004, 0]), as_tensor(np.tile([1.0, 0, 0, 0], (40, 1))))
+    # Off the line the half turn may go any way round, but to the same distance.
+    assert np.abs(np.linalg.norm(moved.numpy() + nodes, axis=1) - 0.004).max() < METRES
+
+
+def strand_beside_a_body() -> tuple[np.ndarray, np.ndarray]:
+    """A solid body that turns, and far from it 17 nodes on a line that turn otherwise."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.05, 0.05, (100, 3))
+    strand = rope(17) * 0.2 + [2.0, 0, 0]
+    nodes = np.concatenate([body, strand])
+    after = np.concatenate(
+        [Rotation.from_euler("x", 40, degrees=True).apply(body), Rotation.from_euler("z", 30, degrees=True).apply(strand)]
+    )
+    return nodes, after
+
+
+def test_a_degenerate_neighbourhood_stays_local():
+    nodes, after = strand_beside_a_body()
+    means = as_tensor(nodes[:100])
+    identity = as_tensor(np.tile([1.0, 0, 0, 0], (100, 1)))
+    expected = Rotation.from_euler("x", 40, degrees=True).as_quat(scalar_first=True)
+    _, turned = Skin(nodes).step(nodes, after, means, identity)
+    assert np.abs(turned.numpy() - expected).max() < COMPONENTS
+    # As released the strand stops all rotations.
+    _, spoiled = Skin(nodes, released_degeneracy=True).step(nodes, after, means, identity)
+    assert np.abs(spoiled.numpy() - identity.numpy()).max() < COMPONENTS
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_handful_of_nodes_carries_splats_too(count):
+    nodes = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 3))
+    moved, turned = Skin(nodes).step(nodes, nodes + [0.1, 0, 0], as_tensor(nodes), as_tensor(np.tile([1.0, 0, 0, 0], (count, 1))))
+    assert np.abs(moved.numpy() - nodes - [0.1, 0, 0]).max() < METRES
+    assert np.abs(turned.numpy() - [1, 0, 0, 0]).max() < COMPONENTS
+
+
+def test_nodes_that_are_not_finite_are_refused():
+    with pytest.raises(InputError, match="nodes.*finite"):
+        Skin(np.full((3, 3), np.nan))
