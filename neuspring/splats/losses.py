@@ -1,0 +1,92 @@
+"""What training of splats minimises, on one view of frame 0.
+
+    L = l1 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
+
+C colour, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
+object. Means are over all pixels. Behind the hands nothing is known: there everything is zero on both sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from neuspring.config_images import Appearance
+from neuspring.errors import InputError
+from neuspring.image_metrics import ssim_map
+from neuspring.splats.rasterise import Rendered
+from neuspring.splats.view import View
+
+WINDOW = 12
+"""Pixels around the object's mask in which SSIM is taken: its window is 11 wide, and beyond it both pictures are black."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What one camera saw in frame 0, masked, on a device."""
+
+    name: str
+    view: View
+    colour: torch.Tensor
+    """[H, W, 3] in 0..1, black outside the object's mask."""
+    mask: torch.Tensor
+    """[H, W] 1 where the object is seen."""
+    known: torch.Tensor
+    """[H, W] 0 behind hands, else 1."""
+    depth: torch.Tensor
+    """[H, W] m, 0 where the object's depth was not measured."""
+    box: tuple[int, int, int, int]
+    """Rows and columns around the mask: top, bottom, left, right, ends excluded."""
+
+    @classmethod
+    def of(
+        cls, name: str, view: View, colour: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
+    ) -> Shot:
+        """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands grow by a square of `margin` pixels.
+
+        Raises InputError for sizes that differ from the view's and for an empty mask.
+        """
+        size = (view.height, view.width)
+        for what, array in {"image": colour, "mask": mask, "mask of hands": hands, "depth": depth}.items():
+            if array.shape[:2] != size:
+                raise InputError(f"camera {name}, {what} of frame 0", f"must have the camera's size {size}", array.shape[:2])
+        grown = hands.astype(np.uint8)
+        if margin >= 1:
+            grown = cv2.dilate(grown, np.ones((round(margin), round(margin)), np.uint8))
+        known = grown == 0
+        seen = mask & known
+        if not seen.any():
+            rule = "the object must be seen in frame 0 by every camera that trains its appearance"
+            raise InputError(f"camera {name}, mask of frame 0", rule, "an empty mask", "Look at its masks.png.")
+        rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+        box = (
+            max(int(rows[0]) - WINDOW, 0),
+            min(int(rows[-1]) + WINDOW + 1, size[0]),
+            max(int(columns[0]) - WINDOW, 0),
+            min(int(columns[-1]) + WINDOW + 1, size[1]),
+        )
+        device = view.intrinsics.device
+        on_black = np.where(seen[..., None], colour, 0).astype(np.float32) / 255
+        measured = np.where(seen, depth, 0.0).astype(np.float32)
+        tensors = [torch.tensor(a, device=device) for a in (on_black, seen.astype(np.float32), known.astype(np.float32), measured)]
+        return cls(name, view, *tensors, box)
+
+
+def loss(drawn: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
+    """The training loss of one picture."""
+    known = shot.known
+    colour = drawn.rgb * known[..., None]
+    total = settings.l1 * (colour - shot.colour).abs().mean()
+    if settings.dssim:
+        top, bottom, left, right = shot.box
+        pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (colour, shot.colour)]
+        total = total + settings.dssim * (1 - ssim_map(*pair)).sum() / colour.numel()
+    if settings.mask:
+        total = total + settings.mask * (drawn.alpha * known - shot.mask).abs().mean()
+    if settings.depth:
+        measured = shot.depth > 0
+        total = total + settings.depth * ((drawn.depth - shot.depth) * measured).abs().mean()
+    return total
