@@ -1,4 +1,4 @@
-# The benchmark: captures -> observations -> search -> fit -> rollout -> scores -> tables, every run in MLflow.
+# The benchmark: captures -> observations -> search -> fit -> rollout -> pictures -> scores -> tables, every run in MLflow.
 from snakemake.utils import min_version
 
 min_version("9.20")
@@ -11,6 +11,7 @@ include: "workflow/rules/common.smk"
 include: "workflow/rules/perceive.smk"
 include: "workflow/rules/observe.smk"
 include: "workflow/rules/twin.smk"
+include: "workflow/rules/images.smk"
 include: "workflow/rules/score.smk"
 include: "workflow/rules/tables.smk"
 include: "workflow/rules/tracking.smk"

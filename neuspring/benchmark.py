@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuspring.config import MADE, Config, Fit, Method, ScenarioRow, Search, SearchRow, merge, parse, plain, read_text, read_yaml
+from neuspring.config import FILMED, MADE, Config, Fit, Method, ScenarioRow, Search, SearchRow, merge, parse, plain, read_text, read_yaml
 from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
 
@@ -135,6 +135,10 @@ class Benchmark:
         """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""
         row = self.scenarios[name]
         return None if row.source in MADE else Path(self.config.data_root or ".") / row.path
+
+    def has_images(self, name: str) -> bool:
+        """Whether a scenario's predictions are drawn and scored."""
+        return self.config.images.enabled and self.scenarios[name].source in FILMED
 
     def capture_folder(self, name: str) -> Path:
         """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""

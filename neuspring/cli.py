@@ -122,6 +122,21 @@ def _observe(a: argparse.Namespace) -> int:
     return 0
 
 
+def _appearance(a: argparse.Namespace) -> int:
+    from neuspring import appearance
+
+    appearance.learn(a.capture.parent, a.masks, a.lifted, _settings(a.settings), a.seed, a.device, a.output)
+    return 0
+
+
+def _render(a: argparse.Namespace) -> int:
+    from neuspring import appearance
+
+    records = (a.appearance, a.rollout)
+    appearance.render(a.capture.parent, a.masks, a.observations, *records, _settings(a.settings), a.device, a.output)
+    return 0
+
+
 def _search(a: argparse.Namespace) -> int:
     from neuspring import stages
 
@@ -153,7 +168,8 @@ def _transfer(a: argparse.Namespace) -> int:
 def _score(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    records = {"search": a.search} | ({"fit": a.fit} if a.fit else {}) | {"rollout": a.rollout}
+    optional = {"fit": a.fit} if a.fit else {}
+    records = {"search": a.search} | optional | {"rollout": a.rollout} | ({"render": a.render} if a.render else {})
     stages.score(a.observations, records, a.method, _json_mapping("--variant", a.variant), a.seed, a.output)
     return 0
 
@@ -251,6 +267,19 @@ def _parser() -> argparse.ArgumentParser:
     observe.add_argument("--capture", type=Path, help="capture.json of raw video")
     observe.add_argument("--lifted", type=Path, help="lifted.json of raw video")
 
+    learn = add("appearance", _appearance, "frame 0 of a capture -> splats", "capture", "settings", "compute", "output")
+    learn.add_argument("--seed", type=int, default=0)
+    draw = add(
+        "render", _render, "splats and trajectory -> pictures, scored and filmed", "capture", "observations", "settings", "compute", "output"
+    )
+    for command in (learn, draw):
+        command.add_argument(
+            "--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order"
+        )
+    learn.add_argument("--lifted", type=Path, required=True, help="lifted.json")
+    draw.add_argument("--appearance", type=Path, required=True, help="appearance.json")
+    draw.add_argument("--rollout", type=Path, required=True, help="rollout.json")
+
     search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
     search.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
     search.add_argument("--seed", type=int, default=0)
@@ -277,6 +306,7 @@ def _parser() -> argparse.ArgumentParser:
     score.add_argument("--search", type=Path, required=True, help="search.json")
     score.add_argument("--fit", type=Path, help="fit.json, if the method has that stage")
     score.add_argument("--rollout", type=Path, required=True, help="rollout.json")
+    score.add_argument("--render", type=Path, help="render.json, if the scenario has images")
     score.add_argument("--method", required=True)
     score.add_argument("--variant", default="{}", help="JSON: the method's switches")
     score.add_argument("--seed", type=int, default=0)

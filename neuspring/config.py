@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
+from neuspring.config_images import Images
 from neuspring.config_perception import Perception, Synthetic
 from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range
 from neuspring.errors import InputError
@@ -392,6 +393,8 @@ class Config:
     """See [synthetic](#synthetic)."""
     perception: Perception = field(default_factory=Perception)
     """See [perception](#perception)."""
+    images: Images = field(default_factory=Images)
+    """See [images](#images)."""
     tracking: Tracking = field(default_factory=Tracking)
     """See [tracking](#tracking)."""
 

@@ -105,10 +105,13 @@ def masked_pair(
     return first, second
 
 
-def silhouettes(object_mask: np.ndarray, rendered: np.ndarray, hand_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(observed, rendered) silhouettes whose IoU PhysTwin reports, each [H, W] bool; inputs as in `masked_pair`.
+def silhouettes(
+    object_mask: np.ndarray, rendered: np.ndarray, hand_mask: np.ndarray, covered: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """(observed, rendered) silhouettes whose IoU is reported, each [H, W] bool; inputs as in `masked_pair`.
 
-    Any alpha but 0 counts. Only the rendered one loses what the hand hides, so a hidden part of the object counts against it.
+    An alpha of at least `covered` counts; PhysTwin counts any but 0. Only the rendered one loses what the hand hides, so a part of
+    the observed mask under the hand counts against it.
     """
     _check_bytes(object_mask.shape, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
-    return object_mask > 0, (rendered[..., 3] > 0) & (hand_mask < 255)
+    return object_mask > 0, (rendered[..., 3] >= covered) & (hand_mask < 255)

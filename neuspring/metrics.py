@@ -1,4 +1,5 @@
-"""What is reported: Chamfer distance and track error (as in the released evaluation), per frame and per task, both averages.
+"""What is reported: Chamfer distance and track error (as in the released evaluation) and scores of pictures, per frame and per task,
+both averages.
 
 Chamfer: each visible observed point to its nearest surface node, single direction, in the L1 norm |dx| + |dy| + |dz|.
 Track: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 from neuspring.artifacts import Observations, Scenario, Trajectory
 
 TASKS = ("reconstruction", "future")
-UNITS = {"chamfer": "m", "track_error": "m"}
+UNITS = {"chamfer": "m", "track_error": "m", "psnr": "dB", "ssim": "1", "lpips": "1", "iou": "1"}
 COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 
 
@@ -94,6 +95,25 @@ def score_tasks(
             if len(usable):
                 identity = (scenario.name, scenario.category, method, seed, task, metric)
                 rows.append((*identity, float(usable.mean()), UNITS[metric], len(usable)))
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def score_images(
+    frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int, tasks: Mapping[str, range] | None = None
+) -> pd.DataFrame:
+    """Tidy scores of pictures from `frames` (columns frame, camera, metric, value), of which the first `drawn` frames exist.
+
+    Cameras are averaged within a frame, then frames; a task that the rollout diverged in is left out.
+    """
+    rows = []
+    for task, span in (tasks or {task: task_frames(scenario, task) for task in TASKS}).items():
+        if not len(span) or span[-1] >= drawn:
+            continue
+        part = frames[frames["frame"].isin(span)]
+        for metric, values in part.groupby("metric", sort=False):
+            per_frame = values.groupby("frame")["value"].mean()
+            identity = (scenario.name, scenario.category, method, seed, task, metric)
+            rows.append((*identity, float(per_frame.mean()), UNITS[str(metric)], len(per_frame)))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

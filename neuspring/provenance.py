@@ -18,7 +18,7 @@ from pathlib import Path
 PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
-NOT_NUMERICS = frozenset({f"{PACKAGE}.config", f"{PACKAGE}.progress", f"{PACKAGE}.records"})
+NOT_NUMERICS = frozenset(f"{PACKAGE}.{name}" for name in ("config", "config_images", "config_perception", "progress", "records"))
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 
 
@@ -80,10 +80,10 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def _stage_code(stage: str) -> str:
-    """The function `stage` of `neuspring.stages`, or `module.function` of another module, and what it calls there."""
+    """The function `stage` of `neuspring.stages`, or `module.function` of another module, and the functions and classes it uses there."""
     module, _, function = stage.rpartition(".")
     tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
-    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     found: dict[str, str] = {}
     waiting = [function]
     while waiting:

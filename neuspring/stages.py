@@ -24,6 +24,10 @@ from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, 
 
 RESULT_ROLES = ("twin", "trajectory")
 """Files of a stage that are its result, as opposed to how it got there."""
+PICTURE_ROLES = ("strip", "video", "turntable")
+"""Files of the render stage to look at."""
+PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks")
+"""What a reader of image scores must know."""
 
 
 def write_table(table: pd.DataFrame, path: Path) -> Path:
@@ -254,7 +258,7 @@ def score(
 ) -> None:
     """Trajectory -> scores.parquet, plots, and run.json: the record of the whole run, which MLflow indexes.
 
-    `records` maps search, fit (if any) and rollout to their records.
+    `records` maps search, fit (if any), rollout and render (for scenarios with images) to their records.
     """
     clock = Stopwatch()
     observations = Observations.load(observations_path)
@@ -264,6 +268,10 @@ def score(
     table = pd.DataFrame(columns=list(metrics.COLUMNS))
     if trajectory is not None:
         table = metrics.score(trajectory, observations, method, seed)
+    drawn = _drawn(stages, records)
+    if drawn is not None and trajectory is not None:
+        pictured = metrics.score_images(drawn, observations.scenario, len(trajectory.positions), method, seed)
+        table = pd.concat([part for part in (table, pictured) if len(part)] or [table], ignore_index=True)
     write_table(table, folder / "scores.parquet")
     histories = {name: records[name].parent / "history.parquet" for name in ("search", "fit") if "history" in _files(stages, name)}
     twin_stage = "fit" if "fit" in stages else "search"
@@ -281,6 +289,9 @@ def score(
         # The search gives every spring the same stiffness.
         searched=None if searched is None else float(np.median(searched.material.stiffness)),
     )
+    if drawn is not None:
+        artefacts["images"] = [stages["render"].file(role, records["render"]) for role in PICTURE_ROLES if role in _files(stages, "render")]
+        artefacts["plots"].append(figures.image_scores_figure(drawn, observations.scenario, method, folder / "plots"))
     content = {
         "scenario": observations.scenario.name,
         "method": method,
@@ -291,6 +302,7 @@ def score(
         "notes": _notes(stages),
         "settings": {name: record.settings for name, record in stages.items()},
         "data_digest": digest_file(observations_path),
+        "images": {name: stages["render"].facts[name] for name in PICTURE_FACTS} if drawn is not None else None,
     }
     # The content of a run, without its timings: the same results have the same key, however often they are made.
     made = {name: record.files[role][1] for name, record in stages.items() for role in RESULT_ROLES if role in record.files}
@@ -316,9 +328,19 @@ def score(
     write_text(output, json.dumps(run, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
+def _drawn(stages: Mapping[str, StageRecord], records: Mapping[str, Path]) -> pd.DataFrame | None:
+    """Scores of pictures per frame, if the scenario has images and they could be drawn."""
+    if "frames" not in _files(stages, "render"):
+        return None
+    return pd.read_parquet(stages["render"].file("frames", records["render"]))
+
+
 def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
     """What a reader of the scores should know although the run did not fail."""
     notes = []
+    rendered = stages.get("render")
+    if rendered and rendered.status == "failed" and stages["rollout"].status == "ok":
+        notes.append(f"no scores of images: {rendered.reason}")
     for name, record in stages.items():
         if record.facts.get("rollbacks"):
             wanted = record.settings["fit"]["epochs"]

@@ -5,6 +5,7 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -31,8 +32,15 @@ HEADINGS = {
     ("future", "chamfer"): "Future CD",
     ("future", "track_error"): "Future TE",
 }
+IMAGE_HEADINGS = {
+    (task, metric): f"{short} {label}"
+    for task, short in (("reconstruction", "Recon."), ("future", "Future"))
+    for metric, label in (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("iou", "IoU"))
+}
 TRANSFER_HEADINGS = {("transfer", "chamfer"): "Transfer CD", ("transfer", "track_error"): "Transfer TE"}
 Headings = Mapping[tuple[str, str], str]
+SHOWN = {"chamfer": (MM, 2), "track_error": (MM, 2), "psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (1.0, 4), "iou": (1.0, 3)}
+"""Metric -> factor and digits in tables."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +63,8 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
         timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
         memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
         averaged = {"averaged": record.get("params", {}).get("rollout.result.averaged", 1)}
-        rows.append(identity | outcome | averaged | timings | memory)
+        images = {"images": json.dumps(record.get("images"))}
+        rows.append(identity | outcome | averaged | images | timings | memory)
         tables.append(pd.read_parquet(path.parent / record["scores_file"]))
     return Collected(_stacked(tables), pd.DataFrame(rows))
 
@@ -180,6 +189,7 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
         lines += _difference_table(differences)
         lines += ["", f"Ratio to {baseline}, geometric mean [95 % interval], which no single scenario of large errors decides:", ""]
         lines += _difference_table(differences, cell=_ratio)
+    lines += image_lines(collected, scores, differences, baseline)
     bad = collected.runs[collected.runs["status"] != "ok"]
     if len(bad):
         lines += ["", "Not in the averages:", ""]
@@ -218,10 +228,10 @@ def _method_table(
             if not len(found):
                 cells.append("–")
                 continue
-            row = found.iloc[0]
-            spread = f" ± {MM * row['seed_std']:.2f}" if np.isfinite(row["seed_std"]) else " ± –"
+            row, (factor, digits) = found.iloc[0], SHOWN[metric]
+            spread = f" ± {factor * row['seed_std']:.{digits}f}" if np.isfinite(row["seed_std"]) else " ± –"
             spread = spread if seeds > 1 else ""
-            cells.append(f"{MM * row['equal']:.2f}{spread} ({MM * row['frames']:.2f})")
+            cells.append(f"{factor * row['equal']:.{digits}f}{spread} ({factor * row['frames']:.{digits}f})")
         status = {str(name): int(value) for name, value in counts.loc[method].to_dict().items()}
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
         cells.append(f"{status.get('ok', 0)}/{sum(status.values())}{failed}")
@@ -243,9 +253,10 @@ def _difference_table(
 
 
 def _interval(row: Any) -> str:
-    text = f"{MM * row['difference']:+.2f}"
+    factor, digits = SHOWN[row["metric"]]
+    text = f"{factor * row['difference']:+.{digits}f}"
     if np.isfinite(row["low"]):
-        text += f" [{MM * row['low']:+.2f}, {MM * row['high']:+.2f}]"
+        text += f" [{factor * row['low']:+.{digits}f}, {factor * row['high']:+.{digits}f}]"
     return f"{text} ({100 * row['relative']:+.1f} %)"
 
 
@@ -256,13 +267,53 @@ def _ratio(row: Any) -> str:
     return f"{row['ratio']:.3f}{interval}"
 
 
+def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.DataFrame, baseline: str) -> list[str]:
+    """The section on pictures: how they were scored, both averages, the paired comparison; a sentence if there are none."""
+    known = collected.runs["images"].dropna() if "images" in collected.runs else pd.Series(dtype=str)
+    facts = [values for values in map(json.loads, known) if values]
+    pictured = scores[scores["metric"].isin([metric for _, metric in IMAGE_HEADINGS])] if len(scores) else scores
+    if not facts or not len(pictured):
+        return ["", "No scores of pictures: these scenarios have no images, or images.enabled is off."]
+    methods = list(dict.fromkeys(collected.runs["method"]))
+    have, all_ = pictured["scenario"].nunique(), collected.runs["scenario"].nunique()
+    some = "" if have == all_ else f" Of {all_} scenarios {have} have images."
+    lines = ["", f"Pictures: PSNR in dB, SSIM and IoU, higher is better; LPIPS, lower is better.{some}", ""]
+    lines += [f"{_image_conditions(facts)} Mean over scenarios; in brackets the frame-weighted mean.", ""]
+    computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
+    headings = {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed}
+    counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
+    lines += _method_table(methods, averages(pictured), counts, collected.runs["seed"].nunique(), headings)
+    reasons = sorted({str(values["lpips"]) for values in facts} - {"computed"})
+    lines += [line for reason in reasons for line in ("", f"LPIPS: not computed: {reason}")]
+    own = differences[differences["metric"].isin(computed)] if len(differences) else differences
+    if len(own):
+        lines += ["", f"Paired difference to {baseline} [95 % interval], same scenario and seed:", ""]
+        lines += _difference_table(own, headings)
+    return lines
+
+
+def _image_conditions(facts: list[dict[str, Any]]) -> str:
+    """How pictures were scored, from the runs' records."""
+
+    def several(name: str) -> str:
+        return " and ".join(sorted({", ".join(v) if isinstance(v := values[name], list) else str(v) for values in facts}))
+
+    quirks = several("quirks")
+    text = f"Cameras scored: {several('views')}; masks: {several('masks')}; rasteriser: {several('backend')}"
+    return f"{text}; released quirks: {quirks}." if quirks.strip() else f"{text}; none of the released evaluation's quirks."
+
+
 def per_scenario_text(scores: pd.DataFrame) -> str:
-    """One line per scenario and method, seeds averaged, in Markdown, mm."""
-    rows = []
+    """One line per scenario and method, seeds averaged, in Markdown; errors in mm."""
+    rows, known = [], set(zip(scores["task"], scores["metric"], strict=True))
+    headings = HEADINGS | {key: text for key, text in IMAGE_HEADINGS.items() if key in known}
     for (scenario, method), part in scores.groupby(["scenario", "method"], sort=False):
         means = part.groupby(["task", "metric"])["value"].mean()
-        rows.append([str(scenario), str(method), *(f"{MM * means[key]:.2f}" if key in means else "–" for key in HEADINGS)])
-    return "\n".join(markdown(["Scenario", "Method", *HEADINGS.values()], rows)) + "\n"
+        cells = [
+            f"{SHOWN[key[1]][0] * means[key]:.{SHOWN[key[1]][1]}f}" if key in means else "–" for key in headings
+        ]
+        rows.append([str(scenario), str(method), *cells])
+    return "\n".join(markdown(["Scenario", "Method", *headings.values()], rows)) + "\n"
 
 
 def timing_text(runs: pd.DataFrame) -> str:
@@ -361,6 +412,6 @@ def write(collected: Collected, baseline: str, folder: Path, transfers: Collecte
     transfer_scores = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
     write_text(folder / "transfers.csv", transfer_scores.to_csv(index=False))
     text = f"# Scores\n\n{summary}{write_ratios(usable, differences, folder)}{transferred}{write_clusters(collected, folder)}"
-    text += f"\n## Per scenario (mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
+    text += f"\n## Per scenario (errors in mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
     write_text(folder / "summary.md", text)
     return summary

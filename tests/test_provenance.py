@@ -86,13 +86,13 @@ def test_declarations_and_reporting_do_not_count(copy):
 LEVELS = [
     {"errors"},
     {"config_types"},
-    {"config_perception"},
+    {"config_perception", "config_images"},
     {"artifacts", "config", "progress"},
-    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views"},
-    {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios"},
+    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views", "image_metrics", "lpips", "video"},
+    {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios", "splats"},
     {"benchmark", "perception", "search", "fit", "carry", "figures", "tables"},
-    {"perceive", "tables_perception"},
-    {"stages"},
+    {"perceive", "tables_perception", "figures_images"},
+    {"stages", "appearance"},
     {"cli"},
     {"__main__"},
 ]

@@ -24,8 +24,10 @@ from neuspring.physics.solver import start_warp
 from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
 
 NEIGHBOURS = 16
-GRID = 64
-"""Cells of the hash grid along each axis."""
+MOST_CELLS = 64
+"""Of the hash grid, along each axis."""
+SMALLEST_RADIUS = 1e-4
+"""m, of a search for nodes."""
 
 
 class Skin:
@@ -44,10 +46,12 @@ class Skin:
         self._device, self._frozen, self._released = device, frozen, released_degeneracy
         self._bound: Any = None
         self._count = min(NEIGHBOURS, len(nodes))
-        # The usual distance of nodes; the search radius doubles where it is too small.
-        spacing = np.median(cKDTree(nodes).query(nodes, k=min(2, len(nodes)))[0]) if len(nodes) > 1 else 1.0
-        self._radius = float(max(2.5 * spacing, 1e-4))
-        self._grid = wp.HashGrid(GRID, GRID, GRID, device=device)
+        # Where this radius holds too few nodes the search doubles it; a larger one would make every search slower.
+        usual = np.median(cKDTree(nodes).query(nodes, k=[self._count])[0])
+        self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
+        # Searches far from all nodes visit every cell, so there should not be many more than nodes.
+        cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
+        self._grid = wp.HashGrid(*cells.tolist(), device=device)
         start = self._vectors(nodes)
         self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
 

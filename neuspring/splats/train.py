@@ -21,7 +21,7 @@ from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend, rasterise
+from neuspring.splats.rasterise import Backend
 
 NEAREST = 3
 """The first scale of a splat is its mean distance to so many others."""
@@ -192,11 +192,14 @@ def restricted(splats: Splats, opacity: float) -> Splats:
     return Splats(**{f.name: getattr(splats, f.name)[kept] for f in dataclasses.fields(Splats)})
 
 
-def shown(gaussians: Gaussians, shot: Shot, backend: Backend) -> torch.Tensor:
-    """Total blending weight of each splat [N], px, in the part of a picture that no hand covers: 0 for splats that nothing shows."""
-    # Colour enters a picture linearly, so the gradient of its sum is the weight.
-    white = torch.ones_like(gaussians.means, requires_grad=True)
-    g = gaussians
-    drawn = rasterise(g.means, g.quaternions, g.scales, g.opacities, white, shot.view, backend=backend)
-    (gradient,) = torch.autograd.grad((drawn.rgb[..., 0] * shot.known).sum(), white)
-    return gradient[:, 0]
+@torch.no_grad()
+def in_sight(gaussians: Gaussians, shot: Shot, backend: Backend, margin: float) -> torch.Tensor:
+    """Which splats [N] a view shows: in the picture, not behind hands, and at most `margin`, m, behind the depth that is drawn there."""
+    drawn = gaussians.draw(shot.view, backend=backend)
+    view = shot.view
+    local = gaussians.means @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    flat = local @ view.intrinsics.T
+    column, row = (torch.floor(flat[:, k] / local[:, 2].clamp_min(1e-6)).long() for k in (0, 1))
+    inside = (local[:, 2] > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+    column, row = column.clamp(0, view.width - 1), row.clamp(0, view.height - 1)
+    return inside & (shot.known[row, column] > 0) & (local[:, 2] <= drawn.depth[row, column] + margin)

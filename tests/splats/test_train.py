@@ -14,7 +14,7 @@ from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.train import extent_of, first_splats, restricted, shown, train
+from neuspring.splats.train import extent_of, first_splats, in_sight, restricted, train
 from neuspring.splats.view import View
 from tests.perception.filmed import EYES, intrinsics
 from neuspring.data.synthetic.make import looking
@@ -139,8 +139,8 @@ def test_hands_hide_and_are_not_compared():
         settings = Appearance()
         assert float(loss(patched, shot, settings)) == float(loss(right, shot, settings))
         assert float(loss(wrong, shot, settings)) > float(loss(right, shot, settings)) + 0.001
-    weights = shown(Gaussians.of(truth), shot, "warp")
-    assert float(weights.sum()) == pytest.approx(float((right.alpha * shot.known).sum()), rel=1e-4)
+    seen = in_sight(Gaussians.of(truth), shot, "warp", 0.01)
+    assert 0.05 < float(seen.float().mean()) < 0.5
 
 
 def test_the_margin_of_hands_grows_by_pixels():

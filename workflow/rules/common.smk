@@ -209,6 +209,27 @@ def perception_settings(*names):
     return json.dumps({"perception": chosen}, sort_keys=True)
 
 
+def image_settings(*names):
+    """Some keys of `images`, so that changing another one runs nothing again."""
+    values = settings.plain(CONFIG)["images"]
+    return json.dumps(
+        {"images": {name: values[name] for name in names}}, sort_keys=True
+    )
+
+
+def render_records(wildcards):
+    """The record of the drawn pictures, for scenarios with images; others have no such stage."""
+    if not BENCHMARK.has_images(wildcards.scenario):
+        return []
+    return [
+        f"{RESULTS}/{wildcards.scenario}/{wildcards.method}/{wildcards.seed}/render.json"
+    ]
+
+
+def render_option(wildcards, input):
+    return ["--render", str(input.render)] if input.get("render") else []
+
+
 def needs_gpu(section, backend):
     chosen = getattr(CONFIG.perception, section).backend
     return 1 if chosen == backend and DEVICE != "cpu" else 0

@@ -1,0 +1,75 @@
+# Pictures: splats once per scenario and seed, shared by all methods; drawn and scored per method.
+rule appearance:
+    input:
+        capture=capture_file,
+        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
+        lifted=rules.lift.output,
+    output:
+        f"{RESULTS}/{{scenario}}/appearance/{{seed}}/appearance.json",
+    log:
+        f"{RESULTS}/logs/appearance/{{scenario}}/{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/appearance/{{scenario}}/{{seed}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        device=DEVICE,
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=8000,
+        runtime=240,
+    params:
+        settings=image_settings("backend", "opacity", "appearance", "released_quirks"),
+        images=image_stamps,
+        code=code_digest("neuspring.splats.train", stage="appearance.learn"),
+    shell:
+        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} --lifted {input.lifted:q}"
+        " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+        " --output {output:q} 2>&1 | tee -a {log:q}"
+
+
+rule render:
+    input:
+        capture=capture_file,
+        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
+        observations=rules.observe.output,
+        appearance=rules.appearance.output,
+        rollout=rules.rollout.output,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/render.json",
+    log:
+        f"{RESULTS}/logs/render/{{scenario}}/{{method}}/{{seed}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/render/{{scenario}}/{{method}}/{{seed}}.tsv"
+    retries: 1
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        device=DEVICE,
+        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
+        mem_mb=8000,
+        runtime=120,
+    params:
+        settings=image_settings(
+            "backend",
+            "views",
+            "opacity",
+            "frozen_skinning",
+            "video",
+            "lpips",
+            "released_quirks",
+        ),
+        images=image_stamps,
+        code=code_digest(
+            "neuspring.splats.skinning",
+            "neuspring.splats.model",
+            "neuspring.image_metrics",
+            "neuspring.figures_images",
+            stage="appearance.render",
+        ),
+    shell:
+        "python -m neuspring render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
+        " --appearance {input.appearance:q} --rollout {input.rollout:q} --settings {params.settings:q}"
+        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
