@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +25,7 @@ from neuspring.config_images import Images
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, Capture
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.lpips import Lpips, find_weights
+from neuspring.perception.lift import clean_masks, lifting_cameras
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.physics.solver import resolve_device
 from neuspring.progress import Progress
@@ -47,30 +49,35 @@ BEHIND = 3.0
 
 
 def learn(
-    folder: Path, masks: Sequence[Path], lifted_record: Path, settings: Config, seed: int, device: str, output: Path
+    folder: Path,
+    masks: Sequence[Path],
+    observations_path: Path,
+    lifted_record: Path | None,
+    settings: Config,
+    seed: int,
+    device: str,
+    output: Path,
 ) -> None:
     """Frame 0 of a capture -> splats.ply, history.parquet, appearance.png, appearance.json.
 
-    A failure to train (no finite loss) is recorded; what was drawn with the splats then is not either.
+    The first splats lie on the points that perception lifted and its shape prior; without its record (processed data), on the
+    lifted masks and the observations' surface points. A failure to train (no finite loss) is recorded.
     """
     clock, device, images = Stopwatch(), resolve_device(device), settings.images
     capture = Capture.load(folder)
     loaded = _masks(capture, masks)
-    before = StageRecord.load(lifted_record)
-    lifted, prior = (kind.load(before.file(role, lifted_record)) for kind, role in ((LiftedTracks, "lifted"), (ShapePrior, "shape")))
-    assert isinstance(lifted, LiftedTracks)
-    assert isinstance(prior, ShapePrior)
     backend = choose_backend(images.backend, device)
-    _require_outside(capture, np.concatenate([lifted.cloud, prior.vertices]))
+    seen = _seen_points(capture, loaded, observations_path, lifted_record, settings, seed)
+    _require_outside(capture, np.concatenate([seen.cloud, seen.prior]))
     shots = _shots(capture, loaded, images, device)
-    points, colours, width = _first_points(capture, lifted, prior, images, seed)
+    points, colours = seen.first()
     common: dict[str, Any] = {
-        "inputs": {"capture": digest_file(folder / CAPTURE), "lift": digest_file(lifted_record)},
+        "inputs": {"capture": digest_file(folder / CAPTURE), "observations": digest_file(observations_path)},
         "settings": {"appearance": config.plain(images.appearance), "seed": seed},
         "device": device,
     }
     try:
-        trained = train(first_splats(points, colours, images.appearance, width), shots, images.appearance, seed, backend)
+        trained = train(first_splats(points, colours, images.appearance, seen.width), shots, images.appearance, seed, backend)
         splats = restricted(trained.splats, images.opacity)
     except NumericalFailure as failure:
         clock.stage("appearance", "failed", reason=str(failure), **common).save(output)
@@ -91,7 +98,7 @@ def learn(
         "loss": trained.history["loss"][-1],
         "backend": backend,
         "cameras": [shot.name for shot in shots],
-        **_seen_facts(gaussians, shots, drawn, backend, BEHIND * width),
+        **_seen_facts(gaussians, shots, drawn, backend, BEHIND * seen.width),
     }
     clock.stage("appearance", "ok", paths, facts=facts, **common).save(output)
 
@@ -150,7 +157,7 @@ def render(
                         videos["video"].add(film.compared(frame, pair))
             if videos:
                 angle = 360 * frame / len(trajectory.positions)
-                videos["turntable"].add(film.timed(_turned(gaussians, scene.views[first], scene.backend, angle), frame))
+                videos["turntable"].add(film.turned(frame, _turned(gaussians, scene.views[first], scene.backend, angle)))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
     files |= {"frames": output.with_name("frames.parquet"), "strip": strip.save(output.with_name("images.png"))}
@@ -276,26 +283,58 @@ def _shots(capture: Capture, masks: Mapping[str, Masks], images: Images, device:
     return shots
 
 
-def _first_points(
-    capture: Capture, lifted: LiftedTracks, prior: ShapePrior, images: Images, seed: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points [P, 3] m, their RGB [P, 3], and the width of a pixel at the object, m: what was seen, and where nothing was the prior."""
+@dataclass(frozen=True)
+class _Seen:
+    """What is known of the object's surface in frame 0."""
+
+    cloud: np.ndarray
+    """[P, 3] m, seen."""
+    colours: np.ndarray
+    """[P, 3] RGB."""
+    prior: np.ndarray
+    """[Q, 3] m, guessed by a shape prior."""
+    width: float
+    """Of a pixel at the object, m."""
+
+    def first(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points [R, 3] m and RGB [R, 3]: what was seen, and where nothing was the prior, in the colours of what is nearest."""
+        if not len(self.prior):
+            return self.cloud, self.colours
+        distance, nearest = cKDTree(self.cloud).query(self.prior)
+        new = distance > NEAR_SEEN * self.width
+        return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colours, self.colours[nearest[new]]])
+
+
+def _seen_points(
+    capture: Capture, masks: Mapping[str, Masks], observations_path: Path, lifted_record: Path | None, settings: Config, seed: int
+) -> _Seen:
     camera = next(iter(capture.cameras.values()))
-    _, depth = camera.project(lifted.cloud)
-    width = float(np.median(depth)) / float(camera.intrinsics[0, 0])
+    if lifted_record is None:
+        chosen = settings.perception.lift
+        _, cloud, colours = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
+        if not len(cloud):
+            raise InputError(capture.folder, "the object's mask of frame 0 must hold pixels with depth in range", "none")
+        width = _pixel_width(camera, cloud)
+        return _Seen(cloud, colours, Observations.load(observations_path).surface_points, width)
+    record = StageRecord.load(lifted_record)
+    lifted = LiftedTracks.load(record.file("lifted", lifted_record))
+    prior = ShapePrior.load(record.file("shape", lifted_record))
+    width = _pixel_width(camera, lifted.cloud)
+    apart = max(settings.images.appearance.spacing, 1.0) * width
+    return _Seen(lifted.cloud, lifted.cloud_colours, _surface_points(prior, apart, seed), width)
+
+
+def _pixel_width(camera: Camera, cloud: np.ndarray) -> float:
+    return float(np.median(camera.project(cloud)[1]) / camera.intrinsics[0, 0])
+
+
+def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
+    """Random points [Q, 3] on the prior's surface, one per square of side `apart`, m."""
     if not len(prior.faces):
-        return lifted.cloud, lifted.cloud_colours, width
-    corners = prior.vertices[prior.faces].astype(float)
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(seed)
-    count = max(int(areas.sum() / (max(images.appearance.spacing, 1.0) * width) ** 2), 1)
-    face = rng.choice(len(areas), count, p=areas / areas.sum())
-    points = np.einsum("ns,nsc->nc", rng.dirichlet((1.0, 1.0, 1.0), count), corners[face])
-    distance, nearest = cKDTree(lifted.cloud).query(points)
-    # Nobody saw their colours; those of the nearest seen points are the best guess.
-    new = distance > NEAR_SEEN * width
-    colours = np.concatenate([lifted.cloud_colours, lifted.cloud_colours[nearest[new]]])
-    return np.concatenate([lifted.cloud, points[new]]), colours, width
+        return np.zeros((0, 3))
+    mesh = trimesh.Trimesh(prior.vertices, prior.faces, process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, max(int(mesh.area / apart**2), 1), seed=seed)
+    return np.asarray(points)
 
 
 def _seen_facts(

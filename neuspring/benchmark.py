@@ -9,7 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuspring.config import FILMED, MADE, Config, Fit, Method, ScenarioRow, Search, SearchRow, merge, parse, plain, read_text, read_yaml
+from neuspring.config import (
+    FILMED,
+    MADE,
+    Config,
+    Fit,
+    Method,
+    ScenarioRow,
+    Search,
+    SearchRow,
+    merge,
+    parse,
+    plain,
+    read_text,
+    read_yaml,
+)
 from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
 
@@ -138,7 +152,9 @@ class Benchmark:
 
     def has_images(self, name: str) -> bool:
         """Whether a scenario's predictions are drawn and scored."""
-        return self.config.images.enabled and self.scenarios[name].source in FILMED
+        source, path = self.scenarios[name].source, self.data_path(name)
+        beside = source == "phystwin" and path is not None and phystwin_raw.has_images(path)
+        return self.config.images.enabled and (source in FILMED or beside)
 
     def capture_folder(self, name: str) -> Path:
         """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
@@ -151,7 +167,7 @@ class Benchmark:
         if source == "synthetic":
             return tuple(map(str, range(self.config.synthetic.cameras)))
         assert path is not None
-        if source == "phystwin_raw":
+        if source in ("phystwin_raw", "phystwin"):
             return tuple(map(str, range(phystwin_raw.camera_count(path))))
         return tuple(camera.name for camera in capture.read_description(path / capture.CAPTURE).cameras)
 

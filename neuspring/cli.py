@@ -125,7 +125,8 @@ def _observe(a: argparse.Namespace) -> int:
 def _appearance(a: argparse.Namespace) -> int:
     from neuspring import appearance
 
-    appearance.learn(a.capture.parent, a.masks, a.lifted, _settings(a.settings), a.seed, a.device, a.output)
+    seen = (a.masks, a.observations, a.lifted)
+    appearance.learn(a.capture.parent, *seen, _settings(a.settings), a.seed, a.device, a.output)
     return 0
 
 
@@ -267,16 +268,25 @@ def _parser() -> argparse.ArgumentParser:
     observe.add_argument("--capture", type=Path, help="capture.json of raw video")
     observe.add_argument("--lifted", type=Path, help="lifted.json of raw video")
 
-    learn = add("appearance", _appearance, "frame 0 of a capture -> splats", "capture", "settings", "compute", "output")
+    learn = add(
+        "appearance", _appearance, "frame 0 of a capture -> splats", "capture", "observations", "settings", "compute", "output"
+    )
     learn.add_argument("--seed", type=int, default=0)
     draw = add(
-        "render", _render, "splats and trajectory -> pictures, scored and filmed", "capture", "observations", "settings", "compute", "output"
+        "render",
+        _render,
+        "splats and trajectory -> pictures, scored and filmed",
+        "capture",
+        "observations",
+        "settings",
+        "compute",
+        "output",
     )
     for command in (learn, draw):
         command.add_argument(
             "--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order"
         )
-    learn.add_argument("--lifted", type=Path, required=True, help="lifted.json")
+    learn.add_argument("--lifted", type=Path, help="lifted.json, where perception made the observations")
     draw.add_argument("--appearance", type=Path, required=True, help="appearance.json")
     draw.add_argument("--rollout", type=Path, required=True, help="rollout.json")
 

@@ -100,7 +100,7 @@ class LpipsWeights:
     backbone: str | None = None
     """AlexNet of torchvision (alexnet-owt-7be5be79.pth); null: in torch hub's cache."""
     heads: str | None = None
-    """Linear heads, version 0.1 (alex.pth); null: in torch hub's cache (lpips_alex_v0.1.pth), or in the packages lpips or torchmetrics."""
+    """Linear heads, version 0.1 (alex.pth); null: in torch hub's cache (lpips_alex_v0.1.pth), in package lpips or torchmetrics."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,7 +84,9 @@ def _errors(observations: Observations, trajectory: Trajectory, title: str) -> F
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
     """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
     shown = [metric for metric in IMAGE_LABELS if metric in set(frames["metric"])]
-    figure, axes = plt.subplots(len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False)
+    figure, axes = plt.subplots(
+        len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False
+    )
     for axis, metric in zip(axes[:, 0], shown, strict=True):
         values = frames[frames["metric"] == metric].groupby("frame")["value"].mean()
         axis.plot(values.index / scenario.frame_rate, values, color="tab:blue")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,9 @@ WORST = 0.5
 """Colour difference, of 1, at the bright end of error pictures."""
 BAR = 6
 """Height of the bar that shows the time, px."""
-TRAINING, FUTURE = (60, 110, 190), (230, 140, 40)
+TITLE = 20
+"""Height of the line of names, px."""
+TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
 """Colours of the two parts of the time."""
 
 
@@ -52,9 +54,7 @@ class Pair:
         return picture
 
 
-def appearance_figure(
-    shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], around: Mapping[int, np.ndarray], path: Path
-) -> Path:
+def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], around: Mapping[int, np.ndarray], path: Path) -> Path:
     """Rows: each training view observed, as splats, and their difference; below, the splats from three other sides (degrees)."""
     columns = 3
     height, width = shots[0].mask.shape
@@ -119,29 +119,27 @@ class Film:
     def compared(self, frame: int, pair: Pair) -> np.ndarray:
         """A frame of the comparison [H, W, 3] uint8."""
         panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": pair.error}
-        labelled = [_labelled(picture, name) for name, picture in panels.items()]
-        return self.timed(np.hstack(labelled), frame)
+        return self._titled(panels, frame)
 
-    def timed(self, picture: np.ndarray, frame: int) -> np.ndarray:
-        """With a bar above that shows the time: training and future in their colours, the border between them white."""
-        width, total = picture.shape[1], self._scenario.frame_count
+    def turned(self, frame: int, picture: np.ndarray) -> np.ndarray:
+        """A frame of the turntable [H, W, 3] uint8, from a picture of the twin."""
+        return self._titled({"twin": picture}, frame)
+
+    def _titled(self, panels: Mapping[str, np.ndarray], frame: int) -> np.ndarray:
+        """Panels side by side below their names and a bar of the time: training and future coloured, the border between white."""
+        picture = np.hstack(list(panels.values()))
+        width, total, end = picture.shape[1], self._scenario.frame_count, self._scenario.train_end
+        future = frame >= end
+        title = np.zeros((TITLE, width, 3), np.uint8)
+        for k, name in enumerate(panels):
+            text = f"{name}, frame {frame} ({'future' if future else 'training'})" if k == 0 else name
+            colour = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
+            place = (6 + k * width // len(panels), TITLE - 6)
+            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
         bar = np.zeros((BAR, width, 3), np.uint8)
-        border, now = (round(width * k / total) for k in (self._scenario.train_end, frame + 1))
-        for start, end, colour in ((0, border, TRAINING), (border, width, FUTURE)):
-            bar[:, start:end] = np.array(colour) // 4
-            bar[:, start : min(end, now)] = colour
+        border, now = (round(width * k / total) for k in (end, frame + 1))
+        for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):
+            bar[:, start:stop] = np.array(shade) // 4
+            bar[:, start : min(stop, now)] = shade
         bar[:, max(border - 1, 0) : border + 1] = 255
-        future = frame >= self._scenario.train_end
-        text = f"frame {frame}, {'future' if future else 'training'}"
-        return np.vstack([bar, _written(picture, text, (4, picture.shape[0] - 6), FUTURE if future else TRAINING)])
-
-
-def _labelled(picture: np.ndarray, text: str) -> np.ndarray:
-    return _written(picture, text, (4, 14), (255, 255, 255))
-
-
-def _written(picture: np.ndarray, text: str, place: tuple[int, int], colour: Iterable[int]) -> np.ndarray:
-    image = np.ascontiguousarray(picture)
-    for shade, thickness in (((0, 0, 0), 3), (tuple(colour), 1)):
-        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, thickness, cv2.LINE_AA)
-    return image
+        return np.vstack([title, bar, picture])

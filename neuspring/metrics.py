@@ -1,5 +1,5 @@
-"""What is reported: Chamfer distance and track error (as in the released evaluation) and scores of pictures, per frame and per task,
-both averages.
+"""What is reported: Chamfer distance and track error (as in the released evaluation) and scores of pictures, per frame and per
+task, both averages.
 
 Chamfer: each visible observed point to its nearest surface node, single direction, in the L1 norm |dx| + |dy| + |dz|.
 Track: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.

@@ -32,13 +32,13 @@ def make_capture(row: ScenarioRow, settings: Config, output: Path) -> None:
         energy = truth.kinetic[-1] + truth.potential[-1]
         print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
         print(f"{row.scenario}: smallest det F {truth.least_jacobian.min():.2f}; energy at the end {energy:.3f} J", flush=True)
-    elif row.source == "phystwin_raw":
+    elif row.source in ("phystwin_raw", "phystwin"):
         from neuspring.data import phystwin_raw
 
         phystwin_raw.convert(row, Path(settings.data_root or ".") / row.path, output.parent)
     else:
         raise InputError(
-            f"scenario {row.scenario}, source", "captures are made of synthetic and phystwin_raw scenarios", row.source
+            f"scenario {row.scenario}, source", "captures are made of synthetic, phystwin_raw and phystwin scenarios", row.source
         )
 
 

@@ -80,7 +80,7 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def _stage_code(stage: str) -> str:
-    """The function `stage` of `neuspring.stages`, or `module.function` of another module, and the functions and classes it uses there."""
+    """The function `stage` of `neuspring.stages`, or `module.function` of another module, and what it uses there."""
     module, _, function = stage.rpartition(".")
     tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}

@@ -290,7 +290,9 @@ def score(
         searched=None if searched is None else float(np.median(searched.material.stiffness)),
     )
     if drawn is not None:
-        artefacts["images"] = [stages["render"].file(role, records["render"]) for role in PICTURE_ROLES if role in _files(stages, "render")]
+        artefacts["images"] = [
+            stages["render"].file(role, records["render"]) for role in PICTURE_ROLES if role in _files(stages, "render")
+        ]
         artefacts["plots"].append(figures.image_scores_figure(drawn, observations.scenario, method, folder / "plots"))
     content = {
         "scenario": observations.scenario.name,

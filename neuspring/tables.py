@@ -309,9 +309,7 @@ def per_scenario_text(scores: pd.DataFrame) -> str:
     headings = HEADINGS | {key: text for key, text in IMAGE_HEADINGS.items() if key in known}
     for (scenario, method), part in scores.groupby(["scenario", "method"], sort=False):
         means = part.groupby(["task", "metric"])["value"].mean()
-        cells = [
-            f"{SHOWN[key[1]][0] * means[key]:.{SHOWN[key[1]][1]}f}" if key in means else "–" for key in headings
-        ]
+        cells = [f"{SHOWN[key[1]][0] * means[key]:.{SHOWN[key[1]][1]}f}" if key in means else "–" for key in headings]
         rows.append([str(scenario), str(method), *cells])
     return "\n".join(markdown(["Scenario", "Method", *headings.values()], rows)) + "\n"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from neuspring import config, config_perception
+from neuspring import config, config_images, config_perception
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -23,9 +23,9 @@ snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
 ```
 
 The "default" column below is the program's: what holds where neither `config.yaml` nor an overlay sets a key. `config.yaml` sets
-`synthetic`, `perception`, `search.rollouts`, `search.start` and `fit.epochs` for its scenes, so overlays for other data set them
-anew. `--config` on the command line is for single values and lists of names at the top level; Snakemake hands numbers in lists
-over as text, which is refused, so `seeds` and nested keys are set in an overlay.
+`synthetic`, `perception`, `images.appearance`, `search.rollouts`, `search.start` and `fit.epochs` for its scenes, so overlays for
+other data set them anew. `--config` on the command line is for single values and lists of names at the top level; Snakemake hands
+numbers in lists over as text, which is refused, so `seeds` and nested keys are set in an overlay.
 
 | overlays, in this order | what they measure |
 |---|---|
@@ -81,6 +81,10 @@ KEYS = {
     "perception.lift": config_perception.Lift,
     "perception.shape": config_perception.ShapePriorSettings,
     "perception.sample": config_perception.Sampling,
+    "images": config_images.Images,
+    "images.appearance": config_images.Appearance,
+    "images.lpips": config_images.LpipsWeights,
+    "images.released_quirks": config_images.ImageQuirks,
     "tracking": config.Tracking,
 }
 ROWS = {"rows of methods.yaml": config.Method, "rows of searches.yaml": config.SearchRow}

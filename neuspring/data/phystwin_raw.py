@@ -1,4 +1,4 @@
-"""PhysTwin's raw layout (`data/different_types/<case>/` before processing) -> a capture folder.
+"""PhysTwin's raw layout (`data/different_types/<case>/`, before processing or beside it) -> a capture folder.
 
 Images are linked where the file system allows it, else copied; masks are put together from one image per detection.
 """
@@ -27,6 +27,12 @@ FILES = (phystwin.METADATA, CALIBRATION, phystwin.SPLIT, phystwin.TRACKS)
 """All but images that the importer looks for in a case's folder."""
 HAND_PHRASE = "hand"
 """The detected phrase of hands; the one other phrase of a camera is the object."""
+
+
+def has_images(case: Path) -> bool:
+    """Whether a case's folder holds images, masks and calibration: what a capture with masks is made of."""
+    files = all((Path(case) / name).is_file() for name in (phystwin.METADATA, CALIBRATION))
+    return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 
 
 def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:

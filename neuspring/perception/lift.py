@@ -6,6 +6,7 @@ its outlier test on single coordinates, ours does not; the released behaviour is
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
 
     Raises InputError where nothing of the object or too little of the hands remains.
     """
-    cameras = {name: _mirrored(camera) if settings.mirrored_principal_point else camera for name, camera in capture.cameras.items()}
+    cameras = lifting_cameras(capture, settings)
     kept, cloud, colours = clean_masks(capture, cameras, masks, settings)
     seen = {}
     for label in (OBJECT, HANDS):
@@ -79,16 +80,21 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     )
 
 
+def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:
+    """The cameras as pixels are lifted with."""
+    return {name: _mirrored(camera) if settings.mirrored_principal_point else camera for name, camera in capture.cameras.items()}
+
+
 def clean_masks(
-    capture: Capture, cameras: dict[str, Camera], masks: dict[str, Masks], settings: Lift
+    capture: Capture, cameras: Mapping[str, Camera], masks: Mapping[str, Masks], settings: Lift, frames: int | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Labels [T, H, W] per camera without pixels that have no usable depth or float alone, and the object's cloud of frame 0 [P, 3]
-    with its colours."""
+    with its colours [P, 3]. Only the first `frames` are cleaned, if given."""
     kept = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
     cloud, colours = np.zeros((0, 3)), np.zeros((0, 3))
     # A camera sees a surface with a density of points that goes with the square of its focal length.
     least = {n: settings.outlier_neighbours * (c.intrinsics[0, 0] / REFERENCE_FOCAL) ** 2 for n, c in cameras.items()}
-    for frame in range(capture.frame_count):
+    for frame in range(frames or capture.frame_count):
         there = [name for name in cameras if capture.has(name, frame)]
         if not there:
             continue

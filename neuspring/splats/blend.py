@@ -43,7 +43,7 @@ def kernels(real: Any) -> tuple[Any, Any]:
         transmittance: wp.array2d(dtype=real),
         ends: wp.array2d(dtype=int),
     ):
-        y, x = wp.tid()
+        y, x = wp.tid()  # type: ignore[misc]
         place = vec2(real(x) + half, real(y) + half)
         number = (y // tile) * across + x // tile
         # Both begin as the caller left them: zero and one.
@@ -89,7 +89,7 @@ def kernels(real: Any) -> tuple[Any, Any]:
         adj_opacities: wp.array(dtype=real),
         adj_features: wp.array(dtype=vec4),
     ):
-        y, x = wp.tid()
+        y, x = wp.tid()  # type: ignore[misc]
         place = vec2(real(x) + half, real(y) + half)
         number = (y // tile) * across + x // tile
         adj = adj_total[y, x]

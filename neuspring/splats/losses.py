@@ -53,10 +53,8 @@ class Shot:
         for what, array in {"image": colour, "mask": mask, "mask of hands": hands, "depth": depth}.items():
             if array.shape[:2] != size:
                 raise InputError(f"camera {name}, {what} of frame 0", f"must have the camera's size {size}", array.shape[:2])
-        grown = hands.astype(np.uint8)
-        if margin >= 1:
-            grown = cv2.dilate(grown, np.ones((round(margin), round(margin)), np.uint8))
-        known = grown == 0
+        square = np.ones((max(round(margin), 1),) * 2, np.uint8)
+        known = cv2.dilate(hands.astype(np.uint8), square) == 0
         seen = mask & known
         if not seen.any():
             rule = "the object must be seen in frame 0 by every camera that trains its appearance"
@@ -71,8 +69,9 @@ class Shot:
         device = view.intrinsics.device
         on_black = np.where(seen[..., None], colour, 0).astype(np.float32) / 255
         measured = np.where(seen, depth, 0.0).astype(np.float32)
-        tensors = [torch.tensor(a, device=device) for a in (on_black, seen.astype(np.float32), known.astype(np.float32), measured)]
-        return cls(name, view, *tensors, box)
+        arrays = (on_black, seen.astype(np.float32), known.astype(np.float32), measured)
+        colour_, mask_, known_, depth_ = (torch.tensor(a, device=device) for a in arrays)
+        return cls(name, view, colour_, mask_, known_, depth_, box)
 
 
 def loss(drawn: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:

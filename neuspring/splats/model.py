@@ -95,7 +95,7 @@ def _read_ply(path: Path) -> np.ndarray:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
-    head, found, body = content[:LONGEST_HEADER].partition(b"end_header\n")
+    head, found, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").splitlines()
     if not found or lines[0] != "ply" or "format binary_little_endian 1.0" not in lines:
         raise InputError(path, rule, repr(content[:40]))

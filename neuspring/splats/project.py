@@ -74,7 +74,7 @@ def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor
 
 def _determinant(u: torch.Tensor, v: torch.Tensor, blur: float) -> torch.Tensor:
     """(u.u + blur)(v.v + blur) - (u.v)^2 = |u x v|^2 + blur (u.u + v.v) + blur^2 without the cancellation of long needles."""
-    area = torch.linalg.cross(u, v)
+    area: torch.Tensor = torch.linalg.cross(u, v)
     return (area * area).sum(-1) + blur * ((u * u).sum(-1) + (v * v).sum(-1)) + blur * blur
 
 

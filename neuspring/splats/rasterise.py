@@ -1,7 +1,7 @@
 """One function that draws Gaussian splats, differentiably: colour, coverage and expected depth.
 
-Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gsplat` (Apache-2.0, extra `gpu`) on CUDA. `auto` takes
-gsplat where it works. Results name the backend.
+Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gsplat` (Apache-2.0, extra `gpu`) on CUDA. `auto`
+takes gsplat where it works. Results name the backend.
 """
 
 from __future__ import annotations
@@ -109,10 +109,17 @@ def _gsplat_fault(device: str) -> str:
     if importlib.util.find_spec("gsplat") is None:
         return 'not installed (pip install -e ".[gpu]")'
     try:
-        tensors = [torch.tensor(v, device=device) for v in ([[0.0, 0, 1]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[1.0] * 3])]
-        eye, size = torch.eye(4, device=device), 16
+        size = 16
         intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], device=device)
-        drawn = rasterise(*tensors, View(eye, intrinsics, size, size), backend="gsplat")
+        drawn = rasterise(
+            torch.tensor([[0.0, 0.0, 1.0]], device=device),
+            torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
+            torch.full((1, 3), 0.1, device=device),
+            torch.full((1,), 0.5, device=device),
+            torch.ones((1, 3), device=device),
+            View(torch.eye(4, device=device), intrinsics, size, size),
+            backend="gsplat",
+        )
     except Exception as error:
         return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return "" if float(drawn.alpha.max()) > 0.4 else "it drew nothing"

@@ -5,12 +5,13 @@ A splat at x follows its 16 nearest nodes (at their places before) with weights 
 
     x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalise(sum_b w_b q(R_b)) q.
 
-Frame to frame, accumulated, as in the released evaluation. Nearest nodes come from a hash grid: time and memory do not grow as nodes
-times splats.
+Frame to frame, accumulated, as in the released evaluation. Nearest nodes come from a hash grid: time and memory do not grow
+as nodes times splats.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,9 +38,7 @@ class Skin:
     released_degeneracy: as released, one node on a line of neighbours turns all nodes as itself, several turn none.
     """
 
-    def __init__(
-        self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False, released_degeneracy: bool = False
-    ) -> None:
+    def __init__(self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False, released_degeneracy: bool = False) -> None:
         start_warp()
         if len(nodes) == 0 or not np.isfinite(nodes).all():
             raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
@@ -51,7 +50,8 @@ class Skin:
         self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
         # Searches far from all nodes visit every cell, so there should not be many more than nodes.
         cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
-        self._grid = wp.HashGrid(*cells.tolist(), device=device)
+        wide, deep, high = cells.tolist()
+        self._grid = wp.HashGrid(wide, deep, high, device=device)
         start = self._vectors(nodes)
         self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
 
@@ -75,7 +75,7 @@ class Skin:
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """(means, quaternions) in every frame of a trajectory [F, N, 3], m, whose frame 0 they were made in."""
         yield means, quaternions
-        for before, after in zip(positions[:-1], positions[1:], strict=True):
+        for before, after in itertools.pairwise(positions):
             means, quaternions = self.step(before, after, means, quaternions)
             yield means, quaternions
 

@@ -32,7 +32,7 @@ def nearest(
     place = queries[t]
     reach = radius
     for _attempt in range(DOUBLINGS):
-        count = int(0)
+        count = wp.int32(0)
         seen = wp.hash_grid_query(grid, place, reach)
         for j in seen:
             if not (own and j == t):
@@ -87,7 +87,7 @@ def turn_nodes(
         moment += wp.outer(wp.vec3d(after[j] - after[i]), wp.vec3d(before[j] - before[i]))
     u, s, v = wp.svd3(moment)
     turn = wp.identity(n=3, dtype=wp.float64)
-    rank = int(0)
+    rank = wp.int32(0)
     if s[0] > wp.float64(TINY):
         if s[1] > wp.float64(DEGENERATE) * s[0]:
             rank = 2
@@ -113,7 +113,7 @@ def move_splats(
     """Linear blend skinning of one splat by the nodes `bound` to it."""
     t = wp.tid()
     place = means[t]
-    total = float(0.0)
+    total = wp.float32(0.0)
     # Displacements, not places, are averaged: they keep their digits far from the origin.
     shift = wp.vec3(0.0)
     blend = wp.quat(0.0, 0.0, 0.0, 0.0)

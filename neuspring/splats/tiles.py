@@ -77,7 +77,12 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, adj_total: torch.Tensor, adj_left: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
         *inputs, left, ends = ctx.saved_tensors
         means, conics, strengths, features = inputs
-        adjoints = [torch.zeros_like(means), torch.zeros_like(conics), torch.zeros_like(strengths[:, 0]), torch.zeros_like(features)]
+        adjoints = [
+            torch.zeros_like(means),
+            torch.zeros_like(conics),
+            torch.zeros_like(strengths[:, 0]),
+            torch.zeros_like(features),
+        ]
         limits: Limits = ctx.limits
         arguments = [*_vectors(*inputs), *_lists(ctx.lists), limits.alpha_min, limits.alpha_max, *_scalars(left.detach(), ends)]
         arguments += [*_vectors(adj_total.contiguous()), *_scalars(adj_left.contiguous())]

@@ -45,12 +45,12 @@ class Trained:
 
 
 def first_splats(points: np.ndarray, colours: np.ndarray, settings: Appearance, width: float) -> Splats:
-    """Splats at points [P, 3], m, with RGB [P, 3]; `width`, m, is that of a pixel at the object. Raises InputError for < 4 points."""
+    """Splats at points [P, 3], m, with RGB [P, 3]; `width`, m, is a pixel's at the object. Raises InputError for less than 4."""
     if settings.spacing and len(points):
         cells = np.floor((points - points.min(axis=0)) / (settings.spacing * width)).astype(np.int64)
-        _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        _, owner, members = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         owner = owner.reshape(-1)
-        sums = [np.bincount(owner, weights=values) / count for values in (*points.T, *colours.T)]
+        sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colours.T)]
         points, colours = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
     if len(points) <= NEAREST:
         raise InputError("appearance, points of frame 0", f"more than {NEAREST} points are needed to begin with", len(points))
@@ -194,7 +194,7 @@ def restricted(splats: Splats, opacity: float) -> Splats:
 
 @torch.no_grad()
 def in_sight(gaussians: Gaussians, shot: Shot, backend: Backend, margin: float) -> torch.Tensor:
-    """Which splats [N] a view shows: in the picture, not behind hands, and at most `margin`, m, behind the depth that is drawn there."""
+    """Which splats [N] a view shows: in the picture, not behind hands, at most `margin`, m, behind the depth drawn there."""
     drawn = gaussians.draw(shot.view, backend=backend)
     view = shot.view
     local = gaussians.means @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]

@@ -51,13 +51,14 @@ class View:
         """
         k = np.array(intrinsics, dtype=np.float64)
         k[:2, 2] += shift
-        pose = np.linalg.inv(camera_to_world)
-        return cls(*(torch.tensor(m, dtype=torch.float32, device=device) for m in (pose, k)), width, height)
+        pose, matrix = (torch.tensor(m, dtype=torch.float32, device=device) for m in (np.linalg.inv(camera_to_world), k))
+        return cls(pose, matrix, width, height)
 
     @property
     def position(self) -> torch.Tensor:
         """The camera's centre in the world [3], m."""
-        return torch.linalg.inv(self.world_to_camera)[:3, 3]
+        pose: torch.Tensor = torch.linalg.inv(self.world_to_camera)
+        return pose[:3, 3]
 
     def require_valid(self) -> None:
         """Raise InputError for a view that cannot be drawn."""

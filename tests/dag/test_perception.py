@@ -20,6 +20,7 @@ SYNTHETIC = {
     "compare_with": "search_only",
     "synthetic": {"size": "tiny", "frames": 8},
     "perception": {"segment": {"backend": "opencv"}, **PERCEPTION},
+    "images": {"appearance": {"iterations": 40}},
 }
 
 
@@ -55,6 +56,37 @@ def test_cameras_are_perceived_by_jobs_of_their_own_and_nothing_reruns(finished)
     assert planned["observe"] == 1
 
 
+def test_predictions_are_drawn_scored_and_filmed(finished):
+    run_folder = finished / "results" / PACKAGE / "search_only" / "0"
+    scores = pd.read_parquet(run_folder / "scores.parquet")
+    pictured = scores[scores["metric"].isin(["psnr", "ssim", "iou"])]
+    assert len(pictured) == 6
+    assert pictured["value"].between(0, 100).all()
+    assert set(scores["metric"]) == {"chamfer", "track_error", "psnr", "ssim", "iou"}
+    record = json.loads((run_folder / "run.json").read_text())
+    assert record["images"]["lpips"].startswith("no AlexNet weights")
+    assert record["images"]["masks"] == "given"
+    assert {"images.png", "video.mp4", "turntable.mp4"} == set(record["artifacts"]["images"])
+    assert all((run_folder / name).stat().st_size > 1000 for name in record["artifacts"]["images"])
+    summary = (finished / "results" / "tables" / "summary.md").read_text()
+    assert "Recon. PSNR" in summary
+    assert "LPIPS: not computed: no AlexNet weights" in summary
+    folder = finished / "results" / PACKAGE / "appearance" / "0"
+    assert {path.name for path in folder.iterdir()} == {"appearance.json", "appearance.png", "history.parquet", "splats.ply"}
+
+
+def test_all_methods_share_one_appearance(finished):
+    changes = SYNTHETIC | {"methods": ["search_only", "baseline", "neuspring"], "seeds": [0, 1]}
+    planned = jobs(run(finished, changes | {"results": "other"}, "--dry-run"))
+    assert (planned["appearance"], planned["render"], planned["score"]) == (2, 6, 6)
+    # What concerns drawing alone does not train again; a run without images has no such steps.
+    planned = jobs(run(finished, SYNTHETIC | {"images": {"views": "all", "appearance": {"iterations": 40}}}, "--dry-run"))
+    assert "appearance" not in planned
+    assert (planned["render"], planned["score"]) == (1, 1)
+    planned = jobs(run(finished, SYNTHETIC | {"results": "other", "images": {"enabled": False}}, "--dry-run"))
+    assert "render" not in planned
+
+
 def test_the_truth_lies_beside_the_capture_and_not_in_it(finished):
     folder = finished / "results" / PACKAGE
     assert (folder / "capture_truth.npz").is_file()
@@ -66,7 +98,7 @@ def test_a_folder_of_the_user_s_own(place):
     table = place / "config" / "scenarios.tsv"
     table.write_text(table.read_text() + "film\tcapture\ttoy\tfilm\tfalse\ttrue\n")
     changes = {"scenarios": ["film"], "methods": ["search_only"], "compare_with": "search_only", "data_root": str(place / "mine")}
-    result = run(place, changes | {"perception": PERCEPTION})
+    result = run(place, changes | {"perception": PERCEPTION, "images": {"appearance": {"iterations": 20}}})
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((place / "results" / "film" / "search_only" / "0" / "run.json").read_text())
     assert record["status"] == "ok"

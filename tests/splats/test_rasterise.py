@@ -170,5 +170,5 @@ def test_wrong_shapes_are_named():
 
 def test_gsplat_is_refused_with_a_reason_where_it_cannot_work():
     assert choose_backend("auto", "cpu") == "warp"
-    with pytest.raises(InputError, match="gsplat must work.*needs CUDA"):
+    with pytest.raises(InputError, match=r"gsplat must work.*needs CUDA"):
         choose_backend("gsplat", "cpu")

@@ -95,7 +95,7 @@ def rope(count: int = 40) -> np.ndarray:
 
 def test_nodes_on_a_line_turn_by_the_least_angle():
     nodes, quarter = rope(), Rotation.from_euler("z", 90, degrees=True)
-    beside = nodes[10:30] + [0, 0.004, 0]
+    beside = nodes[10:30] + np.array([0, 0.004, 0])
     identity = as_tensor(np.tile([1.0, 0, 0, 0], (20, 1)))
     moved, turned = Skin(nodes).step(nodes, quarter.apply(nodes), as_tensor(beside), identity)
     assert np.abs(moved.numpy() - quarter.apply(beside)).max() < METRES
@@ -104,7 +104,9 @@ def test_nodes_on_a_line_turn_by_the_least_angle():
 
 def test_a_line_turned_round_stays_finite_and_rigid():
     nodes = rope()
-    moved, _ = Skin(nodes).step(nodes, -nodes, as_tensor(nodes + [0, 0.004, 0]), as_tensor(np.tile([1.0, 0, 0, 0], (40, 1))))
+    moved, _ = Skin(nodes).step(
+        nodes, -nodes, as_tensor(nodes + np.array([0, 0.004, 0])), as_tensor(np.tile([1.0, 0, 0, 0], (40, 1)))
+    )
     # Off the line the half turn may go any way round, but to the same distance.
     assert np.abs(np.linalg.norm(moved.numpy() + nodes, axis=1) - 0.004).max() < METRES
 
@@ -136,11 +138,13 @@ def test_a_degenerate_neighbourhood_stays_local():
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_handful_of_nodes_carries_splats_too(count):
     nodes = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 3))
-    moved, turned = Skin(nodes).step(nodes, nodes + [0.1, 0, 0], as_tensor(nodes), as_tensor(np.tile([1.0, 0, 0, 0], (count, 1))))
+    moved, turned = Skin(nodes).step(
+        nodes, nodes + np.array([0.1, 0, 0]), as_tensor(nodes), as_tensor(np.tile([1.0, 0, 0, 0], (count, 1)))
+    )
     assert np.abs(moved.numpy() - nodes - [0.1, 0, 0]).max() < METRES
     assert np.abs(turned.numpy() - [1, 0, 0, 0]).max() < COMPONENTS
 
 
 def test_nodes_that_are_not_finite_are_refused():
-    with pytest.raises(InputError, match="nodes.*finite"):
+    with pytest.raises(InputError, match=r"nodes.*finite"):
         Skin(np.full((3, 3), np.nan))

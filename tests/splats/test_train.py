@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neuspring.config_images import Appearance
+from neuspring.data.synthetic.make import looking
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.image_metrics import psnr
 from neuspring.splats import harmonics
@@ -17,7 +18,6 @@ from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.train import extent_of, first_splats, in_sight, restricted, train
 from neuspring.splats.view import View
 from tests.perception.filmed import EYES, intrinsics
-from neuspring.data.synthetic.make import looking
 
 SIZE = (96, 64)
 HELD_OUT = (0.1, -0.55, 0.35)

@@ -109,7 +109,8 @@ def capture_file(wildcards):
 
 def raw_files(wildcards):
     """What a capture is imported from, so that changed data are read again."""
-    if BENCHMARK.scenarios[wildcards.scenario].source != "phystwin_raw":
+    source = BENCHMARK.scenarios[wildcards.scenario].source
+    if source not in ("phystwin_raw", "phystwin"):
         return []
     folder = BENCHMARK.data_path(wildcards.scenario)
     return [
@@ -145,10 +146,10 @@ def perception_tables():
     return [PERCEPTION_TABLE] if judged_scenarios() else []
 
 
-def of_source(source):
-    """Pattern of the scenarios of one source; where there are none it matches nothing."""
+def of_source(*sources):
+    """Pattern of the scenarios of some sources; where there are none it matches nothing."""
     rows = BENCHMARK.scenarios.values()
-    names = [re.escape(row.scenario) for row in rows if row.source == source]
+    names = [re.escape(row.scenario) for row in rows if row.source in sources]
     return "|".join(names) or "(?!)"
 
 
@@ -163,7 +164,8 @@ def image_stamps(wildcards):
     """A digest of names, sizes and times of the images that the user may change, so that changed ones are read again."""
     row = BENCHMARK.scenarios[wildcards.scenario]
     folder = BENCHMARK.data_path(wildcards.scenario)
-    return stamps(str(folder)) if row.source in ("capture", "phystwin_raw") else ""
+    own = row.source in ("capture", "phystwin_raw", "phystwin")
+    return stamps(str(folder)) if own else ""
 
 
 @functools.cache
@@ -192,6 +194,28 @@ def backend_digest(step):
     return code_digest(BACKENDS[step, backend], stage=f"perceive.{step}")
 
 
+def segment_backend(wildcards):
+    """Processed data have masks; those are taken, whatever segments raw video."""
+    processed = BENCHMARK.scenarios[wildcards.scenario].source == "phystwin"
+    return "given" if processed else CONFIG.perception.segment.backend
+
+
+def segment_settings(wildcards):
+    if segment_backend(wildcards) != "given":
+        return perception_settings("segment")
+    return json.dumps({"perception": {"segment": {"backend": "given"}}})
+
+
+def segment_digest(wildcards):
+    return code_digest(
+        BACKENDS["segment", segment_backend(wildcards)], stage="perceive.segment"
+    )
+
+
+def segment_gpu(wildcards):
+    return int(segment_backend(wildcards) == "grounded_sam2" and DEVICE != "cpu")
+
+
 def perception_settings(*names):
     """Some sections of `perception`, with the chosen backend's own settings alone."""
     values = settings.plain(CONFIG)["perception"]
@@ -217,6 +241,26 @@ def image_settings(*names):
     )
 
 
+def appearance_settings(wildcards):
+    """What trains splats; of processed data, which perception has not lifted, also how masks are lifted."""
+    text = image_settings("backend", "opacity", "appearance", "released_quirks")
+    if BENCHMARK.scenarios[wildcards.scenario].source in settings.FILMED:
+        return text
+    return json.dumps(
+        json.loads(text) | json.loads(perception_settings("lift")), sort_keys=True
+    )
+
+
+def lifted_record(wildcards):
+    if BENCHMARK.scenarios[wildcards.scenario].source not in settings.FILMED:
+        return []
+    return [f"{RESULTS}/{wildcards.scenario}/perception/lifted.json"]
+
+
+def lifted_option(wildcards, input):
+    return ["--lifted", str(input.lifted)] if input.get("lifted") else []
+
+
 def render_records(wildcards):
     """The record of the drawn pictures, for scenarios with images; others have no such stage."""
     if not BENCHMARK.has_images(wildcards.scenario):
@@ -230,9 +274,8 @@ def render_option(wildcards, input):
     return ["--render", str(input.render)] if input.get("render") else []
 
 
-def needs_gpu(section, backend):
-    chosen = getattr(CONFIG.perception, section).backend
-    return 1 if chosen == backend and DEVICE != "cpu" else 0
+def track_gpu():
+    return int(CONFIG.perception.track.backend == "cotracker3" and DEVICE != "cpu")
 
 
 def scenario_files(wildcards):

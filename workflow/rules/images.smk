@@ -3,7 +3,8 @@ rule appearance:
     input:
         capture=capture_file,
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
-        lifted=rules.lift.output,
+        observations=rules.observe.output,
+        lifted=lifted_record,
     output:
         f"{RESULTS}/{{scenario}}/appearance/{{seed}}/appearance.json",
     log:
@@ -20,12 +21,18 @@ rule appearance:
         mem_mb=8000,
         runtime=240,
     params:
-        settings=image_settings("backend", "opacity", "appearance", "released_quirks"),
+        settings=appearance_settings,
+        lifted=lifted_option,
         images=image_stamps,
-        code=code_digest("neuspring.splats.train", stage="appearance.learn"),
+        code=code_digest(
+            "neuspring.splats.train",
+            "neuspring.perception.lift",
+            "neuspring.figures_images",
+            stage="appearance.learn",
+        ),
     shell:
-        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} --lifted {input.lifted:q}"
-        " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
+        " {params.lifted:q} --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
         " --output {output:q} 2>&1 | tee -a {log:q}"
 
 

@@ -34,7 +34,7 @@ rule capture:
     benchmark:
         f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
     wildcard_constraints:
-        scenario=of_source("phystwin_raw"),
+        scenario=of_source("phystwin_raw", "phystwin"),
     retries: 1
     conda:
         ENVIRONMENT
@@ -67,13 +67,13 @@ rule segment:
     threads: 1
     resources:
         device=DEVICE,
-        gpu=needs_gpu("segment", "grounded_sam2"),
+        gpu=segment_gpu,
         mem_mb=8000,
         runtime=120,
     params:
-        settings=perception_settings("segment"),
+        settings=segment_settings,
         images=image_stamps,
-        code=backend_digest("segment"),
+        code=segment_digest,
     shell:
         "python -m neuspring segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
         " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
@@ -96,7 +96,7 @@ rule track:
     threads: 1
     resources:
         device=DEVICE,
-        gpu=needs_gpu("track", "cotracker3"),
+        gpu=track_gpu(),
         mem_mb=8000,
         runtime=120,
     params:
