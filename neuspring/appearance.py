@@ -100,6 +100,9 @@ def learn(
         "cameras": [shot.name for shot in shots],
         **_seen_facts(gaussians, shots, drawn, backend, BEHIND * seen.width),
     }
+    hands = ", ".join(f"camera {shot.name} {facts[f'behind_hands_{shot.name}']:.0%}" for shot in shots)
+    hidden = f"frame 0 hides {facts['hidden_splats']:.0%} of the splats from all cameras; behind hands: {hands}"
+    print(f"{len(splats.means)} splats; {hidden}", flush=True)
     clock.stage("appearance", "ok", paths, facts=facts, **common).save(output)
 
 
@@ -130,7 +133,7 @@ def render(
     broken = next((record for record in before.values() if record.status == "failed"), None)
     if before["appearance"].status == "failed" or trajectory is None or not len(trajectory.positions):
         assert broken is not None
-        clock.stage("render", "failed", reason=f"{broken.stage}: {broken.reason}", **common).save(output)
+        clock.stage("render", "failed", reason=broken.reason, **common).save(output)
         return
     capture, scenario = Capture.load(folder), Observations.load(observations_path).scenario
     scene = _Scene.of(capture, _masks(capture, masks), images, device)
@@ -168,9 +171,10 @@ def render(
         "views": list(scene.scored),
         "splats": len(splats.means),
         "lpips": metric if isinstance(metric, str) else "computed",
+        "hidden_splats": before["appearance"].facts["hidden_splats"],
         "quirks": sorted(name for name, on in config.plain(images.released_quirks).items() if on),
     }
-    reason = f"{broken.stage}: {broken.reason}" if broken else ""
+    reason = broken.reason if broken else ""
     clock.stage("render", "failed" if broken else "ok", files, reason=reason, facts=facts, **common).save(output)
 
 

@@ -26,7 +26,7 @@ RESULT_ROLES = ("twin", "trajectory")
 """Files of a stage that are its result, as opposed to how it got there."""
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
-PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks")
+PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "hidden_splats")
 """What a reader of image scores must know."""
 
 

@@ -41,6 +41,7 @@ TRANSFER_HEADINGS = {("transfer", "chamfer"): "Transfer CD", ("transfer", "track
 Headings = Mapping[tuple[str, str], str]
 SHOWN = {"chamfer": (MM, 2), "track_error": (MM, 2), "psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (1.0, 4), "iou": (1.0, 3)}
 """Metric -> factor and digits in tables."""
+NOT_COMPUTED = "not computed"
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _averaged_notes(runs: pd.DataFrame) -> list[str]:
 
 
 def _method_table(
-    methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int, headings: Headings = HEADINGS
+    methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int, headings: Headings = HEADINGS, absent: str = "–"
 ) -> list[str]:
     rows = []
     for method in methods:
@@ -226,7 +227,7 @@ def _method_table(
                 means[(means["method"] == method) & (means["task"] == task) & (means["metric"] == metric)] if len(means) else means
             )
             if not len(found):
-                cells.append("–")
+                cells.append(absent)
                 continue
             row, (factor, digits) = found.iloc[0], SHOWN[metric]
             spread = f" ± {factor * row['seed_std']:.{digits}f}" if np.isfinite(row["seed_std"]) else " ± –"
@@ -280,16 +281,27 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
     lines = ["", f"Pictures: PSNR in dB, SSIM and IoU, higher is better; LPIPS, lower is better.{some}", ""]
     lines += [f"{_image_conditions(facts)} Mean over scenarios; in brackets the frame-weighted mean.", ""]
     computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
-    headings = {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed}
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
-    lines += _method_table(methods, averages(pictured), counts, collected.runs["seed"].nunique(), headings)
+    lines += _method_table(methods, averages(pictured), counts, collected.runs["seed"].nunique(), IMAGE_HEADINGS, NOT_COMPUTED)
+    hidden = _hidden(collected.runs)
+    lines += ["", f"Part of the splats that no camera sees in frame 0: {hidden}."] if hidden else []
     reasons = sorted({str(values["lpips"]) for values in facts} - {"computed"})
     lines += [line for reason in reasons for line in ("", f"LPIPS: not computed: {reason}")]
     own = differences[differences["metric"].isin(computed)] if len(differences) else differences
     if len(own):
         lines += ["", f"Paired difference to {baseline} [95 % interval], same scenario and seed:", ""]
-        lines += _difference_table(own, headings)
+        lines += _difference_table(own, {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed})
     return lines
+
+
+def _hidden(runs: pd.DataFrame) -> str:
+    """Scenarios and the share of their splats that frame 0 hides, in words."""
+    shares: dict[str, list[float]] = {}
+    for scenario, text in zip(runs["scenario"], runs["images"], strict=True):
+        facts = json.loads(text) if isinstance(text, str) else None
+        if facts:
+            shares.setdefault(str(scenario), []).append(facts["hidden_splats"])
+    return ", ".join(f"{scenario} {np.mean(values):.0%}" for scenario, values in shares.items())
 
 
 def _image_conditions(facts: list[dict[str, Any]]) -> str:

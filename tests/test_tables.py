@@ -1,5 +1,7 @@
 """Tables compare like with like, and never hide a gap."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -82,6 +84,47 @@ def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
     within = np.mean([part.var() / 3 for part in runs]) / 12
     between = np.var([part.mean() for part in runs]) / 12
     assert tables._resampled_means(runs, np.random.default_rng(0)).var() == pytest.approx(within + between, rel=0.05)
+
+
+def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collected:
+    """Two scenarios, two methods; the second scenario has no images."""
+    base = collected({(s, m, 0): 0.01 for s in ("a", "b") for m in ("x", "y")})
+    facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "quirks": list(quirks), "hidden_splats": 0.25}
+    runs = base.runs.assign(images=[json.dumps(facts if s == "a" else None) for s in base.runs["scenario"]])
+    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)} | (
+        {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
+    )
+    rows = [
+        ("a", "rope", m, 0, task, metric, pair[k], "1", 10)
+        for metric, pair in values.items()
+        for k, m in enumerate(("x", "y"))
+        for task in ("reconstruction", "future")
+    ]
+    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(COLUMNS))], ignore_index=True), runs)
+
+
+def test_pictures_have_a_table_of_their_own():
+    text = tables.summary_text(with_images(), "x")
+    assert "Of 2 scenarios 1 have images." in text
+    assert "Cameras scored: 0; masks: given; rasteriser: warp; none of the released evaluation's quirks." in text
+    (row,) = [line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line and "0.0500" in line]
+    assert "0.9500 (0.9500)" in row
+    assert "Part of the splats that no camera sees in frame 0: a 25%." in text
+    assert "+3.00" in text
+
+
+def test_what_was_not_computed_is_said_and_never_a_number():
+    text = tables.summary_text(with_images("no AlexNet weights: x is not there", ("any_alpha",)), "x")
+    assert "LPIPS: not computed: no AlexNet weights: x is not there" in text
+    header = next(line for line in text.splitlines() if "Recon. PSNR" in line)
+    assert "not computed" in next(line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line)
+    assert "Recon. LPIPS" in header
+    assert "released quirks: any_alpha" in text
+
+
+def test_scenarios_without_images_are_said_to_have_none():
+    text = tables.summary_text(collected({("a", "x", 0): 0.01}), "x")
+    assert "No scores of pictures: these scenarios have no images" in text
 
 
 def test_a_method_that_has_not_begun_does_not_empty_the_table():

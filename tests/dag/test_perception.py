@@ -1,11 +1,16 @@
 """Raw RGBD through the real workflow: a synthetic package at the smallest size, and a folder of the user's own."""
 
 import json
+import shutil
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from tests.perception.filmed import film
+from neuspring.artifacts import Observations
+from tests.data.phystwin_case import dump
+from tests.perception.filmed import film, write_raw
+from tests.perception.test_perceive import perceived
 
 from .project import copy_workflow, jobs, run
 
@@ -68,6 +73,8 @@ def test_predictions_are_drawn_scored_and_filmed(finished):
     assert record["images"]["masks"] == "given"
     assert {"images.png", "video.mp4", "turntable.mp4"} == set(record["artifacts"]["images"])
     assert all((run_folder / name).stat().st_size > 1000 for name in record["artifacts"]["images"])
+    tracked = {path.name for path in (finished / "results" / "mlartifacts").rglob("*") if path.is_file()}
+    assert {"images.png", "video.mp4", "turntable.mp4", "image_scores.png"} <= tracked
     summary = (finished / "results" / "tables" / "summary.md").read_text()
     assert "Recon. PSNR" in summary
     assert "LPIPS: not computed: no AlexNet weights" in summary
@@ -104,6 +111,43 @@ def test_a_folder_of_the_user_s_own(place):
     assert record["status"] == "ok"
     # No truth, no table of perception.
     assert not (place / "results" / "tables" / "perception.md").exists()
+
+
+def test_processed_cases_with_images_beside_them_are_drawn_too(place):
+    """PhysTwin's released folders: observations come from final_data.pkl, pictures from color, depth and mask."""
+    capture = film(place / "mine" / "film", up="-z")
+    seen = perceived(capture, place / "seen")
+    case = write_raw(capture, place / "data" / "film")
+    dump(case / "final_data.pkl", final_data_of(seen))
+    table = place / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + "film\tphystwin\ttoy\tfilm\tfalse\ttrue\n")
+    changes = {"scenarios": ["film"], "methods": ["search_only"], "compare_with": "search_only", "data_root": str(place / "data")}
+    changes |= {"perception": PERCEPTION | {"segment": {"backend": "opencv"}}, "images": {"appearance": {"iterations": 60}}}
+    planned = jobs(run(place, changes, "--dry-run"))
+    assert {"track", "lift"} & set(planned) == set()
+    assert (planned["capture"], planned["segment"], planned["appearance"], planned["render"]) == (1, 3, 1, 1)
+    result = run(place, changes)
+    assert result.returncode == 0, result.stdout + result.stderr
+    scores = pd.read_parquet(place / "results" / "tables" / "scores.parquet")
+    assert scores.loc[scores["metric"] == "psnr", "value"].min() > 12
+    masks = json.loads((place / "results" / "film" / "perception" / "0" / "masks.json").read_text())
+    assert masks["settings"]["Segmentation"]["backend"] == "given"
+    # Without its images the case has no pictures, and the rest runs.
+    shutil.rmtree(case / "color")
+    assert "appearance" not in jobs(run(place, changes | {"results": "other"}, "--dry-run"))
+
+
+def final_data_of(seen: Observations) -> dict[str, np.ndarray]:
+    visible = seen.object_visibility
+    return {
+        "object_points": seen.object_points.astype(float),
+        "object_colors": np.where(visible[..., None], 0.5, 0.0) * np.ones(3),
+        "object_visibilities": visible,
+        "object_motions_valid": seen.object_motion_valid,
+        "controller_points": seen.controller_points.astype(float),
+        "surface_points": seen.surface_points.astype(float),
+        "interior_points": seen.interior_points.astype(float),
+    }
 
 
 def test_masks_that_the_user_repairs_are_read_again(place):

@@ -1,0 +1,119 @@
+"""Time and memory of the rasteriser: `python -m tests.benchmarks.bench_splats [--device cuda:0] [--repeats 9]`.
+
+A ball of splats, as a toy before a camera: 7 % of the picture, all splats in view, isotropic, harmonics of degree 3 as tensors that
+ask for gradients. Columns: medians over repeats of the forward pass and of both passes, and the growth of the peak memory. On a GPU
+848 x 480 with 100,000 splats, and the same with gsplat where it works. Then skinning: splats and nodes grow together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+import torch
+
+from neuspring.errors import InputError
+from neuspring.splats.rasterise import Backend, choose_backend, rasterise
+from neuspring.splats.skinning import Skin
+from neuspring.splats.view import View
+from tests.benchmarks.bench_frame import peak_mib, reset_peak, timed
+
+SIZES = ((212, 120), (424, 240), (848, 480))
+COUNTS = (2_000, 10_000, 50_000)
+DEGREE = 3
+
+
+def ball(count: int, device: str) -> list[torch.Tensor]:
+    """Splats on an ellipsoid 0.6 m before the camera, as wide as they lie apart."""
+    rng = np.random.default_rng(0)
+    towards = rng.normal(size=(count, 3))
+    means = 0.1 * towards / np.linalg.norm(towards, axis=1, keepdims=True) * [1.5, 1, 1] + [0, 0, 0.6]
+    scale = 0.05 * np.sqrt(4 * np.pi * 1.2 / count)
+    arrays = (
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), scale),
+        rng.uniform(0.3, 1, count),
+        rng.uniform(-0.5, 0.5, (count, (DEGREE + 1) ** 2, 3)),
+    )
+    return [torch.tensor(a, dtype=torch.float32, device=device).requires_grad_() for a in arrays]
+
+
+def front(width: int, height: int, device: str) -> View:
+    """A camera with the released field of view."""
+    focal = 430 * width / 848
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], device=device)
+    return View(torch.eye(4, device=device), intrinsics, width, height)
+
+
+def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend: Backend) -> float:
+    """Print one row; returns the median of both passes, s."""
+    splats, view = ball(count, device), front(*size, device)
+
+    def forward() -> None:
+        rasterise(*splats, view, degree=DEGREE, backend=backend)
+
+    def both() -> None:
+        drawn = rasterise(*splats, view, degree=DEGREE, backend=backend)
+        (drawn.rgb.sum() + drawn.alpha.sum() + drawn.depth.sum()).backward()
+        for tensor in splats:
+            tensor.grad = None
+
+    both()
+    if device == "cpu":
+        reset_peak()
+        before = peak_mib()
+        both()
+        grown = peak_mib() - before
+    else:
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated() / 2**20
+        both()
+        grown = torch.cuda.max_memory_allocated() / 2**20 - before
+    _, first = timed(forward, repeats, device)
+    _, second = timed(both, repeats, device)
+    row = f"{backend:>8}{size[0]:>6} x {size[1]:<4}{count:>8}{1e3 * first:>12.1f}{1e3 * second:>16.1f}{grown:>14.0f}"
+    print(row, flush=True)
+    return second
+
+
+def skinning(device: str) -> None:
+    """Time per frame as splats and nodes grow together."""
+    print(f"\nskinning\n{'splats':>8}{'nodes':>8}{'ms/frame':>12}{'ns/splat':>12}")
+    for count in (2_000, 10_000, 50_000):
+        nodes = np.random.default_rng(1).uniform(-0.1, 0.1, (count // 10, 3))
+        means = torch.tensor(np.random.default_rng(2).uniform(-0.1, 0.1, (count, 3)), dtype=torch.float32, device=device)
+        turns = torch.zeros(count, 4, device=device)
+        turns[:, 0] = 1
+        skin = Skin(nodes, device=device)
+        _, median = timed(lambda skin=skin, nodes=nodes, m=means, q=turns: skin.step(nodes, nodes + 0.001, m, q), 5, device)
+        print(f"{count:>8}{len(nodes):>8}{1e3 * median:>12.2f}{1e9 * median / count:>12.0f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--repeats", type=int, default=9)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"device {options.device}, torch {torch.__version__}, float32, degree {DEGREE}")
+    print(f"{'':>8}{'pixels':>13}{'splats':>8}{'forward ms':>12}{'with gradient ms':>16}{'peak MiB':>14}")
+    start = time.perf_counter()
+    for size in SIZES:
+        for count in COUNTS:
+            bench(size, count, options.device, options.repeats, "warp")
+    if options.device != "cpu":
+        ours = bench((848, 480), 100_000, options.device, options.repeats, "warp")
+        try:
+            choose_backend("gsplat", options.device)
+            theirs = bench((848, 480), 100_000, options.device, options.repeats, "gsplat")
+            print(f"gsplat takes {theirs / ours:.2f} of our time")
+        except InputError as error:
+            print(f"gsplat: {error}")
+    skinning(options.device)
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
