@@ -6,103 +6,108 @@ Each reads artefacts, computes, writes artefacts, pictures and a record, like th
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 import torch
 import trimesh
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from neuspring import config, figures_images, image_metrics
-from neuspring.artifacts import Observations, Trajectory, write_atomically
+from neuspring.artifacts import Observations, Trajectory, write_table
 from neuspring.config import Config
 from neuspring.config_images import Images
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, Capture
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.errors import InputError, NumericalFailure
-from neuspring.lpips import Lpips, find_weights
+from neuspring.lpips import Lpips
+from neuspring.lpips_weights import configured
 from neuspring.perception.lift import clean_masks, lifting_cameras
-from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
+from neuspring.perception.results import LiftedTracks, Masks, ShapePrior, masks_of_cameras
 from neuspring.physics.solver import resolve_device
+from neuspring.pictures import BLACK, COVERED, WHITE, Scored, moved, picture, save_picture, turned, view_of
 from neuspring.progress import Progress
 from neuspring.records import StageRecord, Stopwatch, digest_file
 from neuspring.splats.densify import REFERENCE_WIDTH
 from neuspring.splats.losses import Shot
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend, choose_backend
-from neuspring.splats.skinning import Skin
-from neuspring.splats.train import first_splats, in_sight, restricted, train
-from neuspring.splats.view import View
+from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.train import first_splats, restricted, train
 from neuspring.video import Video
 
 VIDEOS = ("video", "turntable")
-COVERED = 128
-"""Of 255: a pixel that splats cover by half counts as object."""
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
-BEHIND = 3.0
-"""Widths of a pixel by which a splat may lie behind what a view shows and still count as seen."""
+OWN_SETTINGS = ("backend", "appearance")
+"""Keys of `images` that training uses, beside the quirk `corner_pixels`."""
 
 
 def learn(
     folder: Path,
     masks: Sequence[Path],
-    observations_path: Path,
-    lifted_record: Path | None,
     settings: Config,
     seed: int,
     device: str,
     output: Path,
+    *,
+    lifted_record: Path | None = None,
+    observations_path: Path | None = None,
 ) -> None:
     """Frame 0 of a capture -> splats.ply, history.parquet, appearance.png, appearance.json.
 
-    The first splats lie on the points that perception lifted and its shape prior; without its record (processed data), on the
-    lifted masks and the observations' surface points. A failure to train (no finite loss) is recorded.
+    The first splats lie on the points that perception lifted and its shape prior (`lifted_record`), or, of processed data, on the
+    lifted masks and the surface points of `observations_path`. A failure to train is recorded.
     """
     clock, device, images = Stopwatch(), resolve_device(device), settings.images
     capture = Capture.load(folder)
-    loaded = _masks(capture, masks)
+    loaded = masks_of_cameras(capture, masks)
     backend = choose_backend(images.backend, device)
-    seen = _seen_points(capture, loaded, observations_path, lifted_record, settings, seed)
-    _require_outside(capture, np.concatenate([seen.cloud, seen.prior]))
     shots = _shots(capture, loaded, images, device)
+    width = float(np.nanmedian([shot.pixel_width for shot in shots]))
+    seen = _seen_points(capture, loaded, settings, seed, width, lifted_record, observations_path)
+    _require_outside(capture, np.concatenate([seen.cloud, seen.prior]))
     points, colours = seen.first()
+    plain = config.plain(settings)
+    read = {"capture": folder / CAPTURE, **{f"masks{k}": path for k, path in enumerate(masks)}}
+    read |= {"lift": lifted_record} if lifted_record else {}
+    read |= {"observations": observations_path} if observations_path else {}
     common: dict[str, Any] = {
-        "inputs": {"capture": digest_file(folder / CAPTURE), "observations": digest_file(observations_path)},
-        "settings": {"appearance": config.plain(images.appearance), "seed": seed},
+        "inputs": {name: digest_file(path) for name, path in read.items()},
+        "settings": {name: plain["images"][name] for name in OWN_SETTINGS}
+        | {"corner_pixels": images.released_quirks.corner_pixels, "seed": seed}
+        | ({} if lifted_record else {"lift": plain["perception"]["lift"]}),
         "device": device,
     }
     try:
-        trained = train(first_splats(points, colours, images.appearance, seen.width), shots, images.appearance, seed, backend)
-        splats = restricted(trained.splats, images.opacity)
+        trained = train(first_splats(points, colours, images.appearance, width), shots, images.appearance, seed, backend)
     except NumericalFailure as failure:
         clock.stage("appearance", "failed", reason=str(failure), **common).save(output)
         return
     paths = {name: output.with_name(file) for name, file in (("splats", "splats.ply"), ("history", "history.parquet"))}
     trained.splats.save(paths["splats"])
-    history = pd.DataFrame(trained.history).melt("step", var_name="metric", value_name="value")
-    write_atomically(paths["history"], lambda temporary: history.to_parquet(temporary, index=False))
-    gaussians = Gaussians.of(splats, device)
-    drawn = {shot.name: _picture(gaussians, shot.view, backend) for shot in shots}
-    around = {angle: _turned(gaussians, shots[0].view, backend, angle) for angle in (90, 180, 270)}
+    write_table(pd.DataFrame(trained.history).melt("step", var_name="metric", value_name="value"), paths["history"])
+    gaussians = Gaussians.of(trained.splats, device)
+    drawn = {shot.name: picture(gaussians, shot.view, backend) for shot in shots}
+    around = {angle: turned(gaussians, shots[0].view, backend, angle) for angle in (90, 180, 270)}
     paths["picture"] = figures_images.appearance_figure(shots, drawn, around, output.with_name("appearance.png"))
-    facts = {
+    behind = {shot.name: _behind_hands(shot, drawn[shot.name]) for shot in shots}
+    facts: dict[str, Any] = {
         "splats": len(trained.splats.means),
-        "kept": len(splats.means),
         "first_splats": trained.first,
         "iterations": images.appearance.iterations,
         "loss": trained.history["loss"][-1],
         "backend": backend,
         "cameras": [shot.name for shot in shots],
-        **_seen_facts(gaussians, shots, drawn, backend, BEHIND * seen.width),
+        "unseen_surface": seen.hidden,
+        **{f"psnr_{shot.name}": _quality(shot, drawn[shot.name]) for shot in shots},
+        **{f"behind_hands_{name}": share for name, share in behind.items()},
     }
-    hands = ", ".join(f"camera {shot.name} {facts[f'behind_hands_{shot.name}']:.0%}" for shot in shots)
-    hidden = f"frame 0 hides {facts['hidden_splats']:.0%} of the splats from all cameras; behind hands: {hands}"
-    print(f"{len(splats.means)} splats; {hidden}", flush=True)
+    unseen = "a part that is unknown without a shape prior" if seen.hidden is None else f"{seen.hidden:.0%} of the surface"
+    hands = ", ".join(f"camera {name} {share:.0%}" for name, share in behind.items())
+    print(f"{facts['splats']} splats; frame 0 hides {unseen}; of the picture behind hands: {hands}", flush=True)
     clock.stage("appearance", "ok", paths, facts=facts, **common).save(output)
 
 
@@ -122,36 +127,43 @@ def render(
     """
     clock, device, images = Stopwatch(), resolve_device(device), settings.images
     before = {"appearance": StageRecord.load(appearance_record), "rollout": StageRecord.load(rollout_record)}
-    paths = {"appearance": appearance_record, "rollout": rollout_record}
+    paths = {"appearance": appearance_record, "rollout": rollout_record, "capture": folder / CAPTURE}
     common: dict[str, Any] = {
-        "inputs": {name: digest_file(path) for name, path in paths.items()} | {"capture": digest_file(folder / CAPTURE)},
-        "settings": {"images": {name: value for name, value in config.plain(images).items() if name != "appearance"}},
+        "inputs": {name: digest_file(path) for name, path in paths.items()},
+        "settings": {name: value for name, value in config.plain(images).items() if name != "appearance"},
         "device": device,
     }
-    rollout = before["rollout"]
-    trajectory = Trajectory.load(rollout.file("trajectory", rollout_record)) if "trajectory" in rollout.files else None
-    broken = next((record for record in before.values() if record.status == "failed"), None)
-    if before["appearance"].status == "failed" or trajectory is None or not len(trajectory.positions):
-        assert broken is not None
-        clock.stage("render", "failed", reason=broken.reason, **common).save(output)
-        return
+
+    def failed(reason: str) -> None:
+        clock.stage("render", "failed", reason=reason, **common).save(output)
+
     capture, scenario = Capture.load(folder), Observations.load(observations_path).scenario
-    scene = _Scene.of(capture, _masks(capture, masks), images, device)
-    splats = restricted(Splats.load(before["appearance"].file("splats", appearance_record)), images.opacity)
-    weights = find_weights(*(Path(path) if path else None for path in (images.lpips.backbone, images.lpips.heads)))
+    _require_length(capture, scenario.frame_count, observations_path)
+    scored = Scored.of(capture, masks_of_cameras(capture, masks), images, device)
+    weights = configured(images.lpips)
     metric = weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device)
+    rollout, learned = before["rollout"], before["appearance"]
+    if learned.status == "failed":
+        return failed(learned.reason)
+    trajectory = Trajectory.load(rollout.file("trajectory", rollout_record)) if "trajectory" in rollout.files else None
+    if trajectory is None or not len(trajectory.positions):
+        return failed(rollout.reason)
+    try:
+        splats = restricted(Splats.load(learned.file("splats", appearance_record)), images.opacity)
+    except NumericalFailure as failure:
+        return failed(str(failure))
     rows: list[dict[str, Any]] = []
-    film, first = figures_images.Film(scenario), scene.scored[0]
-    files = {role: output.with_name(f"{role}.mp4") for role in (VIDEOS if images.video else ())}
     strip = figures_images.Strip(scenario, len(trajectory.positions))
+    film, first = figures_images.Film(scenario), next(iter(scored.views))
+    files = {role: output.with_name(f"{role}.mp4") for role in (VIDEOS if images.video else ())}
     progress = Progress("render", len(trajectory.positions))
     with contextlib.ExitStack() as stack:
-        videos = {role: stack.enter_context(Video(path, capture.description.frame_rate)) for role, path in files.items()}
-        for frame, gaussians in enumerate(_moved(splats, trajectory.positions, images, device)):
-            for name in scene.scored:
+        videos = {role: stack.enter_context(Video(path, scenario.frame_rate)) for role, path in files.items()}
+        for frame, gaussians in enumerate(moved(splats, trajectory.positions, images, device)):
+            for name in scored.views:
                 if not capture.has(name, frame):
                     continue
-                pair = scene.pair(name, frame, gaussians)
+                pair = scored.pair(name, frame, gaussians)
                 found = _scores(pair, metric, images.released_quirks.unit_lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in found.items()]
                 if name == first:
@@ -160,68 +172,57 @@ def render(
                         videos["video"].add(film.compared(frame, pair))
             if videos:
                 angle = 360 * frame / len(trajectory.positions)
-                videos["turntable"].add(film.turned(frame, _turned(gaussians, scene.views[first], scene.backend, angle)))
+                videos["turntable"].add(film.turned(frame, turned(gaussians, scored.views[first], scored.backend, angle)))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
     files |= {"frames": output.with_name("frames.parquet"), "strip": strip.save(output.with_name("images.png"))}
-    write_atomically(files["frames"], lambda temporary: table.to_parquet(temporary, index=False))
+    write_table(table, files["frames"])
     facts = {
-        "backend": scene.backend,
-        "masks": scene.masks_from,
-        "views": list(scene.scored),
+        "backend": scored.backend,
+        "masks": scored.masks_from,
+        "views": list(scored.views),
         "splats": len(splats.means),
         "lpips": metric if isinstance(metric, str) else "computed",
-        "hidden_splats": before["appearance"].facts["hidden_splats"],
         "quirks": sorted(name for name, on in config.plain(images.released_quirks).items() if on),
+        "unseen_surface": learned.facts["unseen_surface"],
+        # Nothing but black on both sides: such frames have no finite PSNR.
+        "empty_frames": int(np.isinf(table["value"]).sum()),
     }
-    reason = broken.reason if broken else ""
-    clock.stage("render", "failed" if broken else "ok", files, reason=reason, facts=facts, **common).save(output)
+    clock.stage("render", rollout.status, files, reason=rollout.reason, facts=facts, **common).save(output)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """What pictures are compared with."""
+def draw(
+    folder: Path,
+    appearance_record: Path,
+    rollout_record: Path,
+    camera: str,
+    frames: Sequence[int] | None,
+    background: Literal["black", "white"],
+    settings: Config,
+    device: str,
+    output: Path,
+) -> list[Path]:
+    """RGBA pictures <frame>.png (five digits) of a prediction, seen by one camera, in the folder `output`; all frames by default.
 
-    capture: Capture
-    masks: Mapping[str, np.ndarray]
-    masks_from: str
-    views: Mapping[str, View]
-    scored: tuple[str, ...]
-    backend: Backend
-    covered: int
-    """Least coverage, of 255, that counts as object."""
-
-    @classmethod
-    def of(cls, capture: Capture, perceived: Mapping[str, Masks], images: Images, device: str) -> _Scene:
-        names = tuple(capture.cameras)[: 1 if images.views == "first" else None]
-        quirks, cameras = images.released_quirks, list(capture.cameras.values())
-        if quirks.second_camera_intrinsics and len(cameras) < 2:
-            rule = "images.released_quirks.second_camera_intrinsics needs a second camera"
-            raise InputError(capture.folder / CAPTURE, rule, f"{len(cameras)} camera")
-        views = {
-            name: _view(capture.cameras[name], images, device, cameras[1] if quirks.second_camera_intrinsics else None)
-            for name in names
-        }
-        # Scores should not depend on the segmentation under test, where the capture comes with masks of its own.
-        own = capture.description.masks
-        labels = {name: np.zeros((0,)) if own else perceived[name].labels for name in names}
-        source = "given" if own else next(iter(perceived.values())).backend
-        covered = 1 if quirks.any_alpha else COVERED
-        return cls(capture, labels, source, views, names, choose_backend(images.backend, device), covered)
-
-    def labels(self, name: str, frame: int) -> np.ndarray:
-        """[H, W] uint8, as `Capture.mask`."""
-        return self.capture.mask(name, frame) if self.masks_from == "given" else self.masks[name][frame]
-
-    def pair(self, name: str, frame: int, gaussians: Gaussians) -> figures_images.Pair:
-        """Observed and predicted picture of one camera in one frame."""
-        labels = self.labels(name, frame)
-        mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-        colour = self.capture.colour(name, frame)
-        rendered = _picture(gaussians, self.views[name], self.backend)
-        truth, prediction = image_metrics.masked_pair(colour, mask, rendered, hands)
-        silhouettes = image_metrics.silhouettes(mask, rendered, hands, self.covered)
-        return figures_images.Pair(colour, rendered, truth, prediction, silhouettes, hands > 0)
+    Raises InputError for a camera or frame that is not there, and where there is nothing to draw.
+    """
+    device, images, capture = resolve_device(device), settings.images, Capture.load(folder)
+    if camera not in capture.cameras:
+        raise InputError("--camera", f"must be a camera of {folder / CAPTURE}: {', '.join(capture.cameras)}", camera)
+    learned, rollout = StageRecord.load(appearance_record), StageRecord.load(rollout_record)
+    positions = Trajectory.load(rollout.file("trajectory", rollout_record)).positions
+    wanted = range(len(positions)) if frames is None else frames
+    beyond = [frame for frame in wanted if not 0 <= frame < len(positions)]
+    if beyond or not len(positions):
+        raise InputError("--frames", f"the trajectory has the frames 0 to {len(positions) - 1}", beyond)
+    splats = restricted(Splats.load(learned.file("splats", appearance_record)), images.opacity)
+    view, backend = view_of(capture.cameras[camera], images, device), choose_backend(images.backend, device)
+    made = []
+    for frame, gaussians in enumerate(moved(splats, positions, images, device)):
+        if frame in wanted:
+            made.append(output / f"{frame:05d}.png")
+            save_picture(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
+    return made
 
 
 def _scores(pair: figures_images.Pair, lpips: Lpips | str, unit_lpips: bool) -> dict[str, float]:
@@ -235,55 +236,21 @@ def _scores(pair: figures_images.Pair, lpips: Lpips | str, unit_lpips: bool) -> 
     return found if isinstance(lpips, str) else found | {"lpips": float(lpips(prediction, truth, released_range=unit_lpips))}
 
 
-def _moved(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
-    """The splats in every frame of a trajectory [F, N, 3], m."""
-    start = Gaussians.of(splats, device)
-    quirk = images.released_quirks.degenerate_skinning
-    skin = Skin(positions[0], device=device, frozen=images.frozen_skinning, released_degeneracy=quirk)
-    for means, quaternions in skin.carry(positions, start.means, start.quaternions):
-        yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
-
-
-@torch.no_grad()
-def _picture(
-    gaussians: Gaussians, view: View, backend: Backend, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> np.ndarray:
-    """RGBA [H, W, 4] uint8, colour over the background."""
-    drawn = gaussians.draw(view, background=background, backend=backend)
-    picture = torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1).clamp(0, 1)
-    return np.asarray((255 * picture + 0.5).floor().to(torch.uint8).cpu().numpy())
-
-
-def _turned(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
-    """RGB picture over white from a camera like `like` that went round the object by `angle` degrees and still faces it."""
-    centre = gaussians.means.median(0).values.double().cpu().numpy()
-    turn = Rotation.from_euler("z", angle, degrees=True)
-    pose = np.linalg.inv(like.world_to_camera.double().cpu().numpy())
-    pose[:3, :3] = turn.as_matrix() @ pose[:3, :3]
-    pose[:3, 3] = centre + turn.apply(pose[:3, 3] - centre)
-    view = View.of(pose, like.intrinsics.cpu().numpy(), like.width, like.height, str(like.intrinsics.device), shift=0.0)
-    return _picture(gaussians, view, backend, (1.0, 1.0, 1.0))[..., :3]
-
-
-def _view(camera: Camera, images: Images, device: str, borrowed: Camera | None = None) -> View:
-    intrinsics = (borrowed or camera).intrinsics
-    shift = 0.0 if images.released_quirks.corner_pixels else 0.5
-    return View.of(camera.camera_to_world, intrinsics, camera.width, camera.height, device, shift)
-
-
 def _shots(capture: Capture, masks: Mapping[str, Masks], images: Images, device: str) -> list[Shot]:
-    """Views of frame 0 to train on; a camera that does not have the object in view is left out, and said."""
+    """Views of frame 0 to train on; a camera that does not show the object is left out, and said."""
     shots = []
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
-        if not (labels == OBJECT).any():
-            print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
-            continue
         margin = images.appearance.hand_margin * camera.width / REFERENCE_WIDTH
         seen = (capture.colour(name, 0), labels == OBJECT, labels == HANDS, capture.depth(name, 0))
-        shots.append(Shot.of(name, _view(camera, images, device), *seen, margin))
+        shot = Shot.of(name, view_of(camera, images, device), *seen, margin)
+        if shot is None:
+            print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
+        else:
+            shots.append(shot)
     if not shots:
-        raise InputError(capture.folder, "at least one camera must have the object in view in frame 0", "empty masks")
+        rule = "at least one camera must have the object in view in frame 0, away from hands"
+        raise InputError(f"{capture.folder}, masks of frame 0", rule, "empty masks", "Look at perception/<camera>/masks.png.")
     return shots
 
 
@@ -296,40 +263,52 @@ class _Seen:
     colours: np.ndarray
     """[P, 3] RGB."""
     prior: np.ndarray
-    """[Q, 3] m, guessed by a shape prior."""
-    width: float
-    """Of a pixel at the object, m."""
+    """[Q, 3] m, on the surface that a shape prior guesses."""
+    reach: float
+    """m: points of the prior this near to a seen one add nothing."""
+    uniform: bool
+    """Whether the prior's points are uniform over its surface, so that their share is one of area."""
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:
         """Points [R, 3] m and RGB [R, 3]: what was seen, and where nothing was the prior, in the colours of what is nearest."""
-        if not len(self.prior):
-            return self.cloud, self.colours
         distance, nearest = cKDTree(self.cloud).query(self.prior)
-        new = distance > NEAR_SEEN * self.width
+        new = distance > self.reach
         return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colours, self.colours[nearest[new]]])
+
+    @property
+    def hidden(self) -> float | None:
+        """Part of the surface that no camera saw; None where no prior says what the whole is."""
+        if not (self.uniform and len(self.prior)):
+            return None
+        return float((cKDTree(self.cloud).query(self.prior)[0] > self.reach).mean())
 
 
 def _seen_points(
-    capture: Capture, masks: Mapping[str, Masks], observations_path: Path, lifted_record: Path | None, settings: Config, seed: int
+    capture: Capture,
+    masks: Mapping[str, Masks],
+    settings: Config,
+    seed: int,
+    width: float,
+    lifted_record: Path | None,
+    observations_path: Path | None,
 ) -> _Seen:
-    camera = next(iter(capture.cameras.values()))
-    if lifted_record is None:
-        chosen = settings.perception.lift
-        _, cloud, colours = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
-        if not len(cloud):
-            raise InputError(capture.folder, "the object's mask of frame 0 must hold pixels with depth in range", "none")
-        width = _pixel_width(camera, cloud)
-        return _Seen(cloud, colours, Observations.load(observations_path).surface_points, width)
-    record = StageRecord.load(lifted_record)
-    lifted = LiftedTracks.load(record.file("lifted", lifted_record))
-    prior = ShapePrior.load(record.file("shape", lifted_record))
-    width = _pixel_width(camera, lifted.cloud)
-    apart = max(settings.images.appearance.spacing, 1.0) * width
-    return _Seen(lifted.cloud, lifted.cloud_colours, _surface_points(prior, apart, seed), width)
-
-
-def _pixel_width(camera: Camera, cloud: np.ndarray) -> float:
-    return float(np.median(camera.project(cloud)[1]) / camera.intrinsics[0, 0])
+    """From perception's record, or from masks and processed observations; `width`, m, is a pixel's at the object."""
+    if lifted_record is not None:
+        record = StageRecord.load(lifted_record)
+        lifted = LiftedTracks.load(record.file("lifted", lifted_record))
+        prior = ShapePrior.load(record.file("shape", lifted_record))
+        apart = max(settings.images.appearance.spacing, 1.0) * width
+        return _Seen(lifted.cloud, lifted.cloud_colours, _surface_points(prior, apart, seed), NEAR_SEEN * width, True)
+    if observations_path is None:
+        raise InputError("--lifted, --observations", "one of the two is required", "neither")
+    observations = Observations.load(observations_path)
+    _require_length(capture, observations.scenario.frame_count, observations_path)
+    chosen = settings.perception.lift
+    _, cloud, colours = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
+    if not len(cloud):
+        remedy = "perception.lift has depth_range, neighbourhood and outlier_neighbours."
+        raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none", remedy)
+    return _Seen(cloud, colours, observations.surface_points, NEAR_SEEN * width, False)
 
 
 def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
@@ -341,19 +320,16 @@ def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
     return np.asarray(points)
 
 
-def _seen_facts(
-    gaussians: Gaussians, shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], backend: Backend, margin: float
-) -> dict[str, float]:
-    """How well training views are met, and how much of the object frame 0 hides."""
-    seen = torch.stack([in_sight(gaussians, shot, backend, margin) for shot in shots]).any(0)
-    facts = {"hidden_splats": float(1 - seen.float().mean())}
-    for shot in shots:
-        cover = drawn[shot.name][..., 3] >= COVERED
-        behind = cover & (shot.known.cpu().numpy() == 0)
-        facts[f"behind_hands_{shot.name}"] = float(behind.sum() / max(cover.sum(), 1))
-        picture = torch.tensor(drawn[shot.name][..., :3].astype(np.float32) / 255) * shot.known.cpu()[..., None]
-        facts[f"psnr_{shot.name}"] = float(image_metrics.psnr(picture.permute(2, 0, 1), shot.colour.cpu().permute(2, 0, 1)))
-    return facts
+def _behind_hands(shot: Shot, drawn: np.ndarray) -> float:
+    """Part of the splats' picture that hands cover."""
+    cover = drawn[..., 3] >= COVERED
+    return float((cover & (shot.known.cpu().numpy() == 0)).sum() / max(cover.sum(), 1))
+
+
+def _quality(shot: Shot, drawn: np.ndarray) -> float:
+    """PSNR of a training view, dB."""
+    splats = torch.tensor(drawn[..., :3].astype(np.float32) / 255) * shot.known.cpu()[..., None]
+    return float(image_metrics.psnr(splats.permute(2, 0, 1), shot.colour.cpu().permute(2, 0, 1)))
 
 
 def _require_outside(capture: Capture, points: np.ndarray) -> None:
@@ -367,16 +343,8 @@ def _require_outside(capture: Capture, points: np.ndarray) -> None:
             raise InputError(capture.folder / CAPTURE, rule, np.round(centre, 3).tolist(), remedy)
 
 
-def _masks(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:
-    """Masks by camera, from records in the capture's order."""
-    if len(records) != len(capture.cameras):
-        raise InputError("--masks", f"one record per camera is required: {list(capture.cameras)}", len(records))
-    loaded = {}
-    for (name, camera), path in zip(capture.cameras.items(), records, strict=True):
-        masks = Masks.load(StageRecord.load(path).file("masks", path))
-        wanted = (capture.frame_count, camera.height, camera.width)
-        if masks.labels.shape != wanted:
-            remedy = f"Delete {path} and run again."
-            raise InputError(path, f"masks must have the frames and size of camera {name}: {wanted}", masks.labels.shape, remedy)
-        loaded[name] = masks
-    return loaded
+def _require_length(capture: Capture, frames: int, observations_path: Path) -> None:
+    if capture.frame_count != frames:
+        rule = f"must have as many frames as {observations_path}: {frames}"
+        remedy = "Correct the data, or set images.enabled: false to go without pictures."
+        raise InputError(capture.folder / CAPTURE, rule, capture.frame_count, remedy)

@@ -18,11 +18,14 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
 
 import numpy as np
 
 from neuspring.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
@@ -73,6 +76,12 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
     write_atomically(path, lambda p: p.write_text(text, encoding="utf-8"))
+
+
+def write_table(table: pd.DataFrame, path: Path) -> Path:
+    """Write a Parquet file atomically; returns its path."""
+    write_atomically(path, lambda temporary: table.to_parquet(temporary, index=False))
+    return path
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,9 +26,10 @@ from neuspring.config import (
 )
 from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
+from neuspring.lpips_weights import configured
 
-RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published")
-"""Folders of the results that are no scenarios."""
+RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published", "appearance", "perception", "capture")
+"""Folders of the results that are no scenarios or methods."""
 
 
 def read_methods(path: Path) -> dict[str, Method]:
@@ -172,6 +173,9 @@ class Benchmark:
         return tuple(camera.name for camera in capture.read_description(path / capture.CAPTURE).cameras)
 
     def _require_data(self) -> None:
+        if self.config.images.enabled:
+            # Named weights that are missing or wrong are an error before the first job.
+            configured(self.config.images.lpips)
         for name, row in self.scenarios.items():
             path = self.data_path(name)
             if path is None:

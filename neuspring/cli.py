@@ -125,8 +125,8 @@ def _observe(a: argparse.Namespace) -> int:
 def _appearance(a: argparse.Namespace) -> int:
     from neuspring import appearance
 
-    seen = (a.masks, a.observations, a.lifted)
-    appearance.learn(a.capture.parent, *seen, _settings(a.settings), a.seed, a.device, a.output)
+    of = {"lifted_record": a.lifted, "observations_path": a.observations}
+    appearance.learn(a.capture.parent, a.masks, _settings(a.settings), a.seed, a.device, a.output, **of)
     return 0
 
 
@@ -135,6 +135,15 @@ def _render(a: argparse.Namespace) -> int:
 
     records = (a.appearance, a.rollout)
     appearance.render(a.capture.parent, a.masks, a.observations, *records, _settings(a.settings), a.device, a.output)
+    return 0
+
+
+def _draw(a: argparse.Namespace) -> int:
+    from neuspring import appearance
+
+    which = (a.appearance, a.rollout, a.camera, a.frames, a.background)
+    made = appearance.draw(a.capture.parent, *which, _settings(a.settings), a.device, a.output)
+    print(f"{len(made)} pictures: {a.output}")
     return 0
 
 
@@ -169,8 +178,8 @@ def _transfer(a: argparse.Namespace) -> int:
 def _score(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    optional = {"fit": a.fit} if a.fit else {}
-    records = {"search": a.search} | optional | {"rollout": a.rollout} | ({"render": a.render} if a.render else {})
+    given = {name: getattr(a, name) for name in ("search", "fit", "rollout", "appearance", "render")}
+    records = {name: path for name, path in given.items() if path}
     stages.score(a.observations, records, a.method, _json_mapping("--variant", a.variant), a.seed, a.output)
     return 0
 
@@ -268,9 +277,8 @@ def _parser() -> argparse.ArgumentParser:
     observe.add_argument("--capture", type=Path, help="capture.json of raw video")
     observe.add_argument("--lifted", type=Path, help="lifted.json of raw video")
 
-    learn = add(
-        "appearance", _appearance, "frame 0 of a capture -> splats", "capture", "observations", "settings", "compute", "output"
-    )
+    learn = add("appearance", _appearance, "frame 0 of a capture -> splats", "capture", "settings", "compute", "output")
+    learn.add_argument("--observations", type=Path, help="observations.npz, of processed data")
     learn.add_argument("--seed", type=int, default=0)
     draw = add(
         "render",
@@ -287,8 +295,13 @@ def _parser() -> argparse.ArgumentParser:
             "--masks", type=Path, nargs="+", required=True, help="masks.json of every camera, in the capture's order"
         )
     learn.add_argument("--lifted", type=Path, help="lifted.json, where perception made the observations")
-    draw.add_argument("--appearance", type=Path, required=True, help="appearance.json")
-    draw.add_argument("--rollout", type=Path, required=True, help="rollout.json")
+    frames = add("draw", _draw, "splats and trajectory -> RGBA pictures of any camera", "capture", "settings", "compute", "output")
+    frames.add_argument("--camera", required=True)
+    frames.add_argument("--frames", type=int, nargs="+", help="all by default")
+    frames.add_argument("--background", choices=("black", "white"), default="black")
+    for command in (draw, frames):
+        command.add_argument("--appearance", type=Path, required=True, help="appearance.json")
+        command.add_argument("--rollout", type=Path, required=True, help="rollout.json")
 
     search = add("search", _search, "observations -> coarse twin, by CMA-ES", "observations", "settings", "compute", "output")
     search.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
@@ -316,6 +329,7 @@ def _parser() -> argparse.ArgumentParser:
     score.add_argument("--search", type=Path, required=True, help="search.json")
     score.add_argument("--fit", type=Path, help="fit.json, if the method has that stage")
     score.add_argument("--rollout", type=Path, required=True, help="rollout.json")
+    score.add_argument("--appearance", type=Path, help="appearance.json, if the scenario has images")
     score.add_argument("--render", type=Path, help="render.json, if the scenario has images")
     score.add_argument("--method", required=True)
     score.add_argument("--variant", default="{}", help="JSON: the method's switches")
@@ -366,5 +380,5 @@ class _Adder:
             parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N")
             parser.add_argument("--threads", type=int, default=1)
         if "output" in shared:
-            parser.add_argument("--output", type=Path, required=True, help="file (tables: folder) to write")
+            parser.add_argument("--output", type=Path, required=True, help="file (tables, draw: folder) to write")
         return parser

@@ -26,7 +26,8 @@ class Appearance:
     degree_every: Count = 1000
     """Steps after which the degree in use rises by one, from 0."""
     spacing: NonNegative = 0.0
-    """First splats: one per voxel of this many pixels' width at the object; 0: one per point that was seen, as released."""
+    """First splats: one per voxel as wide at the object as this many pixels of the camera's own; 0: one per point that was seen, as
+    released."""
     opacity: Fraction = 0.1
     """Of the first splats."""
     l1: NonNegative = 0.8

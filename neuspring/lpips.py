@@ -2,14 +2,12 @@
 
 d(a, b) = sum over the five ReLUs l of the mean over pixels of w_l . (f_l(a) - f_l(b))^2, f_l of unit length over its channels.
 AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so torchvision is not needed. Its weights and
-the heads are files: in torch hub's cache, or the heads inside an installed `lpips` or `torchmetrics`. Nothing is downloaded, and
-`find_weights` says what is absent.
+the heads are files (`lpips_weights`); nothing is downloaded.
 """
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,17 +15,7 @@ import torch
 from torch.nn.functional import conv2d, max_pool2d, relu
 
 from neuspring.errors import InputError
-from neuspring.records import digest_file
-
-BACKBONE = "alexnet-owt-7be5be79.pth"
-BACKBONE_DIGEST = "7be5be79"
-"""First digits of the SHA-256, by torch hub's convention those in the name."""
-BACKBONE_ADDRESS = f"https://download.pytorch.org/models/{BACKBONE}"
-HEADS = "lpips_alex_v0.1.pth"
-HEADS_DIGEST = "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"
-PACKAGED_HEADS = {"lpips": "weights/v0.1/alex.pth", "torchmetrics": "functional/image/lpips_models/alex.pth"}
-"""Where packages keep the heads, below their folder."""
-SHOWN_DIGITS = 8
+from neuspring.lpips_weights import BACKBONE_ADDRESS, find_weights
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
 """Of the picture and after each convolution."""
@@ -46,72 +34,6 @@ SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
 LEAST_NORM = 1e-10
 """Added to the length of a feature before dividing by it."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Checked weight files."""
-
-    backbone: Path
-    heads: Path
-
-
-def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> Weights | str:
-    """The weight files, or one line that says which are absent. None: look in the usual caches.
-
-    Checks SHA-256 unless `trusted`. Raises InputError only for a given path that is missing or has another content.
-    """
-    hub = Path(torch.hub.get_dir()) / "checkpoints"
-    found = (
-        _find("AlexNet weights", backbone, [hub / BACKBONE], BACKBONE_DIGEST, trusted),
-        _find("LPIPS heads", heads, [hub / HEADS, *_packaged()], HEADS_DIGEST, trusted),
-    )
-    first, second = found
-    if isinstance(first, Path) and isinstance(second, Path):
-        return Weights(first, second)
-    return "; ".join(reason for reason in found if isinstance(reason, str))
-
-
-def _find(what: str, given: Path | None, places: Iterable[Path], digest: str, trusted: bool) -> Path | str:
-    if given is not None:
-        if fault := _fault(given, digest, trusted):
-            raise InputError(given, f"must be the file of {what}", fault, "Name another file, or none to search the caches.")
-        return given
-    faults = []
-    for place in places:
-        fault = _fault(place, digest, trusted)
-        if not fault:
-            return place
-        faults.append(f"{_short(place)} {fault}")
-    return f"no {what}: {', '.join(faults)}"
-
-
-def _short(path: Path) -> str:
-    """A path as users write it."""
-    home = Path.home()
-    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
-
-
-def _fault(path: Path, digest: str, trusted: bool) -> str:
-    """What is wrong with a weight file; empty if nothing is."""
-    try:
-        if not path.is_file():
-            return "is not there"
-        found = digest if trusted else digest_file(path)
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
-    if found.startswith(digest):
-        return ""
-    return f"has SHA-256 {found[:SHOWN_DIGITS]}..., not {digest[:SHOWN_DIGITS]}..."
-
-
-def _packaged() -> list[Path]:
-    """Where the installed packages that carry the heads have them. The packages are not imported."""
-    places = []
-    for package, inside in PACKAGED_HEADS.items():
-        spec = importlib.util.find_spec(package)
-        places += [Path(folder) / inside for folder in (spec.submodule_search_locations or [] if spec else [])]
-    return places
 
 
 def _read(path: Path, shapes: Mapping[str, tuple[int, ...]], device: str) -> list[torch.Tensor]:

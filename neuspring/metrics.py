@@ -98,15 +98,16 @@ def score_tasks(
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def score_images(
-    frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int, tasks: Mapping[str, range] | None = None
-) -> pd.DataFrame:
+def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int) -> pd.DataFrame:
     """Tidy scores of pictures from `frames` (columns frame, camera, metric, value), of which the first `drawn` frames exist.
 
-    Cameras are averaged within a frame, then frames; a task that the rollout diverged in is left out.
+    Cameras are averaged within a frame, then frames; a task that the rollout diverged in is left out. An infinite PSNR (nothing but
+    black on both sides) is left out of the mean.
     """
     rows = []
-    for task, span in (tasks or {task: task_frames(scenario, task) for task in TASKS}).items():
+    frames = frames[np.isfinite(frames["value"])]
+    for task in TASKS:
+        span = task_frames(scenario, task)
         if not len(span) or span[-1] >= drawn:
             continue
         part = frames[frames["frame"].isin(span)]

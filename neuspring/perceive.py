@@ -15,7 +15,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.data.check_capture import objects
 from neuspring.errors import InputError
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior, masks_of_cameras
 from neuspring.records import StageRecord, Stopwatch, digest_file
 
 
@@ -176,11 +176,9 @@ def assemble(row: ScenarioRow, folder: Path, lifted_record: Path, settings: Conf
 
 def _of_cameras(capture: Capture, masks: Sequence[Path], tracks: Sequence[Path]) -> tuple[dict[str, Masks], dict[str, PixelTracks]]:
     """Masks and tracks by camera, from records in the capture's order."""
-    if not len(masks) == len(tracks) == len(capture.cameras):
-        raise InputError(
-            "--masks, --tracks", f"one record per camera is required: {list(capture.cameras)}", (len(masks), len(tracks))
-        )
-    loaded = {n: Masks.load(StageRecord.load(path).file("masks", path)) for n, path in zip(capture.cameras, masks, strict=True)}
+    loaded = masks_of_cameras(capture, masks)
+    if len(tracks) != len(capture.cameras):
+        raise InputError("--tracks", f"one record per camera is required: {list(capture.cameras)}", len(tracks))
     followed = {
         n: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for n, path in zip(capture.cameras, tracks, strict=True)
     }

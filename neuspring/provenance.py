@@ -83,7 +83,14 @@ def _stage_code(stage: str) -> str:
     """The function `stage` of `neuspring.stages`, or `module.function` of another module, and what it uses there."""
     module, _, function = stage.rpartition(".")
     tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
-    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    functions: dict[str, ast.stmt] = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            functions[node.name] = node
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+            functions |= dict.fromkeys(names, node)
     found: dict[str, str] = {}
     waiting = [function]
     while waiting:

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring import config, figures, metrics, provenance
-from neuspring.artifacts import Observations, Trajectory, Twin, write_atomically, write_text
+from neuspring.artifacts import Observations, Trajectory, Twin, write_table, write_text
 from neuspring.config import Config, Kind, ScenarioRow
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
@@ -26,14 +26,8 @@ RESULT_ROLES = ("twin", "trajectory")
 """Files of a stage that are its result, as opposed to how it got there."""
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
-PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "hidden_splats")
+PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
 """What a reader of image scores must know."""
-
-
-def write_table(table: pd.DataFrame, path: Path) -> Path:
-    """Write a Parquet file atomically; returns its path."""
-    write_atomically(path, lambda temporary: table.to_parquet(temporary, index=False))
-    return path
 
 
 def observe(
@@ -258,7 +252,7 @@ def score(
 ) -> None:
     """Trajectory -> scores.parquet, plots, and run.json: the record of the whole run, which MLflow indexes.
 
-    `records` maps search, fit (if any), rollout and render (for scenarios with images) to their records.
+    `records` maps search, fit (if any), rollout and, for scenarios with images, appearance and render to their records.
     """
     clock = Stopwatch()
     observations = Observations.load(observations_path)
@@ -290,7 +284,8 @@ def score(
         searched=None if searched is None else float(np.median(searched.material.stiffness)),
     )
     if drawn is not None:
-        artefacts["images"] = [
+        artefacts["images"] = [stages["appearance"].file("picture", records["appearance"])]
+        artefacts["images"] += [
             stages["render"].file(role, records["render"]) for role in PICTURE_ROLES if role in _files(stages, "render")
         ]
         artefacts["plots"].append(figures.image_scores_figure(drawn, observations.scenario, method, folder / "plots"))
@@ -304,12 +299,13 @@ def score(
         "notes": _notes(stages),
         "settings": {name: record.settings for name, record in stages.items()},
         "data_digest": digest_file(observations_path),
-        "images": {name: stages["render"].facts[name] for name in PICTURE_FACTS} if drawn is not None else None,
     }
     # The content of a run, without its timings: the same results have the same key, however often they are made.
     made = {name: record.files[role][1] for name, record in stages.items() for role in RESULT_ROLES if role in record.files}
     made["scores"] = digest_file(folder / "scores.parquet")
     run = content | {
+        # Beside the content: why LPIPS was not computed names places on this machine.
+        "images": _picture_facts(stages),
         "format": RECORD_FORMAT,
         "run_key": hashlib.sha256(canonical([content, made]).encode()).hexdigest(),
         "source": observations.scenario.source,
@@ -337,12 +333,22 @@ def _drawn(stages: Mapping[str, StageRecord], records: Mapping[str, Path]) -> pd
     return pd.read_parquet(stages["render"].file("frames", records["render"]))
 
 
+def _picture_facts(stages: Mapping[str, StageRecord]) -> dict[str, Any] | None:
+    """How pictures were scored, or why they were not; None for scenarios without images."""
+    if "render" not in stages:
+        return None
+    facts = stages["render"].facts
+    return {name: facts[name] for name in PICTURE_FACTS} if facts else {"failed": stages["render"].reason}
+
+
 def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
     """What a reader of the scores should know although the run did not fail."""
     notes = []
     rendered = stages.get("render")
     if rendered and rendered.status == "failed" and stages["rollout"].status == "ok":
-        notes.append(f"no scores of images: {rendered.reason}")
+        notes.append(f"no scores of pictures: {rendered.reason}")
+    if rendered and rendered.facts.get("empty_frames"):
+        notes.append(f"render: {rendered.facts['empty_frames']} frames show nothing of the object and have no PSNR")
     for name, record in stages.items():
         if record.facts.get("rollbacks"):
             wanted = record.settings["fit"]["epochs"]

@@ -254,11 +254,16 @@ def _difference_table(
 
 
 def _interval(row: Any) -> str:
+    return f"{_plain_interval(row)} ({100 * row['relative']:+.1f} %)"
+
+
+def _plain_interval(row: Any) -> str:
+    """Without the relative difference, which means nothing in dB."""
     factor, digits = SHOWN[row["metric"]]
     text = f"{factor * row['difference']:+.{digits}f}"
     if np.isfinite(row["low"]):
         text += f" [{factor * row['low']:+.{digits}f}, {factor * row['high']:+.{digits}f}]"
-    return f"{text} ({100 * row['relative']:+.1f} %)"
+    return text
 
 
 def _ratio(row: Any) -> str:
@@ -270,41 +275,47 @@ def _ratio(row: Any) -> str:
 
 def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.DataFrame, baseline: str) -> list[str]:
     """The section on pictures: how they were scored, both averages, the paired comparison; a sentence if there are none."""
-    known = collected.runs["images"].dropna() if "images" in collected.runs else pd.Series(dtype=str)
-    facts = [values for values in map(json.loads, known) if values]
-    pictured = scores[scores["metric"].isin([metric for _, metric in IMAGE_HEADINGS])] if len(scores) else scores
-    if not facts or not len(pictured):
+    if "images" not in collected.runs:
+        return ["", "No scores of pictures: no run has finished."]
+    runs = collected.runs.dropna(subset="images")
+    runs = runs.assign(images=runs["images"].map(json.loads))
+    runs = runs[[bool(facts) for facts in runs["images"]]]
+    if not len(runs):
         return ["", "No scores of pictures: these scenarios have no images, or images.enabled is off."]
-    methods = list(dict.fromkeys(collected.runs["method"]))
+    drawn = runs[["failed" not in facts for facts in runs["images"]]]
+    pictured = scores[scores["metric"].isin([metric for _, metric in IMAGE_HEADINGS])] if len(scores) else scores
+    if not len(drawn) or not len(pictured):
+        reasons = sorted({str(facts["failed"]) for facts in runs["images"] if "failed" in facts})
+        return ["", f"No scores of pictures: {'; '.join(reasons) or 'no run that can be compared has them'}."]
     have, all_ = pictured["scenario"].nunique(), collected.runs["scenario"].nunique()
-    some = "" if have == all_ else f" Of {all_} scenarios {have} have images."
+    some = "" if have == all_ else f" Of {all_} scenarios {have} have scores of pictures."
     lines = ["", f"Pictures: PSNR in dB, SSIM and IoU, higher is better; LPIPS, lower is better.{some}", ""]
-    lines += [f"{_image_conditions(facts)} Mean over scenarios; in brackets the frame-weighted mean.", ""]
+    lines += [f"{_image_conditions(drawn['images'])} Mean over scenarios; in brackets the frame-weighted mean.", ""]
+    methods = list(dict.fromkeys(collected.runs["method"]))
+    counts = runs.groupby(["method", "status"]).size().unstack(fill_value=0).reindex(methods, fill_value=0)
+    lines += _method_table(methods, averages(pictured), counts, runs["seed"].nunique(), IMAGE_HEADINGS, NOT_COMPUTED)
+    lines += ["", f"Part of the surface that no camera sees in frame 0: {_unseen(drawn)}."]
     computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
-    counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
-    lines += _method_table(methods, averages(pictured), counts, collected.runs["seed"].nunique(), IMAGE_HEADINGS, NOT_COMPUTED)
-    hidden = _hidden(collected.runs)
-    lines += ["", f"Part of the splats that no camera sees in frame 0: {hidden}."] if hidden else []
-    reasons = sorted({str(values["lpips"]) for values in facts} - {"computed"})
-    lines += [line for reason in reasons for line in ("", f"LPIPS: not computed: {reason}")]
+    where = "in some runs " if "lpips" in computed else ""
+    reasons = sorted({str(facts["lpips"]) for facts in drawn["images"]} - {"computed"})
+    lines += [line for reason in reasons for line in ("", f"LPIPS {where}not computed: {reason}")]
     own = differences[differences["metric"].isin(computed)] if len(differences) else differences
     if len(own):
         lines += ["", f"Paired difference to {baseline} [95 % interval], same scenario and seed:", ""]
-        lines += _difference_table(own, {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed})
+        lines += _difference_table(own, {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed}, _plain_interval)
     return lines
 
 
-def _hidden(runs: pd.DataFrame) -> str:
-    """Scenarios and the share of their splats that frame 0 hides, in words."""
-    shares: dict[str, list[float]] = {}
-    for scenario, text in zip(runs["scenario"], runs["images"], strict=True):
-        facts = json.loads(text) if isinstance(text, str) else None
-        if facts:
-            shares.setdefault(str(scenario), []).append(facts["hidden_splats"])
-    return ", ".join(f"{scenario} {np.mean(values):.0%}" for scenario, values in shares.items())
+def _unseen(runs: pd.DataFrame) -> str:
+    """Scenarios and the share of their surface that frame 0 hides, in words."""
+    shares: dict[str, list[float | None]] = {}
+    for scenario, facts in zip(runs["scenario"], runs["images"], strict=True):
+        shares.setdefault(str(scenario), []).append(facts["unseen_surface"])
+    known = {name: [value for value in values if value is not None] for name, values in shares.items()}
+    return ", ".join(f"{name} {f'{np.mean(v):.0%}' if v else 'unknown (no shape prior)'}" for name, v in known.items())
 
 
-def _image_conditions(facts: list[dict[str, Any]]) -> str:
+def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
     """How pictures were scored, from the runs' records."""
 
     def several(name: str) -> str:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import shutil
 
 import av
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,9 +15,10 @@ from neuspring import appearance, metrics
 from neuspring.artifacts import Trajectory
 from neuspring.config import Config
 from neuspring.config_images import Appearance, ImageQuirks, Images, LpipsWeights
-from neuspring.data.capture import Capture
+from neuspring.data.capture import HANDS, Capture
 from neuspring.errors import InputError
 from neuspring.perception.results import Masks
+from neuspring.pictures import turned
 from neuspring.records import StageRecord, Stopwatch
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
@@ -40,8 +43,8 @@ class Scene:
 
     def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
         self.appearance.parent.mkdir(exist_ok=True)
-        paths = (self.masks, self.folder / "observations.npz", self.folder / "lifted.json")
-        appearance.learn(self.capture.folder, *paths, chosen, seed, "cpu", self.appearance)
+        lifted = self.folder / "lifted.json"
+        appearance.learn(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
         return StageRecord.load(self.appearance)
 
     def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
@@ -84,8 +87,9 @@ def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
     record = StageRecord.load(scene.appearance)
     assert record.status == "ok"
     assert all(record.facts[f"psnr_{name}"] > 28 for name in scene.capture.cameras)
-    # The hand above hides a part; below, no camera looks.
-    assert 0.1 < record.facts["hidden_splats"] < 0.7
+    # Below, no camera looks.
+    assert 0.05 < record.facts["unseen_surface"] < 0.6
+    assert record.inputs.keys() == {"capture", "masks0", "masks1", "masks2", "lift"}
     assert record.facts["backend"] == "warp"
     assert {"splats", "history", "picture"} == set(record.files)
 
@@ -136,7 +140,7 @@ def test_another_camera_s_intrinsics_make_another_picture(tmp_path):
 def test_one_camera_that_misses_frames_and_z_down(tmp_path):
     made = Scene(film(tmp_path / "capture", cameras=1, missing={0: (2,)}, up="-z"), tmp_path)
     record = made.learn(settings())
-    assert record.facts["hidden_splats"] > 0.2
+    assert record.facts["unseen_surface"] > 0.2
     rendered, table = made.render(made.roll(FLIP[:3, :3] @ STEP, "one"), settings())
     assert sorted(table["frame"].unique()) == [0, 1, 3, 4, 5]
     scores = metrics.score_images(table, made.observations.scenario, FRAMES, "m", 0)
@@ -155,16 +159,55 @@ def test_a_diverged_rollout_is_drawn_as_far_as_it_goes(scene):
     assert set(scores["task"]) == {"reconstruction"}
 
 
-def test_a_failed_appearance_is_passed_on(scene, tmp_path):
-    record = scene.learn(settings(opacity=0.9999))
+def test_what_cannot_be_trained_or_drawn_is_recorded_and_passed_on(scene):
+    rendered, table = scene.render(scene.roll(STEP, "faint"), settings(opacity=0.9999))
+    assert (rendered.status, table) == ("failed", None)
+    assert "no splat has an opacity above 0.9999" in rendered.reason
     try:
-        assert (record.status, record.reason) == ("failed", "appearance: no splat has an opacity above 0.9999")
-        rendered, table = scene.render(scene.roll(STEP, "failed"), settings())
-        assert rendered.status == "failed"
-        assert "no splat" in rendered.reason
-        assert table is None
+        record = scene.learn(settings(appearance=dataclasses.replace(IMAGES.appearance, scale_rate=1e4)))
+        assert record.status == "failed"
+        rendered, _ = scene.render(scene.roll(STEP, "failed"), settings())
+        assert (rendered.status, rendered.reason) == ("failed", record.reason)
+        assert "splats are not finite" in rendered.reason
     finally:
         scene.learn(settings())
+
+
+def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_path):
+    """Hands all over frame 1 leave black on both sides."""
+    for path in sorted((scene.capture.folder / "mask" / "0").iterdir()):
+        (tmp_path / "mask" / "0").mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, tmp_path / "mask" / "0" / path.name)
+    cv2.imwrite(str(tmp_path / "mask" / "0" / "00001.png"), np.full((SIZE[1], SIZE[0]), HANDS, np.uint8))
+    for kind in ("color", "depth", "tracks.json", "capture.json"):
+        (tmp_path / kind).symlink_to(scene.capture.folder / kind)
+    rollout = scene.roll(STEP, "covered")
+    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
+    appearance.render(tmp_path, *paths, settings(video=False), "cpu", rollout.with_name("render.json"))
+    record = StageRecord.load(rollout.with_name("render.json"))
+    assert record.facts["empty_frames"] == 1
+    table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
+    scores = metrics.score_images(table, scene.observations.scenario, FRAMES, "m", 0).set_index(["task", "metric"])
+    assert np.isfinite(scores["value"]).all()
+    assert scores.loc[("reconstruction", "psnr"), "frames"] == 2
+    assert scores.loc[("reconstruction", "ssim"), "frames"] == 3
+
+
+def test_pictures_of_any_camera_and_frame(scene, tmp_path):
+    rollout = scene.roll(STEP, "drawn")
+    common = (scene.capture.folder, scene.appearance, rollout)
+    made = appearance.draw(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
+    assert [path.name for path in made] == ["00001.png", "00004.png"]
+    white = cv2.imread(str(made[0]), cv2.IMREAD_UNCHANGED)
+    black = cv2.imread(str(appearance.draw(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
+    assert white.shape == (SIZE[1], SIZE[0], 4)
+    assert np.array_equal(white[..., 3], black[..., 3])
+    # Over a background c the colour is colour over black + (1 - coverage) c.
+    assert np.abs(white[..., :3].astype(int) - black[..., :3] - (255 - black[..., 3:].astype(int))).max() <= 2
+    with pytest.raises(InputError, match="must be a camera of"):
+        appearance.draw(*common, "7", None, "black", settings(), "cpu", tmp_path)
+    with pytest.raises(InputError, match=r"frames 0 to 5; received \[9\]"):
+        appearance.draw(*common, "0", [9], "black", settings(), "cpu", tmp_path)
 
 
 def test_training_follows_its_seed_and_repeats(scene, tmp_path):
@@ -184,7 +227,7 @@ def test_pictures_from_the_side_keep_the_object_in_view(scene):
     gaussians = Gaussians.of(Splats.load(scene.appearance.with_name("splats.ply")))
     camera = scene.capture.cameras["0"]
     view = View.of(camera.camera_to_world, camera.intrinsics, camera.width, camera.height)
-    pictures = [appearance._turned(gaussians, view, "warp", angle) for angle in (0, 90, 180, 270)]
+    pictures = [turned(gaussians, view, "warp", angle) for angle in (0, 90, 180, 270)]
     for picture in pictures:
         dark = (picture.min(axis=2) < 200).mean()
         assert 0.01 < dark < 0.5
@@ -205,8 +248,8 @@ def spoiled(scene: Scene, folder, **changes: object) -> Capture:
 
 
 def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
-    paths = (masks or scene.masks, scene.folder / "observations.npz", scene.folder / "lifted.json")
-    appearance.learn(capture.folder, *paths, settings(), 0, "cpu", tmp_path / "appearance.json")
+    lifted = scene.folder / "lifted.json"
+    appearance.learn(capture.folder, masks or scene.masks, settings(), 0, "cpu", tmp_path / "appearance.json", lifted_record=lifted)
 
 
 def test_a_camera_inside_the_object_is_named(scene, tmp_path):
@@ -241,6 +284,16 @@ def test_masks_of_another_size_and_empty_ones_are_named(scene, tmp_path, capsys)
         learn_from(scene, scene.capture, tmp_path, [empty[0]] * 3)
 
 
+def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
+    shorter = spoiled(scene, tmp_path / "shorter")
+    values = json.loads((shorter.folder / "capture.json").read_text())
+    (shorter.folder / "capture.json").write_text(json.dumps(values | {"frame_count": 5}))
+    rollout = scene.roll(STEP, "length")
+    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
+    with pytest.raises(InputError, match=r"capture\.json: must have as many frames as .*observations\.npz: 6.*received 5.*enabled"):
+        appearance.render(shorter.folder, *paths, settings(), "cpu", rollout.with_name("render.json"))
+
+
 def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
     missing = LpipsWeights(backbone=str(tmp_path / "none.pth"))
     with pytest.raises(InputError, match=r"none\.pth"):
@@ -249,7 +302,8 @@ def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene,
 
 def test_processed_data_need_no_lifted_points(scene, tmp_path):
     """As of PhysTwin's released cases: masks are lifted, surface points of the observations stand for the shape prior."""
-    paths = (scene.masks, scene.folder / "observations.npz", None)
-    appearance.learn(scene.capture.folder, *paths, settings(), 0, "cpu", tmp_path / "appearance.json")
-    facts = StageRecord.load(tmp_path / "appearance.json").facts
+    output, seen = tmp_path / "appearance.json", scene.folder / "observations.npz"
+    appearance.learn(scene.capture.folder, scene.masks, settings(), 0, "cpu", output, observations_path=seen)
+    facts = StageRecord.load(output).facts
+    assert facts["unseen_surface"] is None
     assert all(facts[f"psnr_{name}"] > 25 for name in scene.capture.cameras)

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuspring import lpips
+from neuspring import lpips_weights
 from neuspring.errors import InputError
-from neuspring.lpips import Lpips, Weights, find_weights
+from neuspring.lpips import Lpips
+from neuspring.lpips_weights import Weights, find_weights
 from neuspring.records import digest_file
 
 DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
@@ -37,8 +38,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache of torch hub, and no package that carries heads."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torch.hub, "_hub_dir", None)
-    monkeypatch.setattr(lpips, "PACKAGED_HEADS", {})
+    monkeypatch.setattr(lpips_weights, "PACKAGED_HEADS", {})
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
     return folder
@@ -162,9 +162,9 @@ def test_cached_weights_are_found(hub, files, monkeypatch):
     for path, expected in ((hub / "alexnet-owt-7be5be79.pth", "7be5be79"), (hub / "lpips_alex_v0.1.pth", "df73285e")):
         assert f"{path} has SHA-256 {digest_file(path)[:8]}..., not {expected}..." in reason
     assert find_weights(trusted=True) == Weights(hub / "alexnet-owt-7be5be79.pth", hub / "lpips_alex_v0.1.pth")
-    monkeypatch.setattr(lpips, "BACKBONE_DIGEST", digest_file(files[0])[:8])
+    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0])[:8])
     assert find_weights() == reason.partition("; ")[2]
-    monkeypatch.setattr(lpips, "HEADS_DIGEST", digest_file(files[1]))
+    monkeypatch.setattr(lpips_weights, "HEADS_DIGEST", digest_file(files[1]))
     assert isinstance(find_weights(), Weights)
     a, b = pair(40, 40)
     assert Lpips.load()(a, b) == Lpips.load(*files, trusted=True)(a, b)
@@ -176,19 +176,19 @@ def test_heads_are_found_in_a_package_without_importing_it(hub, files, tmp_path,
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
     shutil.copy(files[1], package / "weights/alex.pth")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(lpips, "PACKAGED_HEADS", {"carries_heads": "weights/alex.pth", "absent_package": "alex.pth"})
+    monkeypatch.setattr(lpips_weights, "PACKAGED_HEADS", {"carries_heads": "weights/alex.pth", "absent_package": "alex.pth"})
     found = find_weights(files[0], trusted=True)
     assert found == Weights(files[0], package / "weights/alex.pth")
     # A stale file in the cache does not hide the good one.
     (hub / "lpips_alex_v0.1.pth").write_bytes(b"stale")
-    monkeypatch.setattr(lpips, "BACKBONE_DIGEST", digest_file(files[0]))
-    monkeypatch.setattr(lpips, "HEADS_DIGEST", digest_file(files[1]))
+    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0]))
+    monkeypatch.setattr(lpips_weights, "HEADS_DIGEST", digest_file(files[1]))
     assert find_weights(files[0]) == found
 
 
 def test_a_truncated_cached_file_is_a_reason(hub, files, monkeypatch):
     whole = files[0].read_bytes()
-    monkeypatch.setattr(lpips, "BACKBONE_DIGEST", digest_file(files[0])[:8])
+    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0])[:8])
     (hub / "alexnet-owt-7be5be79.pth").write_bytes(whole[: len(whole) // 2])
     reason = find_weights()
     assert isinstance(reason, str) and "alexnet-owt-7be5be79.pth has SHA-256" in reason
@@ -200,7 +200,7 @@ def test_an_unreadable_cached_file_is_a_reason(hub, monkeypatch):
     def denied(path):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(lpips, "digest_file", denied)
+    monkeypatch.setattr(lpips_weights, "digest_file", denied)
     assert "cannot be read (Permission denied)" in str(find_weights())
 
 

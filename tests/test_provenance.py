@@ -69,6 +69,31 @@ def test_a_stage_counts_with_the_functions_it_calls_and_no_other(copy):
     assert {name for name in before if stage(name) != before[name]} == {"score"}
 
 
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("pictures.py", "COVERED = 128", "COVERED = 200"),
+        ("lpips.py", "SHIFT = (-0.030", "SHIFT = (-0.031"),
+        ("video.py", "quality: int = 20", "quality: int = 21"),
+        ("splats/train.py", "> opacity", ">= opacity"),
+        ("appearance.py", 'VIDEOS = ("video", "turntable")', 'VIDEOS = ("turntable", "video")'),
+        ("data/capture.py", "[..., ::-1]", "[..., ::1]"),
+    ],
+)
+def test_everything_that_makes_pictures_counts(copy, file, old, new):
+    """The modules that rule `render` names, and constants beside its function."""
+    rule = (PACKAGE.parent / "workflow" / "rules" / "images.smk").read_text().partition("rule render")[2]
+    modules = [word.strip('", ') for word in rule.partition("code_digest(")[2].partition("stage=")[0].split()]
+
+    def now() -> str:
+        clear()
+        return provenance.code_digest(*modules, stage="appearance.render")
+
+    before = now()
+    edit(copy / file, old, new)
+    assert now() != before
+
+
 def test_transitive_imports_count(copy):
     before = digest("neuspring.search")
     edit(copy / "physics" / "springs.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
@@ -89,10 +114,22 @@ LEVELS = [
     {"config_perception", "config_images"},
     {"artifacts", "config", "progress"},
     {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views"},
-    {"image_metrics", "lpips", "video"},
-    {"rollout", "data", "tracking", "parameters", "transfer", "figures_twin", "figures_clusters", "figures_ratios", "splats"},
+    {"image_metrics", "lpips_weights", "video"},
+    {
+        "rollout",
+        "data",
+        "tracking",
+        "parameters",
+        "transfer",
+        "figures_twin",
+        "figures_clusters",
+        "figures_ratios",
+        "splats",
+        "lpips",
+    },
     {"benchmark", "perception", "search", "fit", "carry", "figures", "tables"},
     {"perceive", "tables_perception", "figures_images"},
+    {"pictures"},
     {"stages", "appearance"},
     {"cli"},
     {"__main__"},

@@ -89,7 +89,7 @@ def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
 def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collected:
     """Two scenarios, two methods; the second scenario has no images."""
     base = collected({(s, m, 0): 0.01 for s in ("a", "b") for m in ("x", "y")})
-    facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "quirks": list(quirks), "hidden_splats": 0.25}
+    facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "quirks": list(quirks), "unseen_surface": 0.25}
     runs = base.runs.assign(images=[json.dumps(facts if s == "a" else None) for s in base.runs["scenario"]])
     values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)} | (
         {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
@@ -105,17 +105,21 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
 
 def test_pictures_have_a_table_of_their_own():
     text = tables.summary_text(with_images(), "x")
-    assert "Of 2 scenarios 1 have images." in text
+    assert "Of 2 scenarios 1 have scores of pictures." in text
     assert "Cameras scored: 0; masks: given; rasteriser: warp; none of the released evaluation's quirks." in text
     (row,) = [line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line and "0.0500" in line]
     assert "0.9500 (0.9500)" in row
-    assert "Part of the splats that no camera sees in frame 0: a 25%." in text
+    assert "Part of the surface that no camera sees in frame 0: a 25%." in text
+    # Runs are those with images; a percentage of decibels would mean nothing.
+    assert row.endswith("| 1/1  |")
+    assert "+3.00" in text
+    assert "+3.00 (" not in text
     assert "+3.00" in text
 
 
 def test_what_was_not_computed_is_said_and_never_a_number():
     text = tables.summary_text(with_images("no AlexNet weights: x is not there", ("any_alpha",)), "x")
-    assert "LPIPS: not computed: no AlexNet weights: x is not there" in text
+    assert "LPIPS not computed: no AlexNet weights: x is not there" in text
     header = next(line for line in text.splitlines() if "Recon. PSNR" in line)
     assert "not computed" in next(line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line)
     assert "Recon. LPIPS" in header
@@ -123,8 +127,16 @@ def test_what_was_not_computed_is_said_and_never_a_number():
 
 
 def test_scenarios_without_images_are_said_to_have_none():
-    text = tables.summary_text(collected({("a", "x", 0): 0.01}), "x")
+    one = collected({("a", "x", 0): 0.01})
+    text = tables.summary_text(Collected(one.scores, one.runs.assign(images="null")), "x")
     assert "No scores of pictures: these scenarios have no images" in text
+
+
+def test_pictures_that_could_not_be_made_say_why():
+    one = collected({("a", "x", 0): 0.01})
+    failed = json.dumps({"failed": "appearance: step 3 removed the last splat"})
+    text = tables.summary_text(Collected(one.scores, one.runs.assign(images=failed)), "x")
+    assert "No scores of pictures: appearance: step 3 removed the last splat." in text
 
 
 def test_a_method_that_has_not_begun_does_not_empty_the_table():

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from neuspring.artifacts import Artifact, array
+from neuspring.data.capture import Capture
+from neuspring.errors import InputError
+from neuspring.records import StageRecord
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,3 +63,18 @@ class ShapePrior(Artifact):
     faces: np.ndarray = array("F,3", np.int32, "1", "outward")
     backend: str
     facts: dict[str, float] = field(default_factory=dict)
+
+
+def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:
+    """Masks by camera, from records in the capture's order. Raises InputError for too few and for masks of another size."""
+    if len(records) != len(capture.cameras):
+        raise InputError("--masks", f"one record per camera is required: {list(capture.cameras)}", len(records))
+    loaded = {}
+    for (name, camera), path in zip(capture.cameras.items(), records, strict=True):
+        masks = Masks.load(StageRecord.load(path).file("masks", path))
+        wanted = (capture.frame_count, camera.height, camera.width)
+        if masks.labels.shape != wanted:
+            remedy = f"Delete {path} and run again."
+            raise InputError(path, f"masks must have the frames and size of camera {name}: {wanted}", masks.labels.shape, remedy)
+        loaded[name] = masks
+    return loaded

@@ -81,8 +81,16 @@ def densify(
         children["means"] = children["means"] + torch.einsum("nij,nj->ni", rotations(children["quaternions"]), offsets)
         children["log_scales"] = children["log_scales"] - torch.log(size.new_tensor(SHRINK))
         added = {name: torch.cat([added[name], children[name]]) for name in added}
-    faint = torch.sigmoid(splats["opacity_logits"]) < settings.prune_opacity
-    gone = split | faint
+    gone = split | _superfluous(splats, settings, extent, after_reset)
     if after_reset:
-        gone |= (statistics.radius > settings.prune_radius / REFERENCE_WIDTH) | (size > settings.prune_size * extent)
-    return ~gone, added
+        gone |= statistics.radius > settings.prune_radius / REFERENCE_WIDTH
+    stay = ~_superfluous(added, settings, extent, after_reset)
+    return ~gone, {name: tensor[stay] for name, tensor in added.items()}
+
+
+def _superfluous(splats: Mapping[str, torch.Tensor], settings: Appearance, extent: float, after_reset: bool) -> torch.Tensor:
+    """Faint splats [N], after a reset also huge ones."""
+    faint = torch.sigmoid(splats["opacity_logits"]) < settings.prune_opacity
+    if not after_reset:
+        return faint
+    return faint | (torch.exp(splats["log_scales"]).amax(1) > settings.prune_size * extent)

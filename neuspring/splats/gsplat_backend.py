@@ -1,10 +1,12 @@
-"""Drawing with gsplat (Apache-2.0), on CUDA. Its clamp of opacity is 0.99 since version 1.5, ours 0.999 (`Limits.alpha_max`)."""
+"""Drawing with gsplat (Apache-2.0), on CUDA. Its thresholds of coverage are its own and cannot be set: since version 1.5 no splat
+covers more than 0.99, ours 0.999 (`Limits.alpha_max`)."""
 
 from __future__ import annotations
 
 import torch
 
-from neuspring.splats.view import Limits, View
+from neuspring.errors import InputError
+from neuspring.splats.view import LIMITS, Limits, View
 
 
 def draw(
@@ -18,8 +20,15 @@ def draw(
     background: tuple[float, float, float],
     limits: Limits,
 ) -> tuple[torch.Tensor, ...]:
-    """rgb [H, W, 3], alpha [H, W], depth [H, W], index [M], means [M, 2] px and radii [M] px. Arguments as `rasterise`."""
+    """rgb [H, W, 3], alpha [H, W], depth [H, W], index [M], means [1, N, 2] px and radii [M] px. Arguments as `rasterise`.
+
+    Raises InputError for thresholds other than the defaults, which gsplat would not keep.
+    """
     from gsplat import rasterization
+
+    own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
+    if own != (LIMITS.alpha_min, LIMITS.alpha_max, LIMITS.transmittance_min):
+        raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
 
     drawn, alpha, facts = rasterization(
         means,

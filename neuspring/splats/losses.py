@@ -21,7 +21,7 @@ from neuspring.splats.rasterise import Rendered
 from neuspring.splats.view import View
 
 WINDOW = 12
-"""Pixels around the object's mask in which SSIM is taken: its window is 11 wide, and beyond it both pictures are black."""
+"""Pixels around the object's mask in which SSIM is taken, whose window is 11 wide. What strays beyond costs l1 and mask alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,10 @@ class Shot:
     @classmethod
     def of(
         cls, name: str, view: View, colour: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
-    ) -> Shot:
+    ) -> Shot | None:
         """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands grow by a square of `margin` pixels.
 
-        Raises InputError for sizes that differ from the view's and for an empty mask.
+        None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
         """
         size = (view.height, view.width)
         for what, array in {"image": colour, "mask": mask, "mask of hands": hands, "depth": depth}.items():
@@ -57,8 +57,7 @@ class Shot:
         known = cv2.dilate(hands.astype(np.uint8), square) == 0
         seen = mask & known
         if not seen.any():
-            rule = "the object must be seen in frame 0 by every camera that trains its appearance"
-            raise InputError(f"camera {name}, mask of frame 0", rule, "an empty mask", "Look at its masks.png.")
+            return None
         rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
         box = (
             max(int(rows[0]) - WINDOW, 0),
@@ -72,6 +71,12 @@ class Shot:
         arrays = (on_black, seen.astype(np.float32), known.astype(np.float32), measured)
         colour_, mask_, known_, depth_ = (torch.tensor(a, device=device) for a in arrays)
         return cls(name, view, colour_, mask_, known_, depth_, box)
+
+    @property
+    def pixel_width(self) -> float:
+        """Width of a pixel at the object, m; NaN where no depth was measured on it."""
+        measured = self.depth[self.depth > 0]
+        return float(measured.median() / self.view.intrinsics[0, 0]) if len(measured) else float("nan")
 
 
 def loss(drawn: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:

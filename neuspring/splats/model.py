@@ -55,6 +55,8 @@ class Splats(Artifact):
         names = table.dtype.names or ()
         rest = sum(name.startswith("f_rest_") for name in names)
         scales = sum(name.startswith("scale_") for name in names)
+        if rest % 3:
+            raise InputError(path, "f_rest_...: as many coefficients are required for each of three channels", rest)
         wanted = _columns(scales, 1 + rest // 3)
         missing = [name for name in wanted if name not in names and name not in ("nx", "ny", "nz")]
         if missing:
@@ -97,22 +99,27 @@ def _read_ply(path: Path) -> np.ndarray:
         raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
     head, found, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").splitlines()
-    if not found or lines[0] != "ply" or "format binary_little_endian 1.0" not in lines:
+    if not found or lines[:1] != ["ply"] or "format binary_little_endian 1.0" not in lines:
         raise InputError(path, rule, repr(content[:40]))
     words = [line.split() for line in lines]
     elements = [word for word in words if word[:1] == ["element"]]
     properties = [word for word in words if word[:1] == ["property"]]
-    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][2].isdigit():
+    if len(elements) != 1 or elements[0][1:2] != ["vertex"] or not elements[0][2:] or not elements[0][2].isdigit():
         raise InputError(path, f"{rule}, with vertices alone", elements)
     unknown = [word for word in properties if len(word) != 3 or word[1] not in PLY_TYPES]
     if unknown:
         raise InputError(path, f"{rule}, with properties of type {', '.join(PLY_TYPES)}", " ".join(unknown[0]))
+    named = [word[2] for word in properties]
+    if not named or len(set(named)) < len(named):
+        raise InputError(path, f"{rule}, with properties of different names", " ".join(named) or "none")
     layout = np.dtype([(word[2], PLY_TYPES[word[1]]) for word in properties])
     count = int(elements[0][2])
     available = len(content) - len(head) - len(found)
     if available < count * layout.itemsize:
         held = f"{available // max(layout.itemsize, 1)} whole ones: the file is truncated"
         raise InputError(path, f"the header promises {count} splats", held, "Delete it and re-run its step.")
+    if not count:
+        raise InputError(path, f"{rule}, at least one", "0 vertices")
     return np.frombuffer(content, layout, count, offset=len(head) + len(found))
 
 

@@ -37,7 +37,8 @@ class Rendered:
     index: torch.Tensor
     """[M] int64: the splats that touch the picture."""
     means: torch.Tensor
-    """[M, 2] px, where they lie; keeps its gradient after a backward pass, which tells where splats are too coarse."""
+    """[M, 2] px, where they lie (of gsplat [1, N, 2], all of them); keeps its gradient after a backward pass, which tells where
+    splats are too coarse."""
     radii: torch.Tensor
     """[M] px, three standard deviations."""
     backend: Backend

@@ -76,7 +76,10 @@ def extent_of(shots: Sequence[Shot]) -> float:
 
 
 def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int, backend: Backend) -> Trained:
-    """Fit splats to the shots. Deterministic on the CPU for a seed. Raises NumericalFailure if the loss is not finite."""
+    """Fit splats to the shots. Deterministic on the CPU for a seed.
+
+    Raises NumericalFailure if splats become infinite or all of them are removed.
+    """
     device = str(shots[0].view.intrinsics.device)
     generator = torch.Generator().manual_seed(seed)
     optimiser = _Optimiser(Gaussians.of(start, device), settings, extent_of(shots))
@@ -88,12 +91,11 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
         drawn = optimiser.gaussians.draw(shot.view, degree=(step - 1) // settings.degree_every, backend=backend)
         value = loss(drawn, shot, settings)
         number = float(value.detach())
-        if not math.isfinite(number):
-            raise NumericalFailure(f"appearance: the loss of step {step} is {number}")
         value.backward()  # type: ignore[no-untyped-call]
         if step < settings.densify_until:
             statistics.add(drawn, shot.view.width, shot.view.height)
         optimiser.step()
+        optimiser.require_usable(step)
         if step % RECORD_EVERY == 0 or step == settings.iterations:
             for name, entry in {"step": step, "loss": number, "splats": len(optimiser.gaussians.means)}.items():
                 history[name].append(float(entry))
@@ -109,6 +111,7 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
                 generator,
             )
             optimiser.replace(kept, added)
+            optimiser.require_usable(step)
             statistics = Statistics.empty(optimiser.gaussians.means)
         if step % settings.reset_every == 0 and step < last:
             optimiser.reset_opacities()
@@ -161,6 +164,15 @@ class _Optimiser:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
+    def require_usable(self, step: int) -> None:
+        """Raise NumericalFailure for splats that cannot be drawn."""
+        if not len(self._values["means"]):
+            raise NumericalFailure(f"appearance: step {step} removed the last splat")
+        bad = [name for name, tensor in self._values.items() if not torch.isfinite(tensor.detach()).all()]
+        # Infinite scales have finite logarithms.
+        if bad or not torch.isfinite(torch.exp(self._values["log_scales"].detach())).all():
+            raise NumericalFailure(f"appearance: after step {step} splats are not finite ({', '.join(bad) or 'scales'})")
+
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep some splats with their moments, append others without."""
         shades = added["harmonics"]
@@ -183,23 +195,9 @@ class _Optimiser:
             self._adam.state[tensor][moment].zero_()
 
 
-@torch.no_grad()
 def restricted(splats: Splats, opacity: float) -> Splats:
     """Splats above an opacity. Raises NumericalFailure where none is."""
     kept = 1 / (1 + np.exp(-splats.opacity_logits)) > opacity
     if not kept.any():
         raise NumericalFailure(f"appearance: no splat has an opacity above {opacity}")
     return Splats(**{f.name: getattr(splats, f.name)[kept] for f in dataclasses.fields(Splats)})
-
-
-@torch.no_grad()
-def in_sight(gaussians: Gaussians, shot: Shot, backend: Backend, margin: float) -> torch.Tensor:
-    """Which splats [N] a view shows: in the picture, not behind hands, at most `margin`, m, behind the depth drawn there."""
-    drawn = gaussians.draw(shot.view, backend=backend)
-    view = shot.view
-    local = gaussians.means @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    flat = local @ view.intrinsics.T
-    column, row = (torch.floor(flat[:, k] / local[:, 2].clamp_min(1e-6)).long() for k in (0, 1))
-    inside = (local[:, 2] > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
-    column, row = column.clamp(0, view.width - 1), row.clamp(0, view.height - 1)
-    return inside & (shot.known[row, column] > 0) & (local[:, 2] <= drawn.depth[row, column] + margin)

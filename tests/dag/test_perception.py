@@ -71,13 +71,15 @@ def test_predictions_are_drawn_scored_and_filmed(finished):
     record = json.loads((run_folder / "run.json").read_text())
     assert record["images"]["lpips"].startswith("no AlexNet weights")
     assert record["images"]["masks"] == "given"
-    assert {"images.png", "video.mp4", "turntable.mp4"} == set(record["artifacts"]["images"])
-    assert all((run_folder / name).stat().st_size > 1000 for name in record["artifacts"]["images"])
+    pictures = [run_folder / name for name in record["artifacts"]["images"]]
+    assert [path.name for path in pictures] == ["appearance.png", "images.png", "video.mp4", "turntable.mp4"]
+    assert all(path.stat().st_size > 1000 for path in pictures)
+    assert {"appearance", "render"} <= set(record["timings"])
     tracked = {path.name for path in (finished / "results" / "mlartifacts").rglob("*") if path.is_file()}
-    assert {"images.png", "video.mp4", "turntable.mp4", "image_scores.png"} <= tracked
+    assert {"appearance.png", "images.png", "video.mp4", "turntable.mp4", "image_scores.png"} <= tracked
     summary = (finished / "results" / "tables" / "summary.md").read_text()
     assert "Recon. PSNR" in summary
-    assert "LPIPS: not computed: no AlexNet weights" in summary
+    assert "LPIPS not computed: no AlexNet weights" in summary
     folder = finished / "results" / PACKAGE / "appearance" / "0"
     assert {path.name for path in folder.iterdir()} == {"appearance.json", "appearance.png", "history.parquet", "splats.ply"}
 
@@ -90,6 +92,8 @@ def test_all_methods_share_one_appearance(finished):
     planned = jobs(run(finished, SYNTHETIC | {"images": {"views": "all", "appearance": {"iterations": 40}}}, "--dry-run"))
     assert "appearance" not in planned
     assert (planned["render"], planned["score"]) == (1, 1)
+    quirk = {"released_quirks": {"any_alpha": True}, "appearance": {"iterations": 40}}
+    assert "appearance" not in jobs(run(finished, SYNTHETIC | {"images": quirk}, "--dry-run"))
     planned = jobs(run(finished, SYNTHETIC | {"results": "other", "images": {"enabled": False}}, "--dry-run"))
     assert "render" not in planned
 

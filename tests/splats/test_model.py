@@ -64,6 +64,11 @@ def test_a_truncated_file_says_how_much_is_there(tmp_path):
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0", "no y, z, f_dc_0"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "properties of type"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nelement face 2\nend_header\n", "vertices alone"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex\nproperty float x\nend_header\n", "vertices alone"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "0 vertices"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float x\nend_header\n", "different"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float f_rest_0\nend_header\n\0\0\0\0", "f_rest_"),
+        (b"end_header\n", "must be a binary"),
     ],
 )
 def test_other_files_are_named(tmp_path, content, message):

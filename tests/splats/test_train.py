@@ -15,7 +15,7 @@ from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.train import extent_of, first_splats, in_sight, restricted, train
+from neuspring.splats.train import extent_of, first_splats, restricted, train
 from neuspring.splats.view import View
 from tests.perception.filmed import EYES, intrinsics
 
@@ -123,6 +123,11 @@ def test_densify_clones_small_splits_large_and_removes_faint_and_huge():
     assert kept.tolist() == [True, False, False, False, False, True]
     kept, added = densify(named(splats), statistics, Appearance(most_splats=6), 1.0, False, generator)
     assert len(added["means"]) == 0
+    # New splats are judged as old ones are: no clone of a faint one, no huge child.
+    statistics.pull[2] = statistics.pull[4] = 1.0
+    _, added = densify(named(splats), statistics, Appearance(), 1.0, True, generator)
+    assert torch.sigmoid(added["opacity_logits"]).min() > 0.005
+    assert torch.exp(added["log_scales"]).max() < 0.1
 
 
 def test_hands_hide_and_are_not_compared():
@@ -139,8 +144,6 @@ def test_hands_hide_and_are_not_compared():
         settings = Appearance()
         assert float(loss(patched, shot, settings)) == float(loss(right, shot, settings))
         assert float(loss(wrong, shot, settings)) > float(loss(right, shot, settings)) + 0.001
-    seen = in_sight(Gaussians.of(truth), shot, "warp", 0.01)
-    assert 0.05 < float(seen.float().mean()) < 0.5
 
 
 def test_the_margin_of_hands_grows_by_pixels():
@@ -156,18 +159,34 @@ def test_the_margin_of_hands_grows_by_pixels():
     [
         ("colour", r"camera 0, image of frame 0.*\(64, 96\).*\(10, 96\)"),
         ("mask", r"camera 0, mask of frame 0.*\(64, 96\).*\(10, 96\)"),
-        ("empty", "camera 0, mask of frame 0.*empty mask"),
     ],
 )
 def test_bad_views_are_named(what, message):
     size = (SIZE[1], SIZE[0])
     arrays = {"colour": np.zeros((*size, 3), np.uint8), "mask": np.ones(size, bool)}
-    if what == "empty":
-        arrays["mask"][:] = False
-    else:
-        arrays[what] = arrays[what][:10]
+    arrays[what] = arrays[what][:10]
     with pytest.raises(InputError, match=message):
         Shot.of("0", view_from(EYES[0]), arrays["colour"], arrays["mask"], np.zeros(size, bool), np.ones(size), 4.0)
+
+
+def test_a_view_without_the_object_or_only_beside_a_hand_is_none():
+    size = (SIZE[1], SIZE[0])
+    mask, hands = np.zeros(size, bool), np.zeros(size, bool)
+    arguments = (np.zeros((*size, 3), np.uint8), mask, hands, np.ones(size), 8.0)
+    assert Shot.of("0", view_from(EYES[0]), *arguments) is None
+    mask[30, 40] = hands[30, 42] = True
+    assert Shot.of("0", view_from(EYES[0]), *arguments) is None
+
+
+def test_training_that_breaks_is_a_numerical_failure():
+    truth = known_splats(40)
+    shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    start = first_splats(truth.means, np.full((40, 3), 0.5), FAST, 0.002)
+    with pytest.raises(NumericalFailure, match="splats are not finite"):
+        train(start, shots, dataclasses.replace(FAST, scale_rate=1e4), 0, "warp")
+    faint = dataclasses.replace(FAST, densify_from=5, densify_every=10, prune_opacity=0.95)
+    with pytest.raises(NumericalFailure, match="removed the last splat"):
+        train(start, shots, faint, 0, "warp")
 
 
 def test_the_first_splats_follow_the_points():

@@ -13,6 +13,7 @@ from neuspring import benchmark as benchmarks
 from neuspring import config as settings
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
+from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
 # Jobs call `python -m neuspring`: with the interpreter that runs Snakemake, unless conda provides one. A prefix replaces
@@ -243,22 +244,40 @@ def image_settings(*names):
 
 def appearance_settings(wildcards):
     """What trains splats; of processed data, which perception has not lifted, also how masks are lifted."""
-    text = image_settings("backend", "opacity", "appearance", "released_quirks")
-    if BENCHMARK.scenarios[wildcards.scenario].source in settings.FILMED:
-        return text
-    return json.dumps(
-        json.loads(text) | json.loads(perception_settings("lift")), sort_keys=True
-    )
-
-
-def lifted_record(wildcards):
+    chosen = json.loads(image_settings("backend", "appearance"))
+    quirks = settings.plain(CONFIG)["images"]["released_quirks"]
+    chosen["images"]["released_quirks"] = {"corner_pixels": quirks["corner_pixels"]}
     if BENCHMARK.scenarios[wildcards.scenario].source not in settings.FILMED:
+        chosen |= json.loads(perception_settings("lift"))
+    return json.dumps(chosen, sort_keys=True)
+
+
+def first_points(wildcards):
+    """Where the first splats lie: perception's record, or the observations of processed data."""
+    folder = f"{RESULTS}/{wildcards.scenario}"
+    if BENCHMARK.scenarios[wildcards.scenario].source in settings.FILMED:
+        return f"{folder}/perception/lifted.json"
+    return f"{folder}/observations.npz"
+
+
+def first_points_option(wildcards):
+    filmed = BENCHMARK.scenarios[wildcards.scenario].source in settings.FILMED
+    return "--lifted" if filmed else "--observations"
+
+
+def lpips_weights():
+    """Whether LPIPS can be computed, so that weights that come later are used."""
+    found = configured(CONFIG.images.lpips)
+    return "absent" if isinstance(found, str) else "found"
+
+
+def appearance_records(wildcards):
+    """The record of the splats, for scenarios with images."""
+    if not BENCHMARK.has_images(wildcards.scenario):
         return []
-    return [f"{RESULTS}/{wildcards.scenario}/perception/lifted.json"]
-
-
-def lifted_option(wildcards, input):
-    return ["--lifted", str(input.lifted)] if input.get("lifted") else []
+    return [
+        f"{RESULTS}/{wildcards.scenario}/appearance/{wildcards.seed}/appearance.json"
+    ]
 
 
 def render_records(wildcards):
@@ -270,8 +289,10 @@ def render_records(wildcards):
     ]
 
 
-def render_option(wildcards, input):
-    return ["--render", str(input.render)] if input.get("render") else []
+def picture_options(wildcards, input):
+    if not input.get("render"):
+        return []
+    return ["--appearance", str(input.appearance), "--render", str(input.render)]
 
 
 def track_gpu():

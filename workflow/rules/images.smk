@@ -3,8 +3,7 @@ rule appearance:
     input:
         capture=capture_file,
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
-        observations=rules.observe.output,
-        lifted=lifted_record,
+        points=first_points,
     output:
         f"{RESULTS}/{{scenario}}/appearance/{{seed}}/appearance.json",
     log:
@@ -22,17 +21,17 @@ rule appearance:
         runtime=240,
     params:
         settings=appearance_settings,
-        lifted=lifted_option,
+        points=first_points_option,
         images=image_stamps,
         code=code_digest(
             "neuspring.splats.train",
             "neuspring.perception.lift",
-            "neuspring.figures_images",
+            "neuspring.pictures",
             stage="appearance.learn",
         ),
     shell:
-        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
-        " {params.lifted:q} --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
+        " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
         " --output {output:q} 2>&1 | tee -a {log:q}"
 
 
@@ -68,12 +67,13 @@ rule render:
             "lpips",
             "released_quirks",
         ),
+        lpips=lpips_weights(),
         images=image_stamps,
         code=code_digest(
-            "neuspring.splats.skinning",
-            "neuspring.splats.model",
-            "neuspring.image_metrics",
-            "neuspring.figures_images",
+            "neuspring.pictures",
+            "neuspring.splats.train",
+            "neuspring.lpips",
+            "neuspring.video",
             stage="appearance.render",
         ),
     shell:

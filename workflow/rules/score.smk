@@ -4,6 +4,7 @@ rule score:
         search=search_record,
         fit=fit_records,
         rollout=rules.rollout.output,
+        appearance=appearance_records,
         render=render_records,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/run.json",
@@ -20,10 +21,10 @@ rule score:
         runtime=30,
     params:
         fit=fit_option,
-        render=render_option,
+        pictures=picture_options,
         variant=variant,
         code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
     shell:
         "python -m neuspring score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
-        " --rollout {input.rollout:q} {params.render:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
+        " --rollout {input.rollout:q} {params.pictures:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
         " --output {output:q} 2>&1 | tee -a {log:q}"
