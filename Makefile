@@ -39,6 +39,7 @@ format: $(INSTALLED)
 bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench_frame
 	$(BIN)/python -m tests.benchmarks.bench_adjoint
+	$(BIN)/python -m tests.benchmarks.bench_splats
 
 clean:
 	rm -rf .venv .snakemake
