@@ -19,7 +19,8 @@ from neuspring.figures_twin import CONTROLLER, stiffness_figure, topology_figure
 from neuspring.figures_views import View, limits, point_size, readable, sample, save, side_view, widest_axis
 from neuspring.metrics import chamfer_per_frame, track_error_per_frame
 
-NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png", "image_scores.png")
+NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
+IMAGE_SCORES = "image_scores.png"
 IMAGE_LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "iou": "IoU"}
 MM = 1e3
 PANEL, HEIGHTS = 3.1, (1.1, 3.1)
@@ -52,7 +53,7 @@ def run_figures(
     title = f"{observations.scenario.name}, {method}"
     made = []
     # A picture of an earlier result must not stay beside this one's.
-    for name in NAMES:
+    for name in (*NAMES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
     if trajectory is not None and len(trajectory.positions):
         made.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
@@ -94,7 +95,7 @@ def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, f
         axis.set(ylabel=IMAGE_LABELS[metric], xlim=(0, None))
     axes[0, 0].set_title(f"{scenario.name}, {method} (grey: future)")
     axes[-1, 0].set_xlabel("time [s]")
-    return save(figure, folder / "image_scores.png")
+    return save(figure, folder / IMAGE_SCORES)
 
 
 def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
