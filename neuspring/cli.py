@@ -185,12 +185,13 @@ def _score(a: argparse.Namespace) -> int:
 
 
 def _tables(a: argparse.Namespace) -> int:
-    from neuspring import tables
+    from neuspring import gallery, tables
 
     collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds)
     transfers = tables.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
     print(tables.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
+    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, a.seeds[0], collected.scores, a.output)}")
     return 0
 
 

@@ -127,7 +127,7 @@ LEVELS = [
         "splats",
         "lpips",
     },
-    {"benchmark", "perception", "search", "fit", "carry", "figures", "tables"},
+    {"benchmark", "perception", "search", "fit", "carry", "figures", "tables", "gallery"},
     {"perceive", "tables_perception", "figures_images"},
     {"pictures"},
     {"stages", "appearance"},

@@ -1,7 +1,9 @@
 """Raw RGBD through the real workflow: a synthetic package at the smallest size, and a folder of the user's own."""
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -80,6 +82,12 @@ def test_predictions_are_drawn_scored_and_filmed(finished):
     summary = (finished / "results" / "tables" / "summary.md").read_text()
     assert "Recon. PSNR" in summary
     assert "LPIPS not computed: no AlexNet weights" in summary
+    tables = finished / "results" / "tables"
+    page = (tables / "pictures.html").read_text()
+    links = re.findall(r'src="([^"]+)"', page)
+    assert {Path(link).name for link in links} == {"video.mp4", "turntable.mp4", "appearance.png"}
+    assert all((tables / link).is_file() for link in links)
+    assert "search_only" in page and "dB" in page
     folder = finished / "results" / PACKAGE / "appearance" / "0"
     assert {path.name for path in folder.iterdir()} == {"appearance.json", "appearance.png", "history.parquet", "splats.ply"}
 

@@ -479,6 +479,9 @@ def report_end(failed):
     print(
         f"Scores, trajectories, plots: {RESULTS}/<scenario>/<method>/<seed>/ (run.json names the twin), tables: {RESULTS}/{CONFIG.tables}/"
     )
+    print(
+        f"Open in a browser: {RESULTS}/{CONFIG.tables}/pictures.html (videos of every method, beside each other)"
+    )
     tell_tracking()
 
 

@@ -17,6 +17,6 @@ rule tables:
         runtime=10,
     params:
         arguments=table_arguments(),
-        code=code_digest("neuspring.tables"),
+        code=code_digest("neuspring.tables", "neuspring.gallery"),
     shell:
         "python -m neuspring tables {params.arguments:q} > {log:q} 2>&1"
