@@ -77,7 +77,7 @@ def _figure(run: Path, scenario: str, method: str, seed: int, scores: pd.DataFra
 
 
 def _video(path: Path, folder: Path, kind: str) -> str:
-    return f'<video class="{kind}" src="{_link(path, folder)}" controls loop muted playsinline preload="metadata"></video>'
+    return f'<video class="{kind}" src="{_link(path, folder)}" autoplay controls loop muted playsinline></video>'
 
 
 def _image(path: Path, folder: Path) -> str:

@@ -46,6 +46,7 @@ numbers in lists over as text, which is refused, so `seeds` and nested keys are 
 | `clusters.yaml`, alone or after `mocap.yaml` | 1 to 10 regions |
 | `phystwin.yaml` | the 22 released cases |
 | ..., `one_seed.yaml` | seed 0 of any of them, no transfers |
+| `three_seeds.yaml` | the demo with three seeds |
 
 Everything is checked before the first job: unknown keys, wrong types (YAML reads `5e-5` as text: write `5.0e-5`), unknown
 scenarios, methods and searches, missing data, a results folder that cannot be written. Values are never cast.
