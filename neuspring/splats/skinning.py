@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -52,22 +53,24 @@ class Skin:
         cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
         wide, deep, high = cells.tolist()
         self._grid = wp.HashGrid(wide, deep, high, device=device)
-        start = self._vectors(nodes)
-        self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
+        with _on_torch_stream(device):
+            start = self._vectors(nodes)
+            self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
 
     def step(
         self, before: np.ndarray, after: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Means [S, 3] m and quaternions [S, 4] (w first) after the nodes moved from `before` to `after` [N, 3], m."""
-        old, new = self._vectors(before), self._vectors(after)
-        rotations = self._rotations(old, new)
-        start = wp.from_torch(means.detach().float().contiguous(), dtype=wp.vec3)
-        if self._bound is None or not self._frozen:
-            self._bound = self._nearest(old, start, own=False, wanted=self._count)
         moved, turned = torch.empty_like(means), torch.empty_like(quaternions)
-        orientation = wp.from_torch(quaternions.detach().float().contiguous(), dtype=wp.vec4)
-        outputs = [wp.from_torch(moved, dtype=wp.vec3), wp.from_torch(turned, dtype=wp.vec4)]
-        self._launch(move_splats, len(means), [old, new, rotations, self._bound, start, orientation, *outputs])
+        with _on_torch_stream(self._device):
+            old, new = self._vectors(before), self._vectors(after)
+            rotations = self._rotations(old, new)
+            start = wp.from_torch(means.detach().float().contiguous(), dtype=wp.vec3)
+            if self._bound is None or not self._frozen:
+                self._bound = self._nearest(old, start, own=False, wanted=self._count)
+            orientation = wp.from_torch(quaternions.detach().float().contiguous(), dtype=wp.vec4)
+            outputs = [wp.from_torch(moved, dtype=wp.vec3), wp.from_torch(turned, dtype=wp.vec4)]
+            self._launch(move_splats, len(means), [old, new, rotations, self._bound, start, orientation, *outputs])
         return moved, turned
 
     def carry(
@@ -106,6 +109,12 @@ class Skin:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self._device)
 
     def _launch(self, kernel: Any, size: int, arguments: list[Any]) -> None:
-        on_gpu = self._device != "cpu"
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self._device)) if on_gpu else None
-        wp.launch(kernel, size, arguments, device=self._device, stream=stream)
+        wp.launch(kernel, size, arguments, device=self._device)
+
+
+def _on_torch_stream(device: str) -> AbstractContextManager[Any]:
+    """Torch orders its own work on its current stream, so copies, grid and kernels must run there too."""
+    if device == "cpu":
+        return nullcontext()
+    stream: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    return stream
