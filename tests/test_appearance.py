@@ -25,7 +25,7 @@ from neuspring.splats.view import View
 from tests.perception.filmed import FLIP, FRAMES, SIZE, STEP, film
 from tests.perception.test_perceive import SETTINGS, perceived
 
-IMAGES = Images(appearance=Appearance(iterations=150, degree=0, spacing=1.5, colour_rate=0.01))
+IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
 
 
 def settings(**changes: object) -> Config:
