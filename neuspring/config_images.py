@@ -39,7 +39,7 @@ class Appearance:
     depth: NonNegative = 0.001
     """Weight of the mean absolute difference of depth, per m, where it was measured on the object."""
     hand_margin: NonNegative = 8.0
-    """Pixels by which the hands' masks grow; what lies in them is not compared."""
+    """Side of the square, pixels, by which the hands' masks are dilated; what lies in them is not compared."""
     position_rate: Positive = 1.6e-4
     """Learning rate of means, per extent: 1.1 times the largest distance of a camera from their middle."""
     position_rate_end: Positive = 1.6e-6

@@ -56,7 +56,7 @@ scenarios, methods and searches, missing data, a results folder that cannot be w
 - `searches.yaml`: one row per search: into how many regions the topology is divided (`clusters`), its own `search` settings.
 - Threads, cores and executors are not configuration: they live on the command line and in `workflow/profiles/`.
 
-This page is written from `neuspring/config.py` by `python -m tests.config_readme`; a test keeps them equal.
+This page is written from `neuspring/config*.py` by `python -m tests.config_readme`; a test keeps them equal.
 """
 KEYS = {
     "(top level)": config.Config,

@@ -45,7 +45,7 @@ class Shot:
     def of(
         cls, name: str, view: View, colour: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
     ) -> Shot | None:
-        """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands grow by a square of `margin` pixels.
+        """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands are dilated by a square of `margin` pixels.
 
         None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
         """

@@ -108,7 +108,7 @@ def _gsplat_fault(device: str) -> str:
     if not device.startswith("cuda"):
         return f"it needs CUDA, the device is {device}"
     if importlib.util.find_spec("gsplat") is None:
-        return 'not installed (pip install -e ".[gpu]")'
+        return 'not installed (pip install -c workflow/envs/constraints.txt -e ".[gpu]")'
     try:
         size = 16
         intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], device=device)
