@@ -27,8 +27,7 @@ class Video:
     """Writes pictures one at a time: `with Video(path, rate) as video: video.add(picture)`.
 
     The file appears at `path` when the block ends, and not at all if it fails. `quality` is the constant rate factor of x264: 0
-    (best) to 51, 6 more halve the file. The same pictures give the same bytes. Raises InputError for a bad rate or quality, and at
-    the end for no pictures at all.
+    (best) to 51, 6 more halve the file. Raises InputError for a bad rate or quality, and at the end for no pictures at all.
     """
 
     def __init__(self, path: Path, rate: float, quality: int = 20) -> None:
@@ -85,6 +84,6 @@ class Video:
         stream.pix_fmt = "yuv420p"
         stream.colorspace = stream.color_primaries = stream.color_trc = BT709
         stream.color_range = LIMITED_RANGE
-        # Several threads would give other bytes.
+        # A job has one thread.
         stream.codec_context.thread_count = 1
         self._stream, self._shape = stream, shape
