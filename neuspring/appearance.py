@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -141,7 +142,8 @@ def render(
     _require_length(capture, scenario.frame_count, observations_path)
     scored = Scored.of(capture, masks_of_cameras(capture, masks), images, device)
     weights = configured(images.lpips)
-    metric = weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device)
+    # Their checksums have just been taken.
+    metric = weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
     rollout, learned = before["rollout"], before["appearance"]
     if learned.status == "failed":
         return failed(learned.reason)
@@ -271,7 +273,7 @@ class _Seen:
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:
         """Points [R, 3] m and RGB [R, 3]: what was seen, and where nothing was the prior, in the colours of what is nearest."""
-        distance, nearest = cKDTree(self.cloud).query(self.prior)
+        distance, nearest = self._to_cloud
         new = distance > self.reach
         return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colours, self.colours[nearest[new]]])
 
@@ -280,7 +282,13 @@ class _Seen:
         """Part of the surface that no camera saw; None where no prior says what the whole is."""
         if not (self.uniform and len(self.prior)):
             return None
-        return float((cKDTree(self.cloud).query(self.prior)[0] > self.reach).mean())
+        return float((self._to_cloud[0] > self.reach).mean())
+
+    @cached_property
+    def _to_cloud(self) -> tuple[np.ndarray, np.ndarray]:
+        """Distance, m, and index of the nearest seen point of each point of the prior [Q]."""
+        distance, nearest = cKDTree(self.cloud).query(self.prior)
+        return distance, nearest
 
 
 def _seen_points(

@@ -97,7 +97,7 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
         optimiser.step()
         optimiser.require_usable(step)
         if step % RECORD_EVERY == 0 or step == settings.iterations:
-            for name, entry in {"step": step, "loss": number, "splats": len(optimiser.gaussians.means)}.items():
+            for name, entry in {"step": step, "loss": number, "splats": len(optimiser)}.items():
                 history[name].append(float(entry))
         # New splats of the last step would not be trained.
         last = min(settings.densify_until, settings.iterations)
@@ -115,7 +115,7 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
             statistics = Statistics.empty(optimiser.gaussians.means)
         if step % settings.reset_every == 0 and step < last:
             optimiser.reset_opacities()
-        progress.update(step, f"loss {number:.4f}, {len(optimiser.gaussians.means)} splats")
+        progress.update(step, f"loss {number:.4f}, {len(optimiser)} splats")
     return Trained(optimiser.gaussians.stored(), history, len(start.means))
 
 
@@ -145,6 +145,10 @@ class _Optimiser:
         self._values = {name: tensor.clone().requires_grad_() for name, tensor in values.items()}
         groups = [{"params": [tensor], "lr": rates[name], "name": name} for name, tensor in self._values.items()]
         self._adam = torch.optim.Adam(groups, eps=ADAM_EPSILON)
+
+    def __len__(self) -> int:
+        """Splats now."""
+        return len(self._values["means"])
 
     @property
     def gaussians(self) -> Gaussians:
