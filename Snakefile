@@ -17,12 +17,28 @@ include: "workflow/rules/tables.smk"
 include: "workflow/rules/tracking.smk"
 
 
+# On a cluster these run where Snakemake runs: seconds of work each.
+localrules:
+    all,
+    track_init,
+    tables,
+    study,
+    report,
+    perception_table,
+
+
 rule all:
     default_target: True
     input:
         tables=TABLES,
+        studies=[study_table(name) for name in CONFIG.studies],
+        report=REPORT,
         perception=perception_tables(),
         tracked=tracked_runs(),
+
+
+onstart:
+    tell_plan()
 
 
 onsuccess:

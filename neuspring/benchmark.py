@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import fnmatch
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +29,9 @@ from neuspring.config import (
 from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
 from neuspring.lpips_weights import configured
+from neuspring.studies import Study, read_studies
 
-RESERVED = ("tables", "logs", "benchmarks", "mlartifacts", "published", "appearance", "perception", "capture")
+RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
 
 
@@ -65,6 +68,32 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     return rows
 
 
+def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
+    """The configuration with what `only` leaves of its scenarios, methods and seeds. Raises InputError for terms without match."""
+    where = "configuration, only"
+    rule = "terms scenario=..., category=..., method=..., seed=..., each with names or patterns separated by commas"
+    kept: dict[str, tuple[Any, ...]] = {"scenarios": config.scenarios, "methods": config.methods, "seeds": config.seeds}
+    for term in shlex.split(config.only):
+        key, _, text = term.partition("=")
+        names = {"scenario": "scenarios", "category": "scenarios", "method": "methods", "seed": "seeds"}
+        if key not in names or not text:
+            raise InputError(where, rule, term)
+        for pattern in text.split(","):
+            known = [_word(entry, key, scenarios) for entry in kept[names[key]]]
+            if not fnmatch.filter(known, pattern):
+                raise InputError(where, f"{key} {pattern!r} matches none of the configuration's", ", ".join(dict.fromkeys(known)))
+        kept[names[key]] = tuple(
+            entry
+            for entry in kept[names[key]]
+            if any(fnmatch.fnmatchcase(_word(entry, key, scenarios), pattern) for pattern in text.split(","))
+        )
+    return dataclasses.replace(config, scenarios=kept["scenarios"], methods=kept["methods"], seeds=kept["seeds"])
+
+
+def _word(entry: Any, key: str, scenarios: Mapping[str, ScenarioRow]) -> str:
+    return scenarios[entry].category if key == "category" else str(entry)
+
+
 def fit_of(config: Config, method: Method, name: str) -> Fit:
     """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
     return parse(Fit, _overlaid(config.fit, method.settings), f"method {name}, settings")
@@ -96,6 +125,8 @@ class Benchmark:
     """Chosen method -> the method in whose folder its fit lies."""
     transfers: dict[str, tuple[str, ...]]
     """Chosen scenario -> those that its twins are transferred to."""
+    studies: dict[str, Study]
+    """All rows of the study table; `config.studies` names those that are made without being asked for."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
@@ -107,6 +138,9 @@ class Benchmark:
         scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
         _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
         _require_known("methods", config.methods, methods, config.method_table)
+        studies = read_studies(root / config.study_table)
+        _require_known("studies", config.studies, studies, config.study_table)
+        config = chosen_part(config, scenarios)
         searches = read_searches(root / config.search_table)
         wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
         _require_known("methods' search", wanted, searches, config.search_table)
@@ -126,6 +160,7 @@ class Benchmark:
             {n: methods[n] for n in owners.values()},
             owners,
             transfers,
+            studies,
         )
         for name in [*chosen.scenarios, *chosen.methods]:
             if name in (*RESERVED, config.tables) or name.startswith("search-"):
@@ -145,6 +180,10 @@ class Benchmark:
         """The method that tables compare the others with."""
         wanted = self.config.compare_with
         return wanted if wanted in self.methods else self.config.methods[0]  # type: ignore[return-value]
+
+    def methods_of(self, study: str) -> tuple[str, ...]:
+        """The chosen methods that stand in a study's rows."""
+        return tuple(dict.fromkeys(name for name in self.studies[study].rows.values() if name in self.methods))
 
     def data_path(self, name: str) -> Path | None:
         """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuspring import __version__
+from neuspring import __version__, cli_tools
+from neuspring.cli_options import Adder, json_mapping, read_settings
 from neuspring.errors import InputError, NumericalFailure
 
 if TYPE_CHECKING:
@@ -37,33 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
-def _settings(text: str) -> Config:
-    """Settings from JSON text, or from YAML files separated by commas (later ones override)."""
-    from neuspring import config
-
-    if text.lstrip().startswith("{"):
-        return config.parse(config.Config, _json_mapping("--settings", text), "--settings")
-    values: dict[str, object] = {}
-    for name in text.split(","):
-        config.merge(values, config.read_yaml(Path(name)))
-    return config.parse(config.Config, values, f"--settings {text}")
-
-
-def _json_mapping(option: str, text: str) -> dict[str, object]:
-    try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(option, "must be JSON", str(error)) from error
-    if not isinstance(values, dict):
-        raise InputError(option, "must be a JSON object", type(values).__name__)
-    return values
-
-
 def _row(a: argparse.Namespace, settings: Config) -> ScenarioRow:
     from neuspring import benchmark, config
 
     if a.row:
-        return config.parse(config.ScenarioRow, _json_mapping("--row", a.row), "--row")
+        return config.parse(config.ScenarioRow, json_mapping("--row", a.row), "--row")
     rows = benchmark.read_scenarios(Path(settings.scenario_table))
     if a.scenario not in rows:
         raise InputError("--scenario", f"must be a row of {settings.scenario_table}", a.scenario)
@@ -73,43 +52,43 @@ def _row(a: argparse.Namespace, settings: Config) -> ScenarioRow:
 def _capture(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    settings = _settings(a.settings)
-    perceive.make_capture(_row(a, settings), settings, a.output)
+    chosen = read_settings(a.settings)
+    perceive.make_capture(_row(a, chosen), chosen, a.output)
     return 0
 
 
 def _segment(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    perceive.segment(a.capture.parent, a.camera, _settings(a.settings), a.device, a.output)
+    perceive.segment(a.capture.parent, a.camera, read_settings(a.settings), a.device, a.output)
     return 0
 
 
 def _track(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    perceive.track(a.capture.parent, a.camera, a.masks, _settings(a.settings), a.device, a.output)
+    perceive.track(a.capture.parent, a.camera, a.masks, read_settings(a.settings), a.device, a.output)
     return 0
 
 
 def _lift(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    perceive.lift(a.capture.parent, a.masks, a.tracks, _settings(a.settings), a.output)
+    perceive.lift(a.capture.parent, a.masks, a.tracks, read_settings(a.settings), a.output)
     return 0
 
 
 def _judge(a: argparse.Namespace) -> int:
     from neuspring import perceive
 
-    perceive.judge(a.capture.parent, a.masks, a.tracks, a.lifted, _settings(a.settings), a.output)
+    perceive.judge(a.capture.parent, a.masks, a.tracks, a.lifted, read_settings(a.settings), a.output)
     return 0
 
 
 def _perception_table(a: argparse.Namespace) -> int:
     from neuspring import tables_perception
 
-    scenarios = [(name, str(category)) for name, category in _json_mapping("--scenarios", a.scenarios).items()]
+    scenarios = [(name, str(category)) for name, category in json_mapping("--scenarios", a.scenarios).items()]
     print(tables_perception.write(tables_perception.collect(a.results, scenarios), a.output.parent))
     return 0
 
@@ -117,8 +96,8 @@ def _perception_table(a: argparse.Namespace) -> int:
 def _observe(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    settings = _settings(a.settings)
-    stages.observe(_row(a, settings), settings, a.output, a.capture and a.capture.parent, a.lifted)
+    chosen = read_settings(a.settings)
+    stages.observe(_row(a, chosen), chosen, a.output, a.capture and a.capture.parent, a.lifted)
     return 0
 
 
@@ -126,7 +105,7 @@ def _appearance(a: argparse.Namespace) -> int:
     from neuspring import appearance
 
     of = {"lifted_record": a.lifted, "observations_path": a.observations}
-    appearance.learn(a.capture.parent, a.masks, _settings(a.settings), a.seed, a.device, a.output, **of)
+    appearance.learn(a.capture.parent, a.masks, read_settings(a.settings), a.seed, a.device, a.output, **of)
     return 0
 
 
@@ -134,7 +113,7 @@ def _render(a: argparse.Namespace) -> int:
     from neuspring import appearance
 
     records = (a.appearance, a.rollout)
-    appearance.render(a.capture.parent, a.masks, a.observations, *records, _settings(a.settings), a.device, a.output)
+    appearance.render(a.capture.parent, a.masks, a.observations, *records, read_settings(a.settings), a.device, a.output)
     return 0
 
 
@@ -142,7 +121,7 @@ def _draw(a: argparse.Namespace) -> int:
     from neuspring import appearance
 
     which = (a.appearance, a.rollout, a.camera, a.frames, a.background)
-    made = appearance.draw(a.capture.parent, *which, _settings(a.settings), a.device, a.output)
+    made = appearance.draw(a.capture.parent, *which, read_settings(a.settings), a.device, a.output)
     print(f"{len(made)} pictures: {a.output}")
     return 0
 
@@ -150,14 +129,14 @@ def _draw(a: argparse.Namespace) -> int:
 def _search(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.search(a.observations, _settings(a.settings), a.clusters, a.seed, a.device, a.output)
+    stages.search(a.observations, read_settings(a.settings), a.clusters, a.seed, a.device, a.output)
     return 0
 
 
 def _fit(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.fit(a.observations, a.search, _settings(a.settings), a.kind, a.device, a.output)
+    stages.fit(a.observations, a.search, read_settings(a.settings), a.kind, a.device, a.output)
     return 0
 
 
@@ -171,7 +150,7 @@ def _rollout(a: argparse.Namespace) -> int:
 def _transfer(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    stages.transfer(a.targets, a.twin, a.method, a.seed, _settings(a.settings), a.device, a.output)
+    stages.transfer(a.targets, a.twin, a.method, a.seed, read_settings(a.settings), a.device, a.output)
     return 0
 
 
@@ -180,7 +159,7 @@ def _score(a: argparse.Namespace) -> int:
 
     given = {name: getattr(a, name) for name in ("search", "fit", "rollout", "appearance", "render")}
     records = {name: path for name, path in given.items() if path}
-    stages.score(a.observations, records, a.method, _json_mapping("--variant", a.variant), a.seed, a.output)
+    stages.score(a.observations, records, a.method, json_mapping("--variant", a.variant), a.seed, a.output)
     return 0
 
 
@@ -199,7 +178,7 @@ def _track_init(a: argparse.Namespace) -> int:
     from neuspring import tracking
     from neuspring.artifacts import write_text
 
-    outcome = tracking.init(a.results, _settings(a.settings).tracking)
+    outcome = tracking.init(a.results, read_settings(a.settings).tracking)
     write_text(a.output, json.dumps(outcome, indent=1, sort_keys=True) + "\n")
     print(f"MLflow: {outcome['outcome']}")
     return 0
@@ -209,50 +188,17 @@ def _log(a: argparse.Namespace) -> int:
     from neuspring import tracking
     from neuspring.artifacts import write_text
 
-    outcome = tracking.log_run(a.record, a.results, _settings(a.settings).tracking)
+    outcome = tracking.log_run(a.record, a.results, read_settings(a.settings).tracking)
     write_text(a.output, outcome + "\n")
     print(f"MLflow: {a.record}: {outcome}")
     return 0
-
-
-def _sync(a: argparse.Namespace) -> int:
-    from neuspring import tracking
-
-    settings = _settings(a.settings).tracking
-    tracking.init(a.results, settings)
-    outcomes = tracking.sync(a.results, settings, progress=print)
-    for outcome, names in outcomes.items():
-        print(f"{outcome}: {len(names)}")
-    return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
-
-
-def _ui(a: argparse.Namespace) -> int:
-    from neuspring import tracking
-
-    uri = _settings(a.settings).tracking.uri or tracking.default_uri(a.results)
-    if uri.startswith("http"):
-        print(f"The tracking server is at {uri}")
-        return 0
-    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
-    environment.setdefault("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
-    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", a.host, "--port", str(a.port)]
-    print(f"MLflow UI: http://{a.host}:{a.port} (stop with Ctrl-C)", flush=True)
-    os.execve(sys.executable, command, environment)
-
-
-def _check_data(a: argparse.Namespace) -> int:
-    from neuspring.data import check
-
-    departures = check.check(a.folder)
-    print(check.render(departures))
-    return 2 if any(departure.level == "error" for departure in departures) else 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="neuspring", description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(required=True, metavar="command")
-    add = _Adder(commands)
+    add = Adder(commands)
 
     add("capture", _capture, "synthetic scene or PhysTwin's raw layout -> capture folder", "scenario", "settings", "output")
     segment = add("segment", _segment, "one camera of a capture -> masks", "capture", "settings", "compute", "output")
@@ -336,50 +282,12 @@ def _parser() -> argparse.ArgumentParser:
     score.add_argument("--variant", default="{}", help="JSON: the method's switches")
     score.add_argument("--seed", type=int, default=0)
 
-    table = add("tables", _tables, "run records -> tables", "results", "output")
-    table.add_argument("--scenarios", nargs="+", required=True)
-    table.add_argument("--methods", nargs="+", required=True)
-    table.add_argument("--seeds", nargs="+", type=int, required=True)
+    table = add("tables", _tables, "run records -> tables", "results", "runs", "output")
     table.add_argument("--transfers", nargs="*", default=[], help="scenarios whose twins were rolled out on other recordings")
     table.add_argument("--baseline", help="method that others are compared with (default: the first)")
 
     add("track-init", _track_init, "prepare the MLflow store, once before any run is logged", "results", "settings", "output")
     log = add("log", _log, "log one run.json to MLflow", "results", "settings", "output")
     log.add_argument("--record", type=Path, required=True, help="run.json")
-    add("sync", _sync, "send to MLflow what is missing there, and close runs that were killed", "results", "settings")
-    ui = add("ui", _ui, "open the MLflow UI of a results folder", "results", "settings")
-    ui.add_argument("--host", default="127.0.0.1")
-    ui.add_argument("--port", type=int, default=5000)
-
-    check = add("check-data", _check_data, "report how a data folder departs from the expected layout")
-    check.add_argument("folder", type=Path)
+    cli_tools.add_commands(add)
     return parser
-
-
-class _Adder:
-    """Adds commands with the options they share."""
-
-    def __init__(self, commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-        self._commands = commands
-
-    def __call__(self, name: str, run: object, text: str, *shared: str) -> argparse.ArgumentParser:
-        parser = self._commands.add_parser(name, help=text, description=text)
-        parser.set_defaults(run=run)
-        if "scenario" in shared:
-            which = parser.add_mutually_exclusive_group(required=True)
-            which.add_argument("--scenario", help="name of a row of the scenario table")
-            which.add_argument("--row", help="the row itself, as JSON")
-        if "capture" in shared:
-            parser.add_argument("--capture", type=Path, required=True, help="capture.json")
-        if "observations" in shared:
-            parser.add_argument("--observations", type=Path, required=True, help="observations.npz")
-        if "settings" in shared:
-            parser.add_argument("--settings", default="{}", help="JSON, or YAML files separated by commas; defaults otherwise")
-        if "results" in shared:
-            parser.add_argument("--results", type=Path, default=Path("results"), help="results folder")
-        if "compute" in shared:
-            parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N")
-            parser.add_argument("--threads", type=int, default=1)
-        if "output" in shared:
-            parser.add_argument("--output", type=Path, required=True, help="file (tables, draw: folder) to write")
-        return parser

@@ -8,6 +8,7 @@ the workflow reads it before any job exists.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
+from neuspring.config_gpus import Gpus
 from neuspring.config_images import Images
 from neuspring.config_perception import Perception, Synthetic
 from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range
@@ -197,7 +199,9 @@ class SpringField:
     triplane: bool = True
     """Three feature planes (xy, yz, xz), bilinear, summed. Without them F is an MLP on Fourier features of the coordinates."""
     resolution: Annotated[int, Field(ge=2)] | Literal["adaptive"] = "adaptive"
-    """Texels N per side of a plane; adaptive: round(0.85 sqrt(springs))."""
+    """Texels N per side of a plane; adaptive: round(adaptive_factor sqrt(springs)), at least 2."""
+    adaptive_factor: Positive = 0.85
+    """Of an adaptive resolution."""
     channels: Count = 32
     """Features per texel, C."""
     plane_scale: NonNegative = 0.1
@@ -359,6 +363,11 @@ class Config:
     """The method that tables compare the others with; the first where it is null or not among `methods`."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
     """Of the search and of a field's first weights; every method runs with the same ones."""
+    only: str = ""
+    """Part of these scenarios, methods and seeds: terms scenario, category, method and seed, each with names or patterns, as in
+    `--config only="category=rope,cloth method=clusters_* seed=0"`; empty: all."""
+    studies: tuple[Name, ...] = ()
+    """Rows of the study table, the paper's tables, that `all` makes; each is also a target by its name."""
     transfers: dict[Name, tuple[Name, ...]] | None = None
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen; null: none."""
     results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
@@ -373,8 +382,12 @@ class Config:
     """Relative to the Snakefile."""
     search_table: str = "config/searches.yaml"
     """Relative to the Snakefile."""
-    device: Annotated[str, StringConstraints(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
-    """auto (CUDA where it works), cpu, cuda or cuda:N."""
+    study_table: str = "config/studies.yaml"
+    """Relative to the Snakefile."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
+    gpus: Gpus = field(default_factory=Gpus)
+    """See [gpus](#gpus)."""
     simulation: Simulation = field(default_factory=Simulation)
     """See [simulation](#simulation)."""
     losses: Losses = field(default_factory=Losses)
@@ -399,7 +412,7 @@ class Config:
     """See [tracking](#tracking)."""
 
     def __post_init__(self) -> None:
-        for name in ("scenarios", "methods", "seeds"):
+        for name in ("scenarios", "methods", "seeds", "studies"):
             values = getattr(self, name)
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: entries must differ, received {list(values)}")
@@ -456,12 +469,18 @@ class ScenarioRow:
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
     try:
-        return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+        return _adapter(kind).validate_json(json.dumps(values), strict=True)
     except TypeError as error:
         raise InputError(where, "values must be plain YAML", str(error)) from error
     except ValidationError as error:
         problems = [_describe(problem) for problem in error.errors()]
         raise InputError(where, "\n  " + "\n  ".join(problems), remedy="\nSee config/README.md for every key.") from error
+
+
+@functools.cache
+def _adapter(kind: type[T]) -> TypeAdapter[T]:
+    """Building one takes longer than a thousand uses of it."""
+    return TypeAdapter(kind)
 
 
 def _describe(problem: Any) -> str:

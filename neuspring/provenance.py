@@ -18,7 +18,9 @@ from pathlib import Path
 PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
-NOT_NUMERICS = frozenset(f"{PACKAGE}.{name}" for name in ("config", "config_images", "config_perception", "progress", "records"))
+NOT_NUMERICS = frozenset(
+    f"{PACKAGE}.{name}" for name in ("config", "config_gpus", "config_images", "config_perception", "progress", "records")
+)
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 
 
@@ -102,15 +104,19 @@ def _stage_code(stage: str) -> str:
 
 
 @functools.cache
+def _module_code(module: str) -> bytes:
+    """What the code of a module is, without its documentation."""
+    return _without_docstrings(copy.deepcopy(_tree(module))).encode()
+
+
+@functools.cache
 def code_digest(*modules: str, stage: str = "") -> str:
     """A short SHA-256 over the code that the given package modules use and, if named, a function (see `_stage_code`)."""
     digest = hashlib.sha256()
     used = {name for module in modules for name in used_modules(module)} - NOT_NUMERICS
     for name in sorted(used):
-        path = _source(name)
-        assert path is not None, name
         digest.update(name.encode())
-        digest.update(_without_docstrings(ast.parse(path.read_text(encoding="utf-8"))).encode())
+        digest.update(_module_code(name))
     digest.update(_stage_code(stage).encode() if stage else b"")
     return digest.hexdigest()[:16]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from neuspring import config, config_images, config_perception
+from neuspring import config, config_gpus, config_images, config_perception
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -44,7 +44,8 @@ numbers in lists over as text, which is refused, so `seeds` and nested keys are 
 | `raw.yaml` | your own RGBD video, or PhysTwin's raw layout, with the networks and settings of the released processing |
 | `heldout.yaml` | four scenes moved by another engine |
 | `clusters.yaml`, alone or after `mocap.yaml` | 1 to 10 regions |
-| `phystwin.yaml` | the 22 released cases |
+| `benchmark.yaml` | the whole benchmark: the 22 released scenarios, every method and study of the paper, three seeds |
+| ..., `paper.yaml` | the same methods and studies on other data: behind `toy.yaml`, `synthetic.yaml` or `mocap.yaml` |
 | ..., `one_seed.yaml` | seed 0 of any of them, no transfers |
 | `three_seeds.yaml` | the demo with three seeds |
 
@@ -60,6 +61,7 @@ This page is written from `neuspring/config*.py` by `python -m tests.config_read
 """
 KEYS = {
     "(top level)": config.Config,
+    "gpus": config_gpus.Gpus,
     "simulation": config.Simulation,
     "losses": config.Losses,
     "search": config.Search,

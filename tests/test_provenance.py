@@ -24,7 +24,8 @@ def copy(tmp_path, monkeypatch):
 
 
 def clear():
-    for function in (provenance._source, provenance._tree, provenance.imported_modules, provenance.code_digest):
+    cached = (provenance._source, provenance._tree, provenance.imported_modules, provenance._module_code, provenance.code_digest)
+    for function in cached:
         function.cache_clear()
 
 
@@ -111,26 +112,34 @@ def test_declarations_and_reporting_do_not_count(copy):
 LEVELS = [
     {"errors"},
     {"config_types"},
-    {"config_perception", "config_images"},
-    {"artifacts", "config", "progress"},
-    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views"},
-    {"image_metrics", "lpips_weights", "video"},
+    {"config_perception", "config_images", "config_gpus", "config_tune"},
+    {"artifacts", "config", "progress", "kernels", "faults", "gpus"},
+    {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views", "paper"},
+    {"image_metrics", "lpips_weights", "video", "job_records", "studies", "watch"},
     {
         "rollout",
         "data",
-        "tracking",
+        "tracking_store",
+        "tracking_payload",
         "parameters",
         "transfer",
         "figures_twin",
         "figures_clusters",
         "figures_ratios",
+        "figures_tune",
         "splats",
         "lpips",
+        "plan",
+        "job",
     },
-    {"benchmark", "perception", "search", "fit", "carry", "figures", "tables", "gallery"},
-    {"perceive", "tables_perception", "figures_images"},
-    {"pictures"},
-    {"stages", "appearance"},
+    {"tracking", "benchmark", "perception", "search", "fit", "carry", "figures", "tables", "gallery"},
+    {"perceive", "tables_perception", "figures_images", "tables_cells", "tables_render", "needs"},
+    {"pictures", "tables_paper", "tracking_query"},
+    {"stages", "appearance", "verify", "explain_text", "compare", "tune_space", "tune_records"},
+    {"explain", "report", "tune_store", "tune_trial"},
+    {"tune", "tune_report"},
+    {"cli_options"},
+    {"cli_tools"},
     {"cli"},
     {"__main__"},
 ]

@@ -24,6 +24,7 @@ import warp as wp
 
 from neuspring.artifacts import Simulation
 from neuspring.errors import InputError
+from neuspring.kernels import load
 from neuspring.physics import contact, integrate, springs
 
 DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
@@ -194,12 +195,24 @@ class FrameSolver:
 
     def _launch(self, name: str, record: Callable[[], None]) -> None:
         if name not in self._graphs:
+            for kernel in self._kernels():
+                load(kernel, self.device)
             with wp.ScopedCapture(device=self.device) as capture:
                 record()
             self._graphs[name] = capture.graph
         # Torch orders its own work on its current stream, so the graph must run there too.
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device != "cpu" else None
         wp.capture_launch(self._graphs[name], stream=stream)
+
+    def _kernels(self) -> Iterator[Any]:
+        """What a graph may launch; all are loaded before it is captured, since a capture must not load."""
+        hits = contact.kernels(self._real)
+        yield from springs.kernels(self._real)
+        yield from integrate.kernels(self._real)
+        if self.simulation.self_collision:
+            yield from (hits.candidates, hits.collide, hits.collide_adjoint)
+        if self.simulation.ground:
+            yield from (hits.ground, hits.ground_adjoint)
 
     def _run(self, kernel: Any, size: int, *arguments: Any) -> None:
         wp.launch(kernel, size, list(arguments), device=self.device)

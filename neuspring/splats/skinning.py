@@ -22,6 +22,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from neuspring.errors import InputError
+from neuspring.kernels import load
 from neuspring.physics.solver import start_warp
 from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
 
@@ -109,7 +110,7 @@ class Skin:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self._device)
 
     def _launch(self, kernel: Any, size: int, arguments: list[Any]) -> None:
-        wp.launch(kernel, size, arguments, device=self._device)
+        wp.launch(load(kernel, self._device), size, arguments, device=self._device)
 
 
 def _on_torch_stream(device: str) -> AbstractContextManager[Any]:

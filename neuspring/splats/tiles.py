@@ -8,6 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from neuspring.kernels import load
 from neuspring.physics.solver import start_warp
 from neuspring.splats.blend import kernels
 from neuspring.splats.view import Limits, View
@@ -108,8 +109,8 @@ def blend(
 
 
 def _launch(which: int, view: View, arguments: list[Any], like: torch.Tensor) -> None:
-    kernel = kernels(wp.dtype_from_torch(like.dtype))[which]
     device = wp.device_from_torch(like.device)
+    kernel = load(kernels(wp.dtype_from_torch(like.dtype))[which], device)
     # Torch orders its own work on its current stream, so the kernel must run there too.
     stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
     wp.launch(kernel, (view.height, view.width), arguments, device=device, stream=stream)

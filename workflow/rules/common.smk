@@ -1,4 +1,5 @@
 # Validates the configuration before any job, and holds the helpers that rules use.
+import atexit
 import functools
 import hashlib
 import json
@@ -11,16 +12,12 @@ from types import SimpleNamespace
 
 from neuspring import benchmark as benchmarks
 from neuspring import config as settings
+from neuspring import gpus, job, needs, plan
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
+from neuspring.job_records import JobRecord
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
-
-# Jobs call `python -m neuspring`: with the interpreter that runs Snakemake, unless conda provides one. A prefix replaces
-# Snakemake's own, without which a command that fails before a pipe would count as one that succeeded.
-if not workflow.deployment_settings.deployment_method:
-    folder = shlex.quote(str(Path(sys.executable).parent))
-    shell.prefix(f"set -euo pipefail; export PATH={folder}:$PATH; ")
 
 ROOT = Path(workflow.basedir)
 
@@ -49,8 +46,84 @@ BENCHMARK = checked_benchmark()
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 DEVICE = CONFIG.device
-TABLES = f"{RESULTS}/{CONFIG.tables}/summary.md"
-PERCEPTION_TABLE = f"{RESULTS}/{CONFIG.tables}/perception.md"
+# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs, not cores. Inside one of its jobs nothing is counted.
+CLUSTER = workflow.resource_settings.nodes is not None or workflow.remote_exec
+
+
+def checked_pool():
+    """The GPUs of this machine that jobs lease. Too large a wish is an error here, before any job: Snakemake would clamp it."""
+    if CLUSTER:
+        return ()
+    wanted = workflow.global_resources.get("gpu")
+    limit = wanted.value if wanted else None
+    try:
+        pool = needs.gpu_pool(CONFIG.gpus, DEVICE)
+        if pool:
+            slots = needs.gpu_slots(pool, CONFIG.gpus.jobs_per_gpu, limit)
+            workflow.register_resource("gpu", slots)
+        elif limit:
+            raise InputError(
+                "--resources gpu",
+                "no job of this run can have a GPU",
+                limit,
+                "Leave it out, or set device: cuda where there is one.",
+            )
+    except InputError as error:
+        raise WorkflowError(str(error)) from None
+    return pool
+
+
+POOL = checked_pool()
+GPU = int(DEVICE != "cpu" and (CLUSTER or bool(POOL)))
+NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
+memory, search_work, fit_work = NEEDS.memory, NEEDS.search, NEEDS.fit
+appearance_work, frame_work = NEEDS.appearance, NEEDS.scenario
+
+
+def job_prefix():
+    """What every job's shell begins with: the interpreter that runs Snakemake (unless conda provides one) and the GPUs to share.
+
+    A prefix replaces Snakemake's own, without which a command that fails before a pipe would count as one that succeeded.
+    """
+    values = {
+        job.POOL: job.GIVEN if CLUSTER else ",".join(POOL),
+        job.SHARE: str(CONFIG.gpus.jobs_per_gpu),
+    }
+    exports = "".join(
+        f"export {name}={shlex.quote(value)}; " for name, value in values.items()
+    )
+    if not workflow.deployment_settings.deployment_method:
+        exports += (
+            f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH; "
+        )
+    return f"set -euo pipefail; {exports}"
+
+
+shell.prefix(job_prefix())
+
+# Every job runs in a wrapper: GPU lease, log, record, cause of failure (`neuspring.job`).
+WRAPPED = "python -m neuspring.job --log {log:q} --attempt {resources.attempt}"
+COMMON_JOB = f"{WRAPPED} --quiet -- python -m neuspring"
+JOB = f"{WRAPPED} --scenario {{wildcards.scenario}} --work {{resources.work}} -- python -m neuspring"
+GPU_JOB = JOB.replace(" -- ", " --gpus {resources.gpu} -- ")
+
+
+def attempt_number(wildcards, attempt):
+    return attempt
+
+
+def one(wildcards):
+    return 1
+
+
+def minutes(rule, default, work=None):
+    return NEEDS.minutes(rule, default, work or one)
+
+
+TABLE_FOLDER = f"{RESULTS}/{CONFIG.tables}"
+TABLES = f"{TABLE_FOLDER}/summary.md"
+REPORT = f"{TABLE_FOLDER}/report.html"
+PERCEPTION_TABLE = f"{TABLE_FOLDER}/perception.md"
 
 
 # Only for `--software-deployment-method conda`; without it the running environment is used.
@@ -63,6 +136,7 @@ wildcard_constraints:
     search="|".join(map(re.escape, BENCHMARK.searches)),
     camera=r"[A-Za-z0-9][A-Za-z0-9_.-]*",
     seed="|".join(map(str, CONFIG.seeds)),
+    study="|".join(map(re.escape, BENCHMARK.studies)),
 
 
 def section(*names):
@@ -214,7 +288,7 @@ def segment_digest(wildcards):
 
 
 def segment_gpu(wildcards):
-    return int(segment_backend(wildcards) == "grounded_sam2" and DEVICE != "cpu")
+    return int(segment_backend(wildcards) == "grounded_sam2" and GPU)
 
 
 def perception_settings(*names):
@@ -296,7 +370,7 @@ def picture_options(wildcards, input):
 
 
 def track_gpu():
-    return int(CONFIG.perception.track.backend == "cotracker3" and DEVICE != "cpu")
+    return int(CONFIG.perception.track.backend == "cotracker3" and GPU)
 
 
 def scenario_files(wildcards):
@@ -315,12 +389,15 @@ def scenario_files(wildcards):
 
 
 def search_settings(wildcards):
+    return settings_of_search(wildcards.search)
+
+
+@functools.cache
+def settings_of_search(name):
     """The search's sections, with the search row's own settings on top."""
     chosen = common_settings()
-    row = BENCHMARK.searches[wildcards.search]
-    chosen["search"] = settings.plain(
-        benchmarks.search_of(CONFIG, row, wildcards.search)
-    )
+    row = BENCHMARK.searches[name]
+    chosen["search"] = settings.plain(benchmarks.search_of(CONFIG, row, name))
     if row.clusters == 1:
         # What concerns regions alone changes nothing here, so it must not start the search again.
         for name in ("clusters", "tied_rollouts", "freed_sigma"):
@@ -335,10 +412,15 @@ def common_settings():
 
 
 def fit_settings(wildcards):
+    return settings_of_fit(wildcards.method)
+
+
+@functools.cache
+def settings_of_fit(name):
     """The fit's sections, with the method's own settings on top."""
     chosen = common_settings()
-    method = BENCHMARK.fits[wildcards.method]
-    chosen["fit"] = settings.plain(benchmarks.fit_of(CONFIG, method, wildcards.method))
+    method = BENCHMARK.fits[name]
+    chosen["fit"] = settings.plain(benchmarks.fit_of(CONFIG, method, name))
     if method.fit == "springs":
         del chosen["fit"]["field"]
     return json.dumps(chosen, sort_keys=True)
@@ -387,7 +469,13 @@ def carry_option(wildcards):
 
 
 def variant(wildcards):
-    method = BENCHMARK.methods[wildcards.method]
+    return variant_of(wildcards.method)
+
+
+@functools.cache
+def variant_of(name):
+    """The switches of a method, for its record."""
+    method = BENCHMARK.methods[name]
     row = settings.plain(method)
     return json.dumps(
         {
@@ -425,12 +513,12 @@ def transfer_records():
     )
 
 
-def run_records():
+def run_records(methods=CONFIG.methods):
     return expand(
         "{results}/{scenario}/{method}/{seed}/run.json",
         results=RESULTS,
         scenario=CONFIG.scenarios,
-        method=CONFIG.methods,
+        method=methods,
         seed=CONFIG.seeds,
     )
 
@@ -443,21 +531,66 @@ def tracked_runs():
     )
 
 
-def table_arguments(output=f"{RESULTS}/{CONFIG.tables}"):
+def study_table(name):
+    return f"{TABLE_FOLDER}/studies/{name}.md"
+
+
+def study_arguments(wildcards):
     return [
-        *(
-            "--results",
-            RESULTS,
-            "--output",
-            output,
-            "--scenarios",
-            *CONFIG.scenarios,
-        ),
+        "--study",
+        wildcards.study,
+        "--table",
+        str(ROOT / CONFIG.study_table),
+        *benchmark_arguments(f"{TABLE_FOLDER}/studies"),
+    ]
+
+
+def benchmark_arguments(output):
+    """The results folder, and which runs it is to hold."""
+    return [
+        *("--results", RESULTS, "--output", output),
+        *("--scenarios", *CONFIG.scenarios),
         *("--methods", *CONFIG.methods, "--seeds", *map(str, CONFIG.seeds)),
+    ]
+
+
+def table_arguments(output=TABLE_FOLDER):
+    return [
+        *benchmark_arguments(output),
         *(["--transfers", *BENCHMARK.transfers] if BENCHMARK.transfers else []),
         "--baseline",
         BENCHMARK.compared_with,
     ]
+
+
+def tell_plan():
+    """How much time the run is expected to take."""
+    slots = {
+        "cpu": 0 if CLUSTER else workflow.cores,
+        "gpu": 0 if CLUSTER else len(POOL) * CONFIG.gpus.jobs_per_gpu,
+    }
+    jobs = needs.planned(
+        workflow.dag.needrun_jobs(exclude_finished=False), Path(RESULTS)
+    )
+    print(plan.report(jobs, NEEDS.history, slots), flush=True)
+
+
+def tell_plan_of_dry_run():
+    # Snakemake has no hook for the end of a dry run.
+    if workflow.dryrun and workflow.dag:
+        tell_plan()
+
+
+if workflow.is_main_process:
+    atexit.register(tell_plan_of_dry_run)
+
+
+def sweep_summaries():
+    return []
+
+
+def report_arguments():
+    return []
 
 
 def report_end(failed):
@@ -466,7 +599,7 @@ def report_end(failed):
         print("\nThe run did not finish. What is done so far:", flush=True)
         # In a folder of its own: had the tables a file in place, the next run would find nothing to be done.
         command = [sys.executable, "-m", "neuspring", "tables"]
-        so_far = f"{RESULTS}/{CONFIG.tables}/so_far"
+        so_far = f"{TABLE_FOLDER}/so_far"
         subprocess.run([*command, *table_arguments(so_far)], check=False)
         print(
             "The logs of failed jobs are named above. The same command continues where this one stopped.",

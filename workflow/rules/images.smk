@@ -10,15 +10,17 @@ rule appearance:
         f"{RESULTS}/logs/appearance/{{scenario}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/appearance/{{scenario}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=appearance_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=8000,
-        runtime=240,
+        gpu=GPU,
+        mem_mb=memory("appearance", 8000),
+        runtime=minutes("appearance", 240, appearance_work),
     params:
         settings=appearance_settings,
         points=first_points_option,
@@ -30,9 +32,10 @@ rule appearance:
             stage="appearance.learn",
         ),
     shell:
-        "python -m neuspring appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
+        GPU_JOB
+        + " appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
         " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
-        " --output {output:q} 2>&1 | tee -a {log:q}"
+        " --output {output:q}"
 
 
 rule render:
@@ -48,15 +51,17 @@ rule render:
         f"{RESULTS}/logs/render/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/render/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=frame_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=8000,
-        runtime=120,
+        gpu=GPU,
+        mem_mb=memory("render", 8000),
+        runtime=minutes("render", 120, frame_work),
     params:
         settings=image_settings(
             "backend",
@@ -77,6 +82,7 @@ rule render:
             stage="appearance.render",
         ),
     shell:
-        "python -m neuspring render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
+        GPU_JOB
+        + " render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
         " --appearance {input.appearance:q} --rollout {input.rollout:q} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        " --device {resources.device} --threads {threads} --output {output:q}"

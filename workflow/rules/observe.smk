@@ -7,18 +7,20 @@ rule observe:
         f"{RESULTS}/logs/observe/{{scenario}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/observe/{{scenario}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=30,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("observe", 4000),
+        runtime=minutes("observe", 30, frame_work),
     params:
         settings=observe_settings,
         row=scenario_row,
         code=reader_digest,
         perceived=perceived_options,
     shell:
-        "python -m neuspring observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"
-        " 2>&1 | tee -a {log:q}"
+        JOB
+        + " observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"

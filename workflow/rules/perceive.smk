@@ -8,20 +8,22 @@ rule synthesise:
         f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
     wildcard_constraints:
         scenario=of_source("synthetic"),
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=120,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("capture", 4000),
+        runtime=minutes("capture", 120, frame_work),
     params:
         settings=section("synthetic"),
         row=scenario_row,
         code=code_digest("neuspring.data.synthetic.make", stage="perceive.make_capture"),
     shell:
-        "python -m neuspring capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
-        " 2>&1 | tee -a {log:q}"
+        JOB
+        + " capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
 
 
 rule capture:
@@ -35,21 +37,23 @@ rule capture:
         f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
     wildcard_constraints:
         scenario=of_source("phystwin_raw", "phystwin"),
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=120,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("capture", 4000),
+        runtime=minutes("capture", 120, frame_work),
     params:
         settings=section("data_root"),
         row=scenario_row,
         images=image_stamps,
         code=code_digest("neuspring.data.phystwin_raw", stage="perceive.make_capture"),
     shell:
-        "python -m neuspring capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
-        " 2>&1 | tee -a {log:q}"
+        JOB
+        + " capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
 
 
 rule segment:
@@ -61,22 +65,25 @@ rule segment:
         f"{RESULTS}/logs/segment/{{scenario}}/{{camera}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/segment/{{scenario}}/{{camera}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=frame_work,
         device=DEVICE,
         gpu=segment_gpu,
-        mem_mb=8000,
-        runtime=120,
+        mem_mb=memory("segment", 8000),
+        runtime=minutes("segment", 120, frame_work),
     params:
         settings=segment_settings,
         images=image_stamps,
         code=segment_digest,
     shell:
-        "python -m neuspring segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        GPU_JOB
+        + " segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
+        " --device {resources.device} --threads {threads} --output {output:q}"
 
 
 rule track:
@@ -90,22 +97,25 @@ rule track:
         f"{RESULTS}/logs/track/{{scenario}}/{{camera}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/track/{{scenario}}/{{camera}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=frame_work,
         device=DEVICE,
         gpu=track_gpu(),
-        mem_mb=8000,
-        runtime=120,
+        mem_mb=memory("track", 8000),
+        runtime=minutes("track", 120, frame_work),
     params:
         settings=perception_settings("track", "seed"),
         images=image_stamps,
         code=backend_digest("track"),
     shell:
-        "python -m neuspring track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
-        " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        GPU_JOB
+        + " track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
+        " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q}"
 
 
 rule lift:
@@ -121,13 +131,15 @@ rule lift:
         f"{RESULTS}/logs/lift/{{scenario}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/lift/{{scenario}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=8000,
-        runtime=60,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("lift", 8000),
+        runtime=minutes("lift", 60, frame_work),
     params:
         settings=perception_settings("lift", "shape"),
         images=image_stamps,
@@ -137,8 +149,9 @@ rule lift:
             stage="perceive.lift",
         ),
     shell:
-        "python -m neuspring lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
-        " --settings {params.settings:q} --output {output:q} 2>&1 | tee -a {log:q}"
+        JOB
+        + " lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+        " --settings {params.settings:q} --output {output:q}"
 
 
 rule judge:
@@ -154,20 +167,22 @@ rule judge:
         f"{RESULTS}/logs/judge/{{scenario}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/judge/{{scenario}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=30,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("judge", 4000),
+        runtime=minutes("judge", 30, frame_work),
     params:
         settings=perception_settings("shape"),
         code=code_digest("neuspring.perception.judge", stage="perceive.judge"),
     shell:
-        "python -m neuspring judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+        JOB
+        + " judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
         " --lifted {input.lifted:q} --settings {params.settings:q} --output {output:q}"
-        " 2>&1 | tee -a {log:q}"
 
 
 rule perception_table:
@@ -179,16 +194,16 @@ rule perception_table:
         f"{RESULTS}/logs/{CONFIG.tables}_perception.log",
     benchmark:
         f"{RESULTS}/benchmarks/{CONFIG.tables}_perception.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
-        runtime=10,
+        attempt=attempt_number,
+        mem_mb=memory("perception_table", 2000),
+        runtime=minutes("perception_table", 10),
     params:
         arguments=perception_arguments(),
         code=code_digest("neuspring.tables_perception"),
     shell:
-        "python -m neuspring perception-table {params.arguments:q} --output {output:q}"
-        " > {log:q} 2>&1"
+        COMMON_JOB + " perception-table {params.arguments:q} --output {output:q}"

@@ -12,19 +12,22 @@ rule score:
         f"{RESULTS}/logs/score/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/score/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=30,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("score", 4000),
+        runtime=minutes("score", 30, frame_work),
     params:
         fit=fit_option,
         pictures=picture_options,
         variant=variant,
         code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
     shell:
-        "python -m neuspring score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
+        JOB
+        + " score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
         " --rollout {input.rollout:q} {params.pictures:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
-        " --output {output:q} 2>&1 | tee -a {log:q}"
+        " --output {output:q}"

@@ -8,15 +8,77 @@ rule tables:
         f"{RESULTS}/logs/{CONFIG.tables}.log",
     benchmark:
         f"{RESULTS}/benchmarks/{CONFIG.tables}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
-        runtime=10,
+        attempt=attempt_number,
+        mem_mb=memory("tables", 2000),
+        runtime=minutes("tables", 10),
     params:
         arguments=table_arguments(),
         code=code_digest("neuspring.tables", "neuspring.gallery"),
     shell:
-        "python -m neuspring tables {params.arguments:q} > {log:q} 2>&1"
+        COMMON_JOB + " tables {params.arguments:q}"
+
+
+# The paper's tables, one per study; rows whose method has not run yet say so.
+rule study:
+    input:
+        lambda wildcards: run_records(BENCHMARK.methods_of(wildcards.study)),
+    output:
+        f"{TABLE_FOLDER}/studies/{{study}}.md",
+    log:
+        f"{RESULTS}/logs/study/{CONFIG.tables}/{{study}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/study/{CONFIG.tables}/{{study}}.tsv"
+    retries: 2
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        attempt=attempt_number,
+        mem_mb=memory("study", 2000),
+        runtime=minutes("study", 10),
+    params:
+        arguments=study_arguments,
+        code=code_digest("neuspring.tables_paper"),
+    shell:
+        COMMON_JOB + " study {params.arguments:q}"
+
+
+for study_name in BENCHMARK.studies:
+
+    rule:
+        name:
+            study_name
+        input:
+            study_table(study_name),
+
+
+rule report:
+    input:
+        tables=TABLES,
+        studies=[study_table(name) for name in CONFIG.studies],
+        perception=perception_tables(),
+        sweeps=sweep_summaries(),
+    output:
+        REPORT,
+    log:
+        f"{RESULTS}/logs/report/{CONFIG.tables}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/report/{CONFIG.tables}.tsv"
+    retries: 2
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        attempt=attempt_number,
+        mem_mb=memory("report", 4000),
+        runtime=minutes("report", 20),
+    params:
+        arguments=report_arguments(),
+        code=code_digest("neuspring.report"),
+    shell:
+        COMMON_JOB + " report {params.arguments:q}"

@@ -6,18 +6,20 @@ rule track_init:
         f"{RESULTS}/logs/track_init.log",
     benchmark:
         f"{RESULTS}/benchmarks/track_init.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
-        runtime=10,
+        attempt=attempt_number,
+        mem_mb=memory("track_init", 2000),
+        runtime=minutes("track_init", 10),
     params:
         settings=section("tracking"),
         results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
-        "python -m neuspring track-init --results {params.results:q} --settings {params.settings:q} --output {output:q} 2>&1 | tee -a {log:q}"
+        COMMON_JOB
+        + " track-init --results {params.results:q} --settings {params.settings:q} --output {output:q}"
 
 
 rule log_run:
@@ -30,16 +32,19 @@ rule log_run:
         f"{RESULTS}/logs/log_run/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/log_run/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
-        runtime=10,
+        attempt=attempt_number,
+        work=frame_work,
+        mem_mb=memory("log_run", 2000),
+        runtime=minutes("log_run", 10, frame_work),
     params:
         settings=section("tracking"),
         results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
-        "python -m neuspring log --record {input.record:q} --results {params.results:q} --settings {params.settings:q}"
-        " --output {output:q} 2>&1 | tee -a {log:q}"
+        JOB
+        + " log --record {input.record:q} --results {params.results:q} --settings {params.settings:q}"
+        " --output {output:q}"

@@ -7,22 +7,25 @@ rule search:
         f"{RESULTS}/logs/search/{{scenario}}/{{search}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/search/{{scenario}}/{{search}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=search_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=8000,
-        runtime=240,
+        gpu=GPU,
+        mem_mb=memory("search", 8000),
+        runtime=minutes("search", 240, search_work),
     params:
         settings=search_settings,
         clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
         code=code_digest("neuspring.search"),
     shell:
-        "python -m neuspring search --observations {input.observations:q} --settings {params.settings:q}"
-        " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        GPU_JOB
+        + " search --observations {input.observations:q} --settings {params.settings:q}"
+        " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q}"
 
 
 rule fit:
@@ -35,22 +38,25 @@ rule fit:
         f"{RESULTS}/logs/fit/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/fit/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=fit_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=8000,
-        runtime=480,
+        gpu=GPU,
+        mem_mb=memory("fit", 8000),
+        runtime=minutes("fit", 480, fit_work),
     params:
         settings=fit_settings,
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
         code=code_digest("neuspring.fit"),
     shell:
-        "python -m neuspring fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-        " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        GPU_JOB
+        + " fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
+        " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q}"
 
 
 rule rollout:
@@ -63,23 +69,26 @@ rule rollout:
         f"{RESULTS}/logs/rollout/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/rollout/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=frame_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=4000,
-        runtime=60,
+        gpu=GPU,
+        mem_mb=memory("rollout", 4000),
+        runtime=minutes("rollout", 60, frame_work),
     params:
         carry=carry_option,
         code=code_digest(
             "neuspring.rollout", "neuspring.motion", "neuspring.carry", stage="rollout"
         ),
     shell:
-        "python -m neuspring rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
-        " --device {resources.device} --threads {threads} --output {output:q} 2>&1 | tee -a {log:q}"
+        GPU_JOB
+        + " rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
+        " --device {resources.device} --threads {threads} --output {output:q}"
 
 
 rule transfer:
@@ -92,15 +101,17 @@ rule transfer:
         f"{RESULTS}/logs/transfer/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/transfer/{{scenario}}/{{method}}/{{seed}}.tsv"
-    retries: 1
+    retries: 2
     conda:
         ENVIRONMENT
     threads: 1
     resources:
+        attempt=attempt_number,
+        work=frame_work,
         device=DEVICE,
-        gpu=lambda wildcards: 0 if DEVICE == "cpu" else 1,
-        mem_mb=4000,
-        runtime=60,
+        gpu=GPU,
+        mem_mb=memory("transfer", 4000),
+        runtime=minutes("transfer", 60, frame_work),
     params:
         settings=section("simulation"),
         code=code_digest(
@@ -111,6 +122,7 @@ rule transfer:
             stage="transfer",
         ),
     shell:
-        "python -m neuspring transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
+        GPU_JOB
+        + " transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
         " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
-        " --output {output:q} 2>&1 | tee -a {log:q}"
+        " --output {output:q}"

@@ -1,0 +1,104 @@
+"""Commands around the workflow: data, tracking, comparisons."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from neuspring.cli_options import Adder, read_settings
+from neuspring.errors import InputError
+
+
+def _sync(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+
+    settings = read_settings(a.settings).tracking
+    tracking.init(a.results, settings)
+    outcomes = tracking.sync(a.results, settings, progress=print)
+    for outcome, names in outcomes.items():
+        print(f"{outcome}: {len(names)}")
+    return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
+
+
+def _ui(a: argparse.Namespace) -> int:
+    from neuspring import tracking
+
+    uri = read_settings(a.settings).tracking.uri or tracking.default_uri(a.results)
+    if uri.startswith("http"):
+        print(f"The tracking server is at {uri}")
+        return 0
+    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
+    environment.setdefault("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
+    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", a.host, "--port", str(a.port)]
+    print(f"MLflow UI: http://{a.host}:{a.port} (stop with Ctrl-C)", flush=True)
+    os.execve(sys.executable, command, environment)
+
+
+def _check_data(a: argparse.Namespace) -> int:
+    from neuspring.data import check
+
+    departures = check.check(a.folder)
+    print(check.render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
+
+
+def _study(a: argparse.Namespace) -> int:
+    from neuspring import studies, tables_paper
+
+    known = studies.read_studies(a.table)
+    if a.study not in known:
+        raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(known)}")
+    print(tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output))
+    return 0
+
+
+def _fetch(a: argparse.Namespace) -> int:
+    from neuspring.data import check, fetch
+
+    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run)
+    if a.dry_run:
+        return 0
+    print(check.render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
+
+
+def _verify_released(a: argparse.Namespace) -> int:
+    from neuspring.verify.run import CHECKS, verify_released
+
+    lpips = read_settings(a.settings).images.lpips
+    which = {"scenarios": a.scenarios, "checks": a.checks or tuple(CHECKS)}
+    report = verify_released(a.data_root, a.output, **which, device=a.device, lpips=lpips)
+    print(report.text, end="")
+    return report.status
+
+
+def add_commands(add: Adder) -> None:
+    """Add these commands to the parser."""
+    add("sync", _sync, "send to MLflow what is missing there, and close runs that were killed", "results", "settings")
+    ui = add("ui", _ui, "open the MLflow UI of a results folder", "results", "settings")
+    ui.add_argument("--host", default="127.0.0.1")
+    ui.add_argument("--port", type=int, default=5000)
+
+    study = add("study", _study, "run records -> one of the paper's tables, beside the paper's values", "results", "runs", "output")
+    study.add_argument("--study", required=True, help="row of the study table")
+    study.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
+
+    fetch = add("fetch", _fetch, "released archives -> the folders that the readers expect")
+    fetch.add_argument("source", choices=["phystwin"])
+    fetch.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="all 22 by default")
+    fetch.add_argument("--data-root", type=Path, required=True, help="folder to write to; data_root of the configuration")
+    parts = "data, results, appearance, images, other; all: these five; extra: more clothes"
+    fetch.add_argument("--parts", nargs="+", default=["data", "results"], help=f"{parts} (default: data results)")
+    fetch.add_argument("--revision", default="main", help="branch, tag or commit of the data set")
+    fetch.add_argument("--dry-run", action="store_true", help="say what would be fetched and the space it takes")
+    verify = add(
+        "verify-released", _verify_released, "PhysTwin's released results, checked against ours", "settings", "compute", "output"
+    )
+    verify.add_argument("data_root", type=Path, help="folder that holds data, experiments, experiments_optimization, gaussian_output")
+    verify.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
+    checks = "2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
+    verify.add_argument("--checks", nargs="+", type=int, help=checks)
+    check = add("check-data", _check_data, "report how a data folder departs from the expected layout")
+    check.add_argument("folder", type=Path)

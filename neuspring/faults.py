@@ -1,0 +1,83 @@
+"""Why a command failed, and whether trying again can help.
+
+The verdict is read off the exit status and the end of the output, since most causes (CUDA, the system's out-of-memory killer, a
+database) end a process from outside Python.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+TAIL = 40
+"""Lines of output that are searched for a cause."""
+BAD_INPUT = 2
+"""Exit status of `neuspring` for input that only another input can mend."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A cause of failure."""
+
+    outcome: Literal["transient", "permanent", "killed"]
+    cause: str
+    remedy: str = ""
+
+
+FULL = Fault("permanent", "no space left on the disk", "Free some space; the same command continues.")
+READ_ONLY = Fault("permanent", "the file system is read-only", "Make it writable; the same command continues.")
+GPU_MEMORY = Fault("transient", "out of GPU memory")
+LOST_DEVICE = Fault("transient", "the GPU was lost or failed")
+MEMORY = Fault("transient", "out of memory")
+UNREACHABLE = Fault("transient", "a store or host could not be reached")
+STORAGE = Fault("transient", "the storage failed")
+INPUT = Fault("permanent", "bad input")
+UNKNOWN = Fault("permanent", "the program failed")
+CRASH = Fault("transient", "the process crashed")
+STOPPED = Fault("killed", "stopped from outside")
+
+PATTERNS = (
+    (r"no space left on device|disk quota exceeded|database or disk is full", FULL),
+    (r"read-only file system", READ_ONLY),
+    (r"cuda out of memory|OutOfMemoryError|CUDA_ERROR_OUT_OF_MEMORY|CUDA error 2: out of memory", GPU_MEMORY),
+    (r"failed to allocate \d+ bytes on device 'cuda|CUBLAS_STATUS_ALLOC_FAILED", GPU_MEMORY),
+    (r"CUDA error: (unspecified launch failure|uncorrectable ECC|the launch timed out|unknown error)", LOST_DEVICE),
+    (r"CUDA_ERROR_(ECC_UNCORRECTABLE|DEVICE_UNAVAILABLE|LAUNCH_TIMEOUT|UNKNOWN)|all CUDA-capable devices are busy", LOST_DEVICE),
+    (r"GPU is lost|fallen off the bus|no CUDA-capable device is detected", LOST_DEVICE),
+    (r"^MemoryError|cannot allocate memory|std::bad_alloc|DefaultCPUAllocator: (can't|not enough memory)", MEMORY),
+    (r"connection (refused|reset|timed out)|ConnectionError|could not (connect|translate host name)", UNREACHABLE),
+    (r"name or service not known|temporary failure in name resolution|server closed the connection", UNREACHABLE),
+    (r"database is locked|TimeoutError|read timed out", UNREACHABLE),
+    (r"stale file handle|input/output error|transport endpoint is not connected", STORAGE),
+)
+
+
+def diagnose(status: int, output: Sequence[str]) -> Fault | None:
+    """The cause of exit status `status` (negative: a signal), from the last lines of the output; None for success."""
+    if status == 0:
+        return None
+    # A shell reports the signal that ended its command as 128 + n.
+    number = -status if status < 0 else status - 128 if 128 < status < 160 else 0
+    text = "\n".join(output[-TAIL:])
+    named = next((fault for pattern, fault in PATTERNS if re.search(pattern, text, re.IGNORECASE | re.MULTILINE)), None)
+    if named:
+        return named
+    if status == BAD_INPUT:
+        return INPUT
+    if number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        return STOPPED
+    if number == signal.SIGKILL:
+        return Fault("transient", "killed by the system, most likely out of memory")
+    if number:
+        return Fault(CRASH.outcome, f"{CRASH.cause} ({signal.Signals(number).name})")
+    return UNKNOWN
+
+
+def last_words(output: Sequence[str]) -> str:
+    """The last line of the output that says something, short."""
+    lines = [line.strip() for line in output if line.strip()]
+    errors = [line for line in lines if "error" in line.lower() or "exception" in line.lower()]
+    return (errors or lines or [""])[-1][:500]

@@ -1,0 +1,240 @@
+"""`python -m neuspring.job ... -- COMMAND`: run one job of the workflow.
+
+Holds the GPUs that the job needs while it runs, keeps its output in its log, watches its time and memory, and writes its record
+(`neuspring.job_records`), with the cause if it fails. A job that failed for a reason that trying again cannot mend is not tried
+again. Imports nothing heavy: this is the start of every job.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import ctypes
+import os
+import platform
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from neuspring import faults, gpus
+from neuspring.errors import InputError
+from neuspring.job_records import LOGS, Attempt, JobRecord
+from neuspring.watch import Watch
+
+GIVEN = "given"
+POOL, SHARE = "NEUSPRING_GPUS", "NEUSPRING_JOBS_PER_GPU"
+"""Environment: the devices that jobs share (or `given`: a cluster has chosen this job's), how many jobs a device takes."""
+KEPT = 200
+"""Lines of output that are kept to find a cause in."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status (1 if a signal ended it)."""
+    parser = argparse.ArgumentParser(prog="python -m neuspring.job", description="Run one job of the workflow.")
+    parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
+    parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
+    parser.add_argument("--attempt", type=int, default=1, help="1, or more where the workflow tries again")
+    parser.add_argument("--scenario", default="", help="its scenario; jobs of one prefer the same GPU")
+    parser.add_argument("--work", type=float, default=1.0, help="how much it has to do, in units of its rule")
+    parser.add_argument("--quiet", action="store_true", help="output goes to the log alone, unless it fails")
+    parser.add_argument("command", nargs=argparse.REMAINDER)
+    a = parser.parse_args(arguments)
+    command = a.command[1:] if a.command[:1] == ["--"] else a.command
+    if not command:
+        parser.error("a command is required after --")
+    try:
+        results = _results(a.log)
+        job = Job(
+            command=tuple(command),
+            record=JobRecord.of_log(results, a.log, a.scenario, a.work),
+            results=results,
+            log=a.log,
+            gpus=a.gpus,
+            attempt=a.attempt,
+            quiet=a.quiet,
+        )
+        return run(job)
+    except (InputError, TimeoutError) as error:
+        print(f"neuspring: error: {error}", file=sys.stderr)
+        return faults.BAD_INPUT
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A command of the workflow and where its traces go."""
+
+    command: tuple[str, ...]
+    record: JobRecord
+    """Without attempts."""
+    results: Path
+    log: Path
+    gpus: int = 0
+    attempt: int = 1
+    """1, or more where the workflow tries again."""
+    quiet: bool = False
+
+
+def run(job: Job) -> int:
+    """Run a job; returns its exit status (1 if a signal ended it). Raises InputError if it needs more GPUs than there are."""
+    record = replace(job.record, attempts=_earlier(job.record.path(job.results)))
+    if job.attempt > 1 and record.attempts and record.last.outcome == "permanent":
+        # The workflow cannot tell causes apart; its second try ends here.
+        print(f"not tried again ({record.last.cause}): {record.last.message}", file=sys.stderr)
+        return record.last.exit or 1
+    lease = _lease(job)
+    try:
+        devices, waited = (list(lease.devices), round(lease.waited, 3)) if lease else (_given(job), 0.0)
+        begun = Attempt(started=_moment(), host=platform.node(), devices=devices, waited=waited)
+        _save(record, begun, job.results)
+        ended = _execute(job, lease, begun)
+        _save(record, ended, job.results)
+    finally:
+        if lease:
+            lease.release()
+    assert ended.exit is not None
+    return ended.exit if ended.exit >= 0 else 1
+
+
+def _results(log: Path) -> Path:
+    """The results folder of a log."""
+    for parent in log.parents:
+        if parent.name == LOGS:
+            return parent.parent
+    raise InputError(log, f"the log of a job must lie in a folder {LOGS} of the results")
+
+
+def _earlier(path: Path) -> list[Attempt]:
+    try:
+        return JobRecord.load(path).attempts
+    except InputError:
+        return []  # none yet, or a record that a full disk cut short
+
+
+def _save(record: JobRecord, attempt: Attempt, results: Path) -> None:
+    """The earlier attempts and this one. A record that cannot be written must not fail the job that it is about."""
+    try:
+        replace(record, attempts=[*record.attempts, attempt]).save(results)
+    except (OSError, InputError) as error:
+        print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
+
+
+def _lease(job: Job) -> gpus.Lease | None:
+    """GPUs of this machine; None where none is needed or a cluster has chosen them."""
+    pool = os.environ.get(POOL, "")
+    if not job.gpus or pool == GIVEN:
+        return None
+    names = [name for name in pool.split(",") if name] or gpus.visible_devices()
+
+    def waiting() -> None:
+        print(f"waiting for {job.gpus} of the GPUs {', '.join(names)}", file=sys.stderr, flush=True)
+
+    share = int(os.environ.get(SHARE, "1"))
+    return gpus.acquire(job.gpus, names, jobs_per_gpu=share, affinity=job.record.scenario, waiting=waiting)
+
+
+def _moment() -> str:
+    """UTC, with milliseconds: leases follow one another closely."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _given(job: Job) -> list[str]:
+    return list(gpus.visible_devices()) if job.gpus else []
+
+
+def _environment(job: Job, lease: gpus.Lease | None) -> dict[str, str]:
+    """The command's: its GPUs alone; none where it asked for none, whatever a library would take by itself."""
+    if lease:
+        return os.environ | lease.environment()
+    return dict(os.environ) if job.gpus else os.environ | {gpus.VISIBLE: ""}
+
+
+def _execute(job: Job, lease: gpus.Lease | None, begun: Attempt) -> Attempt:
+    """Run the command, its output into the log and our own; returns the finished attempt."""
+    start = time.monotonic()
+    kept: collections.deque[str] = collections.deque(maxlen=KEPT)
+    process = subprocess.Popen(
+        job.command,
+        env=_environment(job, lease),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        bufsize=1,
+        # The command holds the slots too: they are free when it has ended, even if this process dies first.
+        pass_fds=[file.fileno() for file in lease.files] if lease else [],
+        preexec_fn=_die_with_parent,
+    )
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda received, frame: process.send_signal(received))
+    with Watch(process.pid, begun.devices) as watch, _Log(job.log) as log:
+        log.write(f"# {begun.started} {shlex.join(job.command)}\n")
+        assert process.stdout is not None
+        for line in process.stdout:
+            kept.append(line)
+            log.write(line)
+            if not job.quiet:
+                print(line, end="", flush=True)
+        status = process.wait()
+    fault = faults.diagnose(status, list(kept))
+    ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
+    if fault is None:
+        return ended
+    if job.quiet:
+        print("".join(kept), end="", file=sys.stderr)
+    again = " (may be tried again)" if fault.outcome == "transient" else ""
+    print(f"{fault.cause}{again}. {fault.remedy}".strip(), file=sys.stderr)
+    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(kept)))
+
+
+class _Log:
+    """The log, appended to. Where the disk is full the job's own error counts, not the log's."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> _Log:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: IO[str] | None = self._path.open("a", encoding="utf-8", buffering=1)
+        except OSError as error:
+            print(f"warning: {self._path}: {error.strerror}", file=sys.stderr)
+            self._file = None
+        return self
+
+    def write(self, text: str) -> None:
+        if self._file is None:
+            return
+        try:
+            self._file.write(text)
+        except OSError as error:
+            print(f"warning: {self._path}: {error.strerror}", file=sys.stderr)
+            self._drop()
+
+    def _drop(self) -> None:
+        file, self._file = self._file, None
+        try:
+            if file is not None:
+                file.close()
+        except OSError:
+            pass  # what it still held could not be written either
+
+    def __exit__(self, *_: object) -> None:
+        self._drop()
+
+
+def _die_with_parent() -> None:
+    """A job whose wrapper was killed must not write on while the next run makes the same files (Linux)."""
+    if sys.platform == "linux":
+        PR_SET_PDEATHSIG = 1
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,117 @@
+"""What happened to a job of the workflow: its attempts, causes of failure, time, memory, GPU. Written by `neuspring.job`.
+
+One JSON file per job at results/jobs/<rule>/<wildcards>.json, beside its log at results/logs/<rule>/<wildcards>.log.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from pydantic import TypeAdapter, ValidationError
+
+from neuspring.artifacts import write_text
+from neuspring.config_types import STRICT
+from neuspring.errors import InputError
+from neuspring.records import RECORD_FORMAT, read_json
+
+FOLDER, LOGS = "jobs", "logs"
+Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
+"""How an attempt ended. transient: may be tried again. running: it runs, or its wrapper was killed before it could say more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One run of a job's command."""
+
+    __pydantic_config__ = STRICT
+    started: str
+    """UTC, ISO 8601."""
+    seconds: float = 0.0
+    """Wall time of the command, without waiting."""
+    waited: float = 0.0
+    """s waited for a GPU."""
+    outcome: Outcome = "running"
+    cause: str = ""
+    """Why it failed, in words; empty if it did not."""
+    message: str = ""
+    """The last line of the output that says something; empty if it did not fail."""
+    exit: int | None = None
+    """Exit status; negative: the signal that ended it."""
+    host: str = ""
+    devices: list[str] = field(default_factory=list)
+    """GPUs held, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
+    device_names: list[str] = field(default_factory=list)
+    peak_memory_mb: float = 0.0
+    """Resident memory of all its processes, MiB."""
+    peak_gpu_memory_mb: float | None = None
+    """Memory in use on the held GPUs, MiB; None where it cannot be read."""
+    gpu_utilisation: float | None = None
+    """Mean over time and held GPUs, %."""
+    cpu_seconds: float = 0.0
+    samples: list[list[float | None]] = field(default_factory=list)
+    """[s since the start, CPU %, resident MiB, GPU %, GPU MiB], at most 120 rows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobRecord:
+    """All attempts of a job."""
+
+    __pydantic_config__ = STRICT
+    rule: str
+    name: str
+    """<rule>/<wildcards joined by />."""
+    log: str
+    """Relative to the results folder."""
+    attempts: list[Attempt]
+    scenario: str = ""
+    work: float = 1.0
+    """How much it had to do, in units of its rule (see `neuspring.plan`)."""
+
+    @property
+    def last(self) -> Attempt:
+        """The newest attempt."""
+        return self.attempts[-1]
+
+    @property
+    def failed(self) -> bool:
+        """Whether the newest attempt ended without success."""
+        return self.last.outcome not in ("ok", "running")
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all attempts."""
+        return sum(attempt.seconds for attempt in self.attempts)
+
+    @classmethod
+    def of_log(cls, results: Path, log: Path, scenario: str = "", work: float = 1.0) -> JobRecord:
+        """A new record of the job that logs to `log`, which must lie under results/logs. Raises InputError."""
+        try:
+            name = log.relative_to(results / LOGS).with_suffix("").as_posix()
+        except ValueError as error:
+            raise InputError(log, f"logs of jobs must lie in {results / LOGS}") from error
+        where = {"name": name, "log": log.relative_to(results).as_posix()}
+        return cls(rule=name.partition("/")[0], attempts=[], scenario=scenario, work=work, **where)
+
+    def path(self, results: Path) -> Path:
+        """Where the record lies."""
+        return Path(results) / FOLDER / f"{self.name}.json"
+
+    def save(self, results: Path) -> None:
+        """Write as JSON, atomically."""
+        write_text(self.path(results), json.dumps({"format": RECORD_FORMAT, **asdict(self)}, allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> JobRecord:
+        """Read a record. Raises InputError if it is missing or damaged."""
+        try:
+            return TypeAdapter(cls).validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
+        except ValidationError as error:
+            raise InputError(path, "must be a job record", error.errors()[0]["msg"], "Delete it.") from error
+
+
+def read_jobs(results: Path) -> list[JobRecord]:
+    """The records of all jobs of a results folder, by name. Raises InputError for a damaged one."""
+    return [JobRecord.load(path) for path in sorted((Path(results) / FOLDER).rglob("*.json"))]

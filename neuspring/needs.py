@@ -1,0 +1,135 @@
+"""What the Snakefile asks before any job exists: GPUs, the work in a job, what jobs of a rule need."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from neuspring import benchmark as benchmarks
+from neuspring import gpus
+from neuspring.benchmark import Benchmark
+from neuspring.config_gpus import Gpus
+from neuspring.data import conformance
+from neuspring.errors import InputError
+from neuspring.job_records import JobRecord
+from neuspring.plan import History, Kind, Planned
+
+TRAIN = 0.7
+"""Part of the frames that is for training, where only the count of frames is known."""
+HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
+"""What is asked for, over the most that earlier jobs needed."""
+LEAST_MEMORY, LEAST_MINUTES = 1000, 10
+
+
+def gpu_pool(settings: Gpus, device: str) -> tuple[str, ...]:
+    """The GPUs of this machine that jobs may use; none on a CPU. Raises InputError for one that is not there or not allowed."""
+    if device == "cpu":
+        return ()
+    visible = gpus.visible_devices()
+    chosen = visible if settings.devices == "all" else tuple(map(str, settings.devices))
+    with gpus.nvml() as library:
+        known = bool(library) or gpus.VISIBLE in os.environ
+    missing = [name for name in chosen if name not in visible and name.isdigit()] if known else []
+    if missing:
+        rule = "every device must be one that this run may use"
+        value = f"{', '.join(missing)}; allowed: {', '.join(visible) or 'none'}"
+        raise InputError("configuration, gpus.devices", rule, value, f"Correct it, or {gpus.VISIBLE}.")
+    if device == "cuda" and not chosen:
+        rule = "device: cuda needs a GPU that this run may use, and there is none"
+        raise InputError("configuration, device", rule, device, f"Use device: cpu or auto, or correct {gpus.VISIBLE}.")
+    return chosen
+
+
+def gpu_slots(pool: tuple[str, ...], jobs_per_gpu: int, limit: int | None) -> int:
+    """How many jobs may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError if that cannot be."""
+    slots = len(pool) * jobs_per_gpu
+    if limit is None:
+        return slots
+    where, remedy = "--resources gpu", "Leave it out to use them all."
+    if limit > slots:
+        rule = f"there are {slots} GPU slots ({len(pool)} GPUs, gpus.jobs_per_gpu {jobs_per_gpu})"
+        raise InputError(where, rule, limit, remedy)
+    if limit < 1:
+        raise InputError(where, "jobs on a GPU need one", limit, f"{remedy} Use device: cpu for none.")
+    return limit
+
+
+def planned(jobs: Iterable[Any], results: Path) -> list[Planned]:
+    """Jobs of Snakemake's DAG as `neuspring.plan` takes them; targets, which have no log, do nothing."""
+    return [
+        Planned(
+            rule=JobRecord.of_log(results, Path(job.log[0])).rule,
+            scenario=getattr(job.wildcards, "scenario", ""),
+            kind="gpu" if job.resources.get("gpu") else "cpu",
+            work=float(job.resources.get("work", 1)),
+        )
+        for job in jobs
+        if len(job.log)
+    ]
+
+
+class Needs:
+    """Work, memory and time of jobs: from the configuration, and from what earlier jobs of this results folder needed."""
+
+    def __init__(self, benchmark: Benchmark, kind: Kind) -> None:
+        self._benchmark, self._kind = benchmark, kind
+
+    @cached_property
+    def history(self) -> History:
+        """Earlier jobs of the results folder."""
+        return History.of(Path(self._benchmark.config.results))
+
+    def frames(self, scenario: str) -> int:
+        """Frames of a scenario, as far as they are known before its data are read; 1 otherwise."""
+        config, row = self._benchmark.config, self._benchmark.scenarios[scenario]
+        if row.source == "toy":
+            return config.toy.frames
+        if row.source == "mocap":
+            return config.mocap.frames or 1
+        # Synthetic scenes have the names and lengths of the released ones.
+        facts = conformance.released_cases().get(Path(row.path).name)
+        frames = int(facts["frames"]) if facts else 1
+        return min(frames, config.synthetic.frames or frames) if row.source == "synthetic" else frames
+
+    def search(self, wildcards: Any) -> int:
+        """Rollouts x training frames."""
+        row = self._benchmark.searches[wildcards.search]
+        rollouts = benchmarks.search_of(self._benchmark.config, row, wildcards.search).rollouts
+        return rollouts * math.ceil(TRAIN * self.frames(wildcards.scenario))
+
+    def fit(self, wildcards: Any) -> int:
+        """Epochs x training frames."""
+        epochs = benchmarks.fit_of(self._benchmark.config, self._benchmark.fits[wildcards.method], wildcards.method).epochs
+        return epochs * math.ceil(TRAIN * self.frames(wildcards.scenario))
+
+    def appearance(self, wildcards: Any) -> int:
+        """Iterations."""
+        return self._benchmark.config.images.appearance.iterations
+
+    def scenario(self, wildcards: Any) -> int:
+        """Frames."""
+        return self.frames(wildcards.scenario)
+
+    def memory(self, rule: str, default: int) -> Callable[..., int]:
+        """MB to ask for: half as much again as earlier jobs of the rule needed, else `default`; times the attempt."""
+
+        def needed(wildcards: Any, attempt: int) -> int:
+            peak = self.history.memory.get(rule)
+            return attempt * (max(math.ceil(HEADROOM_MEMORY * peak), LEAST_MEMORY) if peak else default)
+
+        return needed
+
+    def minutes(self, rule: str, default: int, work: Callable[[Any], int]) -> Callable[..., int]:
+        """Minutes to ask for: three times what earlier jobs took for as much work, else `default`; times the attempt."""
+
+        def needed(wildcards: Any, attempt: int) -> int:
+            rate = self.history.rates.get((rule, self._kind, "")) or self.history.rates.get((rule, "cpu", ""))
+            if rate is None:
+                return attempt * default
+            return attempt * max(math.ceil(HEADROOM_TIME * rate * work(wildcards) / 60), LEAST_MINUTES)
+
+        return needed

@@ -1,0 +1,131 @@
+"""What jobs will cost, from the times that earlier jobs took: for the plan of a dry run, and for what a cluster is asked for.
+
+Times are rates, seconds per unit of a job's work (rollouts x training frames, epochs x training frames, iterations, frames), so
+that a record made with another budget still tells something. Records of the results folder come first, then those that ship with
+the package (data/timings.csv, each with where it is from).
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from neuspring.errors import InputError
+from neuspring.job_records import JobRecord, read_jobs
+
+SHIPPED = Path(__file__).parent / "data" / "timings.csv"
+Kind = Literal["cpu", "gpu"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A job that would run."""
+
+    rule: str
+    scenario: str = ""
+    kind: Kind = "cpu"
+    work: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """Seconds per unit of work, and where that is from."""
+
+    seconds: float
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class History:
+    """Earlier jobs of a results folder."""
+
+    rates: Mapping[tuple[str, Kind, str], float] = field(default_factory=dict)
+    """(rule, kind, scenario or "" for all) -> median seconds per unit of work."""
+    memory: Mapping[str, float] = field(default_factory=dict)
+    """Rule -> largest resident memory, MiB."""
+    longest: Mapping[str, float] = field(default_factory=dict)
+    """Rule -> longest wall time, s."""
+
+    @classmethod
+    def of(cls, results: Path) -> History:
+        """What the job records of a results folder say; damaged ones are passed over."""
+        try:
+            return cls.of_records(read_jobs(results))
+        except InputError:
+            return cls()
+
+    @classmethod
+    def of_records(cls, records: Iterable[JobRecord]) -> History:
+        """From job records; only attempts that succeeded count for times."""
+        seconds: dict[tuple[str, Kind, str], list[float]] = defaultdict(list)
+        memory: dict[str, float] = defaultdict(float)
+        longest: dict[str, float] = defaultdict(float)
+        for record in records:
+            memory[record.rule] = max([memory[record.rule], *(a.peak_memory_mb for a in record.attempts)])
+            done = [attempt for attempt in record.attempts if attempt.outcome == "ok"]
+            if not done:
+                continue
+            last = done[-1]
+            kind: Kind = "gpu" if last.devices else "cpu"
+            longest[record.rule] = max(longest[record.rule], last.seconds)
+            for scenario in {"", record.scenario}:
+                seconds[record.rule, kind, scenario].append(last.seconds / record.work)
+        return cls(rates={key: statistics.median(v) for key, v in seconds.items()}, memory=dict(memory), longest=dict(longest))
+
+
+def shipped_rates(path: Path = SHIPPED) -> dict[tuple[str, str], Rate]:
+    """(rule, kind) -> the rate that ships with the package."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(line for line in stream if not line.startswith("#"))
+        return {(row["rule"], row["kind"]): Rate(seconds=float(row["seconds"]), source=row["source"]) for row in rows}
+
+
+def rate(job: Planned, history: History, shipped: Mapping[tuple[str, str], Rate]) -> Rate | None:
+    """The best known rate for a job; None where nothing is known of its rule."""
+    for scenario in (job.scenario, ""):
+        if (job.rule, job.kind, scenario) in history.rates:
+            return Rate(seconds=history.rates[job.rule, job.kind, scenario], source="this results folder")
+    if (job.rule, job.kind) in shipped:
+        return shipped[job.rule, job.kind]
+    other: Kind = "cpu" if job.kind == "gpu" else "gpu"
+    if (job.rule, other) in shipped:
+        found = shipped[job.rule, other]
+        return Rate(seconds=found.seconds, source=f"{found.source}, for want of a record on a {job.kind.upper()}")
+    return None
+
+
+def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int]) -> str:
+    """How many jobs, CPU- and GPU-hours are expected, by rule and in all, and what that rests on."""
+    shipped = shipped_rates()
+    hours: dict[tuple[str, Kind], float] = defaultdict(float)
+    counts: dict[tuple[str, Kind], int] = defaultdict(int)
+    sources: dict[str, set[str]] = defaultdict(set)
+    unknown = set()
+    for job in jobs:
+        counts[job.rule, job.kind] += 1
+        known = rate(job, history, shipped)
+        if known is None:
+            unknown.add(job.rule)
+            continue
+        hours[job.rule, job.kind] += known.seconds * job.work / 3600
+        sources[known.source].add(job.rule)
+    if not counts:
+        return ""
+    totals: dict[Kind, float] = {kind: sum(v for (_, k), v in hours.items() if k == kind) for kind in ("gpu", "cpu")}
+    parts = [f"{totals[kind]:.{1 if totals[kind] < 100 else 0}f} {kind.upper()}-hours" for kind in totals if totals[kind]]
+    lines = [f"Expected: {sum(counts.values())} jobs, {' and '.join(parts) or 'no time on record'}."]
+    largest = sorted(hours, key=lambda key: -hours[key])[:5]
+    lines += [f"  {rule}: {counts[rule, kind]} jobs, {hours[rule, kind]:.2f} {kind.upper()}-hours" for rule, kind in largest]
+    least = max([totals[kind] / slots[kind] for kind in totals if slots.get(kind)], default=0.0)
+    places = " and ".join(f"{slots[kind]} {'GPU slots' if kind == 'gpu' else 'cores'}" for kind in totals if slots.get(kind))
+    if least:
+        lines.append(f"  with {places}: at least {least:.1f} h")
+    lines += [f"  times of {', '.join(sorted(rules))}: {source}" for source, rules in sorted(sources.items())]
+    if unknown:
+        lines.append(f"  no time on record, not counted: {', '.join(sorted(unknown))}")
+    return "\n".join(lines)

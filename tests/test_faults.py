@@ -1,0 +1,51 @@
+"""Causes of failure: which are tried again."""
+
+import signal
+
+import pytest
+
+from neuspring import faults
+
+
+@pytest.mark.parametrize(
+    ("status", "output", "outcome", "cause"),
+    [
+        (1, ["torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB"], "transient", "out of GPU memory"),
+        (1, ["Warp CUDA error 2: out of memory (in function wp_alloc)"], "transient", "out of GPU memory"),
+        (1, ["RuntimeError: Failed to allocate 800 bytes on device 'cuda:0'"], "transient", "out of GPU memory"),
+        (1, ["RuntimeError: CUDA error: unspecified launch failure"], "transient", "the GPU was lost or failed"),
+        (1, ["RuntimeError: CUDA error: device-side assert triggered"], "permanent", "the program failed"),
+        (1, ["MemoryError"], "transient", "out of memory"),
+        (-signal.SIGKILL, [], "transient", "killed by the system, most likely out of memory"),
+        (137, [], "transient", "killed by the system, most likely out of memory"),
+        (-signal.SIGSEGV, [], "transient", "the process crashed (SIGSEGV)"),
+        (-signal.SIGTERM, [], "killed", "stopped from outside"),
+        (1, ["psycopg2.OperationalError: connection to server failed: Connection refused"], "transient", faults.UNREACHABLE.cause),
+        (1, ["sqlite3.OperationalError: database is locked"], "transient", faults.UNREACHABLE.cause),
+        (1, ["OSError: [Errno 28] No space left on device"], "permanent", "no space left on the disk"),
+        (2, ["error: must be writable; received Read-only file system."], "permanent", faults.READ_ONLY.cause),
+        (1, ["OSError: [Errno 116] Stale file handle"], "transient", "the storage failed"),
+        (2, ["neuspring: error: x.npz: must be an artefact."], "permanent", "bad input"),
+        (1, ["Traceback", "AssertionError"], "permanent", "the program failed"),
+    ],
+)  # fmt: skip
+def test_the_cause_is_read_off_status_and_output(status, output, outcome, cause):
+    fault = faults.diagnose(status, output)
+    assert fault is not None
+    assert (fault.outcome, fault.cause) == (outcome, cause)
+
+
+def test_success_is_no_fault_whatever_was_printed():
+    assert faults.diagnose(0, ["CUDA out of memory (handled)"]) is None
+
+
+def test_only_the_end_of_the_output_names_a_cause():
+    long_ago = ["warning: Connection refused, trying again"] + ["epoch"] * faults.TAIL + ["ValueError: no"]
+    fault = faults.diagnose(1, long_ago)
+    assert fault == faults.UNKNOWN
+
+
+def test_last_words_are_the_error_or_else_the_last_line():
+    assert faults.last_words(["ValueError: no\n", "  at exit\n", "\n"]) == "ValueError: no"
+    assert faults.last_words(["one\n", "two\n"]) == "two"
+    assert faults.last_words([]) == ""
