@@ -6,7 +6,6 @@ They compare a case with its released results where these are present; a check t
 from __future__ import annotations
 
 import csv
-import zipfile
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -18,34 +17,24 @@ from scipy.spatial import cKDTree
 from neuspring.artifacts import Observations
 from neuspring.config import ScenarioRow
 from neuspring.data import phystwin
+from neuspring.data.capture import Camera
 from neuspring.data.departure import Case, Departure, broken, note, unusual
+from neuspring.data.released import (
+    best_checkpoint,
+    depth_image,
+    gated_lift,
+    mirrored,
+    parameter_departures,
+    read_checkpoint,
+    visible_pixels,
+)
 from neuspring.data.unpickle import load_pickle
 from neuspring.errors import InputError
 
-DEPTH_GATE = (0.2, 1.5)
-"""Camera depths that the released lifting keeps, m."""
-DEPTH_SCALE = 1000.0
-"""Depth units per metre."""
 PUBLISHED = {"chamfer": 0.011579, "track_error": 0.022019}
 """Equal-case means over the future frames of the 22 released predictions, m."""
-LARGEST = 1e30
-"""No parameter comes near; also refuses infinity and NaN."""
 SELF_COLLIDING = ("cloth", "package")
 """Released cases whose name holds one of these words use the cloth configuration."""
-OPTIMAL_KEYS = (
-    "global_spring_Y",
-    "object_radius",
-    "object_max_neighbours",
-    "controller_radius",
-    "controller_max_neighbours",
-    "collide_elas",
-    "collide_fric",
-    "collide_object_elas",
-    "collide_object_fric",
-    "collision_dist",
-    "drag_damping",
-    "dashpot_damping",
-)
 
 
 def read_case(case: Case) -> Observations | None:
@@ -166,64 +155,23 @@ def compare_published(folder: Path, cases: list[Case]) -> list[Departure]:
 def _check_topology(case: Case, observations: Observations, root: Path) -> None:
     """Check 2: springs rebuilt from the released parameters against the released checkpoint."""
     parameters_path = root / "experiments_optimization" / case.name / "optimal_params.pkl"
-    checkpoint_path = _best_checkpoint(root / "experiments" / case.name / "train")
+    checkpoint_path = best_checkpoint(root / "experiments" / case.name / "train")
     if not parameters_path.exists():
         case.skip(parameters_path, "the topology check (2) is")
         return
     parameters = case.load(parameters_path, load_pickle)
     if parameters is None:
         return
-    found = _parameter_departures(parameters_path, parameters)
+    found = parameter_departures(parameters_path, parameters)
     case.found += found
     if checkpoint_path is None:
         case.skip(root / "experiments" / case.name / "train" / "best_*.pth", "the topology check (2) is")
         return
-    counts = _checkpoint_counts(case, checkpoint_path)
-    if counts is None or any(d.level == "error" for d in found):
+    checkpoint = case.load(checkpoint_path, read_checkpoint)
+    if checkpoint is None or any(d.level == "error" for d in found):
         return
+    counts = (len(checkpoint.stiffness), checkpoint.object_springs)
     _compare_topology(case, observations, parameters, checkpoint_path, counts)
-
-
-def _best_checkpoint(folder: Path) -> Path | None:
-    """The released best_{epoch}.pth, of the highest epoch if there are several."""
-    numbered = [path for path in folder.glob("best_*.pth") if path.stem.removeprefix("best_").isdecimal()]
-    return max(numbered, key=_epoch, default=None)
-
-
-def _epoch(path: Path) -> int:
-    return int(path.stem.removeprefix("best_"))
-
-
-def _parameter_departures(path: Path, parameters: Any) -> list[Departure]:
-    if not isinstance(parameters, dict):
-        return [broken(path, "", "a dict of 12 numbers is required", type(parameters).__name__)]
-    found = []
-    for key in OPTIMAL_KEYS:
-        value = parameters.get(key)
-        if key not in parameters:
-            found.append(broken(path, key, "this key is missing"))
-        elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
-            found.append(broken(path, key, "a finite number is required", value))
-        elif key.endswith("neighbours") and value != int(value):
-            found.append(broken(path, key, "a whole number is required", value))
-        elif key.endswith(("neighbours", "radius")) and value <= 0:
-            found.append(broken(path, key, "a positive number is required", value))
-    found += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
-    return found
-
-
-def _checkpoint_counts(case: Case, path: Path) -> tuple[int, int] | None:
-    """(springs, object springs) of a checkpoint, or None with a departure."""
-    import torch  # slow to import, and needed for this check alone
-
-    try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-        return len(stored["spring_Y"]), int(stored["num_object_springs"])
-    except Exception as error:  # torch names no closed set of exceptions for damaged or refused files
-        reason = str(error).partition("\n")[0]
-        rule = "a checkpoint with spring_Y and num_object_springs is required (read with weights_only)"
-        case.found.append(broken(path, "", rule, f"{type(error).__name__}: {reason}"))
-        return None
 
 
 def _compare_topology(
@@ -252,8 +200,9 @@ def _compare_topology(
     known = released_cases().get(case.name)
     if known is not None and int(known["springs"]) != counts[0]:
         case.found.append(broken(checkpoint, "spring_Y", f"the released case has {known['springs']} springs", counts[0]))
-    if known is not None and int(known["best_epoch"]) != _epoch(checkpoint):
-        case.found.append(unusual(checkpoint, "", f"the released best epoch is {known['best_epoch']}", _epoch(checkpoint)))
+    epoch = int(checkpoint.stem.removeprefix("best_"))
+    if known is not None and int(known["best_epoch"]) != epoch:
+        case.found.append(unusual(checkpoint, "", f"the released best epoch is {known['best_epoch']}", epoch))
 
 
 def check_deprojection(
@@ -272,18 +221,17 @@ def check_deprojection(
             note(tracks_path, "needs usable final_data.pkl, calibrate.pkl and metadata.json: the deprojection check (4) is skipped")
         )
         return
-    pixels = case.load(tracks_path, _visible_pixels)
-    depth = case.load(depth_path, _depth_image)
+    pixels = case.load(tracks_path, visible_pixels)
+    depth = case.load(depth_path, depth_image)
     if pixels is None or depth is None:
         return
     if depth.shape != tuple(reversed(metadata["WH"])):
         case.found.append(broken(depth_path, "", f"[height, width] must match WH = {metadata['WH']}", depth.shape))
         return
-    camera = np.asarray(metadata["intrinsics"][0], dtype=np.float64)
-    mirrored = camera.copy()
-    mirrored[0, 2] = metadata["WH"][0] - camera[0, 2]
+    width, height = metadata["WH"]
+    camera = Camera("0", width, height, np.asarray(metadata["intrinsics"][0], dtype=np.float64), cameras[0])
     observed = data["object_points"][0]
-    distances = [_lift_distance(pixels, depth, matrix, cameras[0], observed) for matrix in (camera, mirrored)]
+    distances = [_lift_distance(pixels, depth, used, observed) for used in (camera, mirrored(camera))]
     if None in distances:
         case.found.append(note(tracks_path, "no visible track has a depth within the gate: the deprojection check (4) is skipped"))
         return
@@ -294,61 +242,7 @@ def check_deprojection(
     case.found.append(note(tracks_path, message))
 
 
-def _lift_distance(
-    pixels: np.ndarray, depth: np.ndarray, camera: np.ndarray, pose: np.ndarray, observed: np.ndarray
-) -> float | None:
+def _lift_distance(pixels: np.ndarray, depth: np.ndarray, camera: Camera, observed: np.ndarray) -> float | None:
     """Median distance, m, from lifted `pixels` [Q, 2] (row, column) to their nearest observed point; None where none lifts."""
-    height, width = depth.shape
-    row, column = np.rint(pixels).astype(np.int64).T
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    row, column = row[inside], column[inside]
-    z = depth[row, column] / DEPTH_SCALE
-    gate = (z > DEPTH_GATE[0]) & (z < DEPTH_GATE[1])
-    row, column, z = row[gate], column[gate], z[gate]
-    if not len(z):
-        return None
-    rays = np.linalg.solve(camera, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
-    world = pose[:3, :3] @ (rays * z) + pose[:3, 3:]
-    return float(np.median(cKDTree(observed).query(world.T)[0]))
-
-
-def _visible_pixels(path: Path) -> np.ndarray:
-    """Frame-0 pixels [Q, 2] (row, column) of the visible tracks. Raises InputError."""
-    stored = _numpy(path)
-    try:
-        tracks, visible = stored["tracks"], stored["visibility"]
-    except (KeyError, IndexError) as error:
-        raise InputError(path, "arrays `tracks` and `visibility` are required", str(error)) from error
-    if (
-        tracks.ndim != 3
-        or tracks.shape[2] != 2
-        or visible.shape != tracks.shape[:2]
-        or not len(tracks)
-        or visible.dtype != np.bool_
-    ):
-        received = f"{tracks.shape} and {visible.shape} {visible.dtype}"
-        raise InputError(path, "tracks [T, Q, 2] and bool visibility [T, Q] are required", received)
-    pixels: np.ndarray = tracks[0][visible[0]].astype(np.float64)
-    if not np.isfinite(pixels).all():
-        raise InputError(path, "track pixels of frame 0 must be finite")
-    return pixels
-
-
-def _depth_image(path: Path) -> np.ndarray:
-    """Depth of one frame [H, W], uint16. Raises InputError."""
-    depth = _numpy(path)
-    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype != np.uint16:
-        raise InputError(path, "a uint16 image [H, W] is required", getattr(depth, "dtype", type(depth).__name__))
-    return depth
-
-
-def _numpy(path: Path) -> Any:
-    """An .npy array or the arrays of an .npz, without pickle. Raises InputError."""
-    try:
-        stored = np.load(path, allow_pickle=False)
-        if isinstance(stored, np.ndarray):
-            return stored
-        with stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, "this file must be a NumPy file without pickle", f"{type(error).__name__}: {error}") from error
+    lifted = gated_lift(camera, pixels, depth)
+    return float(np.median(cKDTree(observed).query(lifted)[0])) if len(lifted) else None
