@@ -15,6 +15,13 @@ include: "workflow/rules/images.smk"
 include: "workflow/rules/score.smk"
 include: "workflow/rules/tables.smk"
 include: "workflow/rules/tracking.smk"
+include: "workflow/rules/sweep.smk"
+
+
+# It is the main process that tries a job again, with more memory: inside a submitted job rules' own retries would multiply.
+if workflow.remote_exec:
+    for submitted in workflow.rules:
+        submitted.restart_times = 0
 
 
 # On a cluster these run where Snakemake runs: seconds of work each.
@@ -25,6 +32,7 @@ localrules:
     study,
     report,
     perception_table,
+    sweep,
 
 
 rule all:

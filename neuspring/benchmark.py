@@ -173,6 +173,8 @@ class Benchmark:
                 rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
                 raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
         chosen._require_data()
+        if config.tune:
+            _require_known("tune.scenarios", config.tune.scenarios, chosen.scenarios, "this configuration's scenarios")
         return chosen
 
     @property

@@ -6,9 +6,14 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neuspring.cli_options import Adder, read_settings
 from neuspring.errors import InputError
+
+if TYPE_CHECKING:
+    from neuspring.config import Config
+    from neuspring.config_tune import Tune
 
 
 def _sync(a: argparse.Namespace) -> int:
@@ -54,6 +59,58 @@ def _study(a: argparse.Namespace) -> int:
     return 0
 
 
+def _explain(a: argparse.Namespace) -> int:
+    from neuspring import explain, explain_text
+
+    found = explain.explain(a.cell, a.results, a.results / a.tables / "studies", a.configfile)
+    print(found.as_json() if a.json else explain_text.text(found), end="")
+    return 1 if found.problems else 0
+
+
+def _report(a: argparse.Namespace) -> int:
+    from neuspring import report, studies
+
+    options = report.Options(
+        scenarios=a.scenarios,
+        methods=a.methods,
+        seeds=a.seeds,
+        baseline=a.baseline,
+        transfers=a.transfers,
+        shown=a.shown,
+        settings=None if a.settings == "{}" else read_settings(a.settings),
+        studies=studies.read_studies(a.table),
+        tables=a.tables,
+        megabytes=a.megabytes,
+        video_megabytes=a.video_megabytes,
+    )
+    print(f"Report: {report.write(a.results, a.output, options)}")
+    return 0
+
+
+def _tune(a: argparse.Namespace) -> int:
+    from neuspring import tune
+
+    chosen, study = _study_of(a)
+    tune.work(chosen, study, a.observations, a.worker, a.device, a.output)
+    return 0
+
+
+def _tune_report(a: argparse.Namespace) -> int:
+    from neuspring import tune_report
+
+    chosen, study = _study_of(a)
+    tune_report.report(chosen, study, a.output)
+    print(a.output.read_text(encoding="utf-8"))
+    return 0
+
+
+def _study_of(a: argparse.Namespace) -> tuple[Config, Tune]:
+    chosen = read_settings(a.settings)
+    if chosen.tune is None:
+        raise InputError("--settings, tune", "a tuning study is required", None, "See config/README.md, tune.")
+    return chosen, chosen.tune
+
+
 def _fetch(a: argparse.Namespace) -> int:
     from neuspring.data import check, fetch
 
@@ -85,6 +142,28 @@ def add_commands(add: Adder) -> None:
     study.add_argument("--study", required=True, help="row of the study table")
     study.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
 
+    explain = add("explain", _explain, "a cell of a study's table -> the runs behind it, and how to make them again", "results")
+    explain.add_argument("cell", help="STUDY/ROW/TASK/METRIC, for example table1/NeuSpring/future/chamfer")
+    explain.add_argument("--tables", default="tables", help="folder of the tables in the results folder")
+    explain.add_argument("--configfile", nargs="+", default=(), help="files the benchmark was run with, for the commands")
+    explain.add_argument("--json", action="store_true")
+    page = add("report", _report, "results folder -> one self-contained HTML file", "results", "settings", "output")
+    for name in ("scenarios", "methods"):
+        page.add_argument(f"--{name}", nargs="+", default=(), help="those of the settings, else all on disk, by default")
+    page.add_argument("--seeds", nargs="+", type=int, default=())
+    page.add_argument("--transfers", nargs="*", default=(), help="scenarios whose twins were rolled out on other recordings")
+    page.add_argument("--baseline", help="method that others are compared with")
+    page.add_argument("--shown", nargs="+", default=(), help="methods to draw (default: six at most)")
+    page.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
+    page.add_argument("--tables", default="tables", help="folder of tables in the results folder")
+    page.add_argument("--megabytes", type=float, default=25.0, help="size that pictures and videos may fill up")
+    page.add_argument("--video-megabytes", type=float, default=8.0, help="of it for videos; the others are linked")
+
+    tune = add("tune", _tune, "one worker of a tuning study", "settings", "compute", "output")
+    tune.add_argument("--observations", type=Path, nargs="+", required=True, help="observations.npz of the study's scenarios")
+    tune.add_argument("--worker", type=int, default=0)
+    add("tune-report", _tune_report, "a tuning study -> summary, plots, best.yaml", "settings", "output")
+
     fetch = add("fetch", _fetch, "released archives -> the folders that the readers expect")
     fetch.add_argument("source", choices=["phystwin"])
     fetch.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="all 22 by default")
@@ -96,7 +175,7 @@ def add_commands(add: Adder) -> None:
     verify = add(
         "verify-released", _verify_released, "PhysTwin's released results, checked against ours", "settings", "compute", "output"
     )
-    verify.add_argument("data_root", type=Path, help="folder that holds data, experiments, experiments_optimization, gaussian_output")
+    verify.add_argument("data_root", type=Path, help="folder that holds data, experiments and their kin")
     verify.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
     checks = "2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
     verify.add_argument("--checks", nargs="+", type=int, help=checks)

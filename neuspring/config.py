@@ -21,6 +21,7 @@ from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 from neuspring.config_gpus import Gpus
 from neuspring.config_images import Images
 from neuspring.config_perception import Perception, Synthetic
+from neuspring.config_tune import Tune
 from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range
 from neuspring.errors import InputError
 
@@ -410,6 +411,8 @@ class Config:
     """See [images](#images)."""
     tracking: Tracking = field(default_factory=Tracking)
     """See [tracking](#tracking)."""
+    tune: Tune | None = None
+    """A tuning study, for the target `sweep`, see [tune](#tune); null: none."""
 
     def __post_init__(self) -> None:
         for name in ("scenarios", "methods", "seeds", "studies"):

@@ -20,7 +20,6 @@ from neuspring.config import SpringField as Settings
 
 AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
-RESOLUTION_FACTOR = 0.85
 FEWEST_TEXELS = 2
 """Bilinear interpolation needs two texels per side."""
 
@@ -39,9 +38,9 @@ def in_cube(points: np.ndarray) -> np.ndarray:
     return mapped
 
 
-def adaptive_resolution(springs: int) -> int:
-    """N = round(0.85 sqrt(|E|)), at least 2."""
-    return max(round(RESOLUTION_FACTOR * math.sqrt(springs)), FEWEST_TEXELS)
+def adaptive_resolution(springs: int, factor: float = 0.85) -> int:
+    """N = round(factor sqrt(|E|)), at least 2."""
+    return max(round(factor * math.sqrt(springs)), FEWEST_TEXELS)
 
 
 def fourier(values: torch.Tensor, bands: int) -> torch.Tensor:
@@ -125,7 +124,9 @@ class SpringField(nn.Module):
         self.settings = settings
         mapped = in_cube(points)
         self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
-        self.resolution = adaptive_resolution(len(points)) if settings.resolution == "adaptive" else settings.resolution
+        self.resolution = (
+            adaptive_resolution(len(points), settings.adaptive_factor) if settings.resolution == "adaptive" else settings.resolution
+        )
         generator = torch.Generator().manual_seed(seed)
         self.planes = None
         if settings.triplane:

@@ -14,6 +14,7 @@ import json
 import math
 import time
 import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -323,10 +324,17 @@ class TwinFit:
         self.optimiser.load_state_dict(stored)
 
 
-def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "") -> FitResult:
+def fit(
+    problem: FitProblem,
+    *,
+    partial: Path | None = None,
+    key: str = "",
+    on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
+) -> FitResult:
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
-    Raises NumericalFailure if no epoch could be completed.
+    `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. Raises
+    NumericalFailure if no epoch could be completed.
     """
     clock = time.perf_counter()
     run = TwinFit(problem)
@@ -348,6 +356,7 @@ def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "") -> F
         state.overflow = overflow + run.collision_overflow
         last = state.history[-1]
         progress.update(state.epoch, f"loss {last['loss']:.3e} m^2" if not last["rolled_back"] else "rolled back")
+        on_epoch(state.history)
         if partial is not None and state.epoch % problem.fit.checkpoint_every == 0:
             state.save(partial, key, earlier + time.perf_counter() - clock)
     if not math.isfinite(state.best_loss):

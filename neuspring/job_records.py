@@ -6,6 +6,7 @@ One JSON file per job at results/jobs/<rule>/<wildcards>.json, beside its log at
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -110,6 +111,15 @@ class JobRecord:
             return TypeAdapter(cls).validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
         except ValidationError as error:
             raise InputError(path, "must be a job record", error.errors()[0]["msg"], "Delete it.") from error
+
+
+def failure_lines(records: Iterable[JobRecord], results: Path) -> list[str]:
+    """What failed and why, a line a job, and where its log lies."""
+    return [
+        f"{record.name}: {record.last.cause} (attempt {len(record.attempts)}): {record.last.message}; {results / record.log}"
+        for record in records
+        if record.failed
+    ]
 
 
 def read_jobs(results: Path) -> list[JobRecord]:

@@ -19,7 +19,7 @@ PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
 NOT_NUMERICS = frozenset(
-    f"{PACKAGE}.{name}" for name in ("config", "config_gpus", "config_images", "config_perception", "progress", "records")
+    f"{PACKAGE}.{name}" for name in ("config", "config_gpus", "config_images", "config_perception", "config_tune", "progress", "records")
 )
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 

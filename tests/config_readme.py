@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from neuspring import config, config_gpus, config_images, config_perception
+from neuspring import config, config_gpus, config_images, config_perception, config_tune
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -89,6 +89,8 @@ KEYS = {
     "images.lpips": config_images.LpipsWeights,
     "images.released_quirks": config_images.ImageQuirks,
     "tracking": config.Tracking,
+    "tune": config_tune.Tune,
+    "tune.space": config_tune.Dimension,
 }
 ROWS = {"rows of methods.yaml": config.Method, "rows of searches.yaml": config.SearchRow}
 MEANINGS = {"description": "What the row is, for people."}

@@ -12,10 +12,10 @@ from types import SimpleNamespace
 
 from neuspring import benchmark as benchmarks
 from neuspring import config as settings
-from neuspring import gpus, job, needs, plan
+from neuspring import gpus, job, needs, plan, tune_space
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
-from neuspring.job_records import JobRecord
+from neuspring.job_records import failure_lines, read_jobs
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
@@ -26,6 +26,8 @@ def checked_benchmark():
     """The validated configuration; a clear message and no traceback if it is wrong or the results folder is not writable."""
     try:
         benchmark = benchmarks.Benchmark.of(config, ROOT)
+        if benchmark.config.tune:
+            tune_space.Plan.of(benchmark.config, benchmark.config.tune, ROOT)
         results = Path(benchmark.config.results)
         try:
             results.mkdir(parents=True, exist_ok=True)
@@ -106,6 +108,7 @@ WRAPPED = "python -m neuspring.job --log {log:q} --attempt {resources.attempt}"
 COMMON_JOB = f"{WRAPPED} --quiet -- python -m neuspring"
 JOB = f"{WRAPPED} --scenario {{wildcards.scenario}} --work {{resources.work}} -- python -m neuspring"
 GPU_JOB = JOB.replace(" -- ", " --gpus {resources.gpu} -- ")
+COMMON_GPU_JOB = COMMON_JOB.replace("--quiet --", "--gpus {resources.gpu} --")
 
 
 def attempt_number(wildcards, attempt):
@@ -545,6 +548,11 @@ def study_arguments(wildcards):
     ]
 
 
+def study_definition(wildcards):
+    """A study's rows, so that changed ones make its table again."""
+    return json.dumps(settings.plain(BENCHMARK.studies[wildcards.study]))
+
+
 def benchmark_arguments(output):
     """The results folder, and which runs it is to hold."""
     return [
@@ -585,12 +593,71 @@ if workflow.is_main_process:
     atexit.register(tell_plan_of_dry_run)
 
 
+TUNE_FOLDER = f"{RESULTS}/tune/{CONFIG.tune.study}" if CONFIG.tune else ""
+
+
 def sweep_summaries():
-    return []
+    """The summary of the tuning study, if the configuration has one."""
+    return [f"{TUNE_FOLDER}/summary.md"] if CONFIG.tune else []
 
 
-def report_arguments():
-    return []
+def sweep_targets(wildcards):
+    if not CONFIG.tune:
+        raise WorkflowError(
+            "The target sweep needs a study: the section `tune` of the configuration (config/README.md, config/tune.yaml)."
+        )
+    logged = [f"{TUNE_FOLDER}/mlflow.txt"] if CONFIG.tracking.enabled else []
+    return [*sweep_summaries(), *logged]
+
+
+def finished_sweeps():
+    """A study costs much and is not asked for by `all`; the report shows one that is there."""
+    return [path for path in sweep_summaries() if Path(path).exists()]
+
+
+def tune_settings():
+    """What a study's workers need; its tables of methods and searches are found wherever a job runs."""
+    names = ("simulation", "losses", "search", "fit", "released_quirks", "tune")
+    tables = {
+        name: str(ROOT / getattr(CONFIG, name))
+        for name in ("method_table", "search_table")
+    }
+    chosen = json.loads(section(*names, "scenarios")) | tables
+    return json.dumps(chosen, sort_keys=True)
+
+
+def tuned_rows():
+    """The rows of the method that is varied, so that changed ones are tuned again."""
+    method = benchmarks.read_methods(ROOT / CONFIG.method_table)[CONFIG.tune.method]
+    search = benchmarks.read_searches(ROOT / CONFIG.search_table)[method.search]
+    rows = [settings.plain(method), settings.plain(search)]
+    return json.dumps(rows, sort_keys=True)
+
+
+def report_arguments(output=REPORT):
+    values = settings.plain(CONFIG)
+    # Where MLflow lies may hold a password, and concerns nothing that the report shows.
+    del values["tracking"]
+    return [
+        *("--results", RESULTS, "--output", output),
+        *("--settings", json.dumps(values, sort_keys=True)),
+        *("--table", str(ROOT / CONFIG.study_table), "--tables", CONFIG.tables),
+        *("--baseline", BENCHMARK.compared_with),
+        *(["--transfers", *BENCHMARK.transfers] if BENCHMARK.transfers else []),
+    ]
+
+
+def tell_failures():
+    """What failed and why; the report says the same."""
+    try:
+        lines = failure_lines(read_jobs(Path(RESULTS)), Path(RESULTS))
+    except InputError as error:
+        lines = [str(error)]
+    print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
+    print(
+        f"Report so far: {TABLE_FOLDER}/so_far/report.html. The same command continues where this one stopped.",
+        flush=True,
+    )
 
 
 def report_end(failed):
@@ -601,10 +668,10 @@ def report_end(failed):
         command = [sys.executable, "-m", "neuspring", "tables"]
         so_far = f"{TABLE_FOLDER}/so_far"
         subprocess.run([*command, *table_arguments(so_far)], check=False)
-        print(
-            "The logs of failed jobs are named above. The same command continues where this one stopped.",
-            flush=True,
-        )
+        command[-1] = "report"
+        page = report_arguments(f"{so_far}/report.html")
+        subprocess.run([*command, *page], check=False, stdout=subprocess.DEVNULL)
+        tell_failures()
         return
     if not Path(TABLES).exists():
         return
@@ -613,7 +680,7 @@ def report_end(failed):
         f"Scores, trajectories, plots: {RESULTS}/<scenario>/<method>/<seed>/ (run.json names the twin), tables: {RESULTS}/{CONFIG.tables}/"
     )
     print(
-        f"Open in a browser: {RESULTS}/{CONFIG.tables}/pictures.html (videos of every method, beside each other)"
+        f"Open in a browser: {REPORT} (everything), {TABLE_FOLDER}/pictures.html (videos of every method)"
     )
     tell_tracking()
 

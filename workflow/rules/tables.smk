@@ -43,6 +43,7 @@ rule study:
         runtime=minutes("study", 10),
     params:
         arguments=study_arguments,
+        definition=study_definition,
         code=code_digest("neuspring.tables_paper"),
     shell:
         COMMON_JOB + " study {params.arguments:q}"
@@ -62,7 +63,7 @@ rule report:
         tables=TABLES,
         studies=[study_table(name) for name in CONFIG.studies],
         perception=perception_tables(),
-        sweeps=sweep_summaries(),
+        sweeps=finished_sweeps(),
     output:
         REPORT,
     log:

@@ -1,0 +1,189 @@
+"""Faults in a running workflow: one costs one job, nothing finished is lost, the same command continues."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from neuspring.job_records import JobRecord, read_jobs
+from tests.data.phystwin_case import write_case
+
+from .project import ROOT, SCENE, arguments
+
+OTHER, RELEASED = "toy_blob_lift_smooth", "weird_package"
+SABOTAGE = '''
+"""Lets chosen `neuspring` commands fail when they are first called; counts the calls of all."""
+import json, os, sys
+from pathlib import Path
+if sys.orig_argv[1:3] == ["-m", "neuspring"] and "FAULTS" in os.environ:
+    line = " ".join(sys.orig_argv[3:])
+    for name, (words, message) in json.loads(os.environ["FAULTS"]).items():
+        if all(word in line for word in words):
+            calls = Path(os.environ["FAULT_CALLS"], name)
+            with calls.open("a") as stream:
+                stream.write("x")
+            if calls.stat().st_size == 1 and message:
+                sys.exit(message)
+'''
+
+
+@pytest.fixture
+def sabotage(tmp_path):
+    """Environment in which commands fail once: faults(name=(words of the command line, last words or "")); and the calls so far."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(SABOTAGE)
+    calls = tmp_path / "calls"
+    calls.mkdir()
+
+    def environment(**faults):
+        path = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
+        return os.environ | {"PYTHONPATH": path, "FAULTS": json.dumps(faults), "FAULT_CALLS": str(calls)}
+
+    environment.count = lambda name: (calls / name).stat().st_size if (calls / name).exists() else 0
+    return environment
+
+
+def start(place, changes, environment):
+    return subprocess.Popen(
+        arguments(place, changes), cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def wait_for(condition, process):
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def wrapper_of(*words):
+    """The wrapper process of a job, by words of its command line."""
+    for process in psutil.process_iter(["cmdline"]):
+        line = process.info["cmdline"] or []
+        if line[1:3] == ["-m", "neuspring.job"] and all(word in " ".join(line) for word in words):
+            return process
+    raise AssertionError(f"no wrapper with {words}")
+
+
+def record(results, name):
+    return JobRecord.load(results / "jobs" / f"{name}.json")
+
+
+def finished(results):
+    return {path.parent.parent.parent.name for path in results.glob("*/*/*/run.json")}
+
+
+def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path, sabotage):
+    """Out of GPU memory, a wrapper killed in the middle, corrupt data and a dead tracking server, all in one run."""
+    results, data = place / "results", tmp_path / "data"
+    case = write_case(data, RELEASED)
+    whole = (case / "final_data.pkl").read_bytes()
+    (case / "final_data.pkl").write_bytes(whole[:1000])
+    changes = {
+        "scenarios": [SCENE, OTHER, RELEASED],
+        "methods": ["baseline"],
+        "data_root": str(data),
+        "fit": {"epochs": 40},
+        "tracking": {"uri": "http://127.0.0.1:9"},
+    }
+    faults = {
+        "memory": (["fit", f"/{SCENE}/"], "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."),
+        "killed": (["fit", f"/{OTHER}/"], ""),
+        "corrupt": (["observe", RELEASED], ""),
+    }
+    process = start(place, changes, sabotage(**faults))
+    partial = results / OTHER / "baseline" / "0" / "fit.partial.npz"
+    wait_for(partial.exists, process)
+    wrapper = wrapper_of("fit", f"/{OTHER}/")
+    (command,) = wrapper.children()
+    wrapper.send_signal(signal.SIGKILL)
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 1, output
+
+    # Two of three scenarios are finished: one after another attempt, one from its checkpoint.
+    assert finished(results) == {SCENE, OTHER}
+    assert [attempt.outcome for attempt in record(results, f"fit/{SCENE}/baseline/0").attempts] == ["transient", "ok"]
+    assert record(results, f"fit/{SCENE}/baseline/0").attempts[0].cause == "out of GPU memory"
+    assert [attempt.outcome for attempt in record(results, f"fit/{OTHER}/baseline/0").attempts] == ["running", "ok"]
+    assert json.loads((results / OTHER / "baseline" / "0" / "fit.json").read_text())["attempts"] == 2
+    assert not command.is_running()
+    # Bad data are read once, not three times, and named.
+    assert sabotage.count("corrupt") == 1
+    assert record(results, f"observe/{RELEASED}").last.cause == "bad input"
+    assert f"observe/{RELEASED}: bad input (attempt 1)" in output
+    assert "final_data.pkl" in output
+    # The server is away: the runs wait on disk.
+    assert {path.read_text().split(":")[0] for path in results.glob("*/*/*/mlflow.txt")} == {"unreachable"}
+    so_far = (results / "tables" / "so_far" / "summary.md").read_text()
+    assert f"{RELEASED} / baseline / seed 0: missing" in so_far
+    report = (results / "tables" / "so_far" / "report.html").read_text()
+    assert "bad input" in report
+
+    # Mended data: the same command does what is missing, and nothing again.
+    calls = {name: sabotage.count(name) for name in ("memory", "killed")}
+    (case / "final_data.pkl").write_bytes(whole)
+    process = start(place, changes, sabotage(**faults))
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output
+    assert finished(results) == {SCENE, OTHER, RELEASED}
+    assert {name: sabotage.count(name) for name in calls} == calls
+    assert not [job.name for job in read_jobs(results) if job.failed]
+
+
+def mount(folder: Path, size: str):
+    """A small file system of its own; skips where that is not allowed."""
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"a file system of a chosen size cannot be mounted here: {done.stderr.strip()}")
+
+
+def remount(folder: Path, option: str):
+    subprocess.run(["mount", "-o", f"remount,{option}", str(folder)], check=True)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mounts a tmpfs")
+def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(place, tmp_path, sabotage):
+    disk = tmp_path / "disk"
+    mount(disk, "40k")
+    try:
+        changes = {"methods": ["baseline"], "results": str(disk / "results"), "tracking": {"enabled": False}}
+        calls = {"observe": (["observe"], ""), "search": (["search "], ""), "fit": (["fit "], "")}
+        results = disk / "results"
+        process = start(place, changes, sabotage(**calls))
+        output, _ = process.communicate(timeout=240)
+        assert process.returncode == 1, output
+        assert "no space left on the disk. Free some space; the same command continues." in output
+        done = {name: sabotage.count(name) for name in calls if record_ok(results, name)}
+        assert done
+
+        remount(disk, "size=100m")
+        remount(disk, "ro")
+        process = start(place, changes, sabotage(**calls))
+        output, _ = process.communicate(timeout=240)
+        assert process.returncode == 1
+        assert "this folder must be writable; received Read-only file system" in output
+        remount(disk, "rw")
+        process = start(place, changes, sabotage(**calls))
+        output, _ = process.communicate(timeout=240)
+        assert process.returncode == 0, output
+        # What was finished before the disk was full was not made again.
+        assert {name: sabotage.count(name) for name in done} == done
+        assert finished(results) == {SCENE}
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def record_ok(results, rule):
+    """Whether a rule's only job has finished."""
+    found = [job for job in read_jobs(results) if job.rule == rule]
+    return bool(found) and found[0].last.outcome == "ok"

@@ -1,0 +1,92 @@
+# A tuning study: workers share it; each is a job, and the study is as long as the configuration says, however many there are.
+if CONFIG.tune:
+
+    rule tune:
+        input:
+            observations=[
+                f"{RESULTS}/{name}/observations.npz"
+                for name in CONFIG.tune.scenarios or CONFIG.scenarios
+            ],
+        output:
+            f"{TUNE_FOLDER}/worker-{{worker}}.json",
+        log:
+            f"{RESULTS}/logs/tune/{CONFIG.tune.study}/{{worker}}.log",
+        benchmark:
+            f"{RESULTS}/benchmarks/tune/{CONFIG.tune.study}/{{worker}}.tsv"
+        wildcard_constraints:
+            worker=r"\d+",
+        retries: 2
+        conda:
+            ENVIRONMENT
+        threads: 1
+        resources:
+            attempt=attempt_number,
+            device=DEVICE,
+            gpu=GPU,
+            mem_mb=memory("tune", 8000),
+            runtime=2880,
+        params:
+            settings=tune_settings(),
+            rows=tuned_rows(),
+            code=code_digest(
+                "neuspring.fit", "neuspring.search", stage="tune_trial.run"
+            ),
+        shell:
+            COMMON_GPU_JOB
+            + " tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
+            " --device {resources.device} --threads {threads} --output {output:q}"
+
+    rule sweep_report:
+        input:
+            workers=expand(rules.tune.output, worker=range(CONFIG.tune.workers)),
+        output:
+            sweep_summaries(),
+        log:
+            f"{RESULTS}/logs/sweep/{CONFIG.tune.study}.log",
+        benchmark:
+            f"{RESULTS}/benchmarks/sweep/{CONFIG.tune.study}.tsv"
+        retries: 2
+        conda:
+            ENVIRONMENT
+        threads: 1
+        resources:
+            attempt=attempt_number,
+            mem_mb=memory("sweep", 4000),
+            runtime=minutes("sweep", 20),
+        params:
+            settings=tune_settings(),
+            code=code_digest("neuspring.tune_report"),
+        shell:
+            COMMON_JOB
+            + " tune-report --settings {params.settings:q} --output {output:q}"
+
+    rule log_sweep:
+        input:
+            store=rules.track_init.output,
+            summary=rules.sweep_report.output,
+        output:
+            f"{TUNE_FOLDER}/mlflow.txt",
+        log:
+            f"{RESULTS}/logs/log_sweep/{CONFIG.tune.study}.log",
+        benchmark:
+            f"{RESULTS}/benchmarks/log_sweep/{CONFIG.tune.study}.tsv"
+        retries: 2
+        conda:
+            ENVIRONMENT
+        threads: 1
+        resources:
+            attempt=attempt_number,
+            mem_mb=memory("log_sweep", 2000),
+            runtime=minutes("log_sweep", 30),
+        params:
+            settings=section("tracking"),
+            results=lambda wildcards, input: str(Path(input.store[0]).parent),
+            folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
+        shell:
+            COMMON_JOB
+            + " sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
+
+
+rule sweep:
+    input:
+        sweep_targets,
