@@ -1,0 +1,199 @@
+"""What a page is made of. Blocks hold data and text; the template turns them into HTML, and escapes every text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from markupsafe import Markup
+
+Tone = Literal["", "good", "bad", "warn", "mute"]
+SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chip:
+    """A word on a coloured ground, with a symbol, so that colour says nothing alone."""
+
+    text: str
+    tone: Tone = ""
+    symbol: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A cell: a main text, smaller lines and chips below it."""
+
+    text: str = ""
+    small: Sequence[str] = ()
+    chips: Sequence[Chip] = ()
+    best: bool = False
+    mark: str = ""
+    """Words for `best` that are read aloud."""
+    tone: Tone = ""
+    value: float | str | None = None
+    """What the column is sorted by; None: the text."""
+    wrap: bool = False
+    """May take several lines."""
+    link: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table; the first `stub` cells of every row are its headings."""
+
+    kind: ClassVar[str] = "table"
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    groups: Sequence[tuple[str, int]] = ()
+    """A line above the header: text and number of columns."""
+    stub: int = 1
+    sortable: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text:
+    """A paragraph; `tone` makes it a note."""
+
+    kind: ClassVar[str] = "text"
+    text: str
+    tone: Tone = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Items:
+    """A list."""
+
+    kind: ClassVar[str] = "items"
+    items: Sequence[str | Link]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """A file beside the report; `note` follows it."""
+
+    text: str
+    target: str
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Large numbers with a label each."""
+
+    kind: ClassVar[str] = "facts"
+    facts: Sequence[tuple[str, str, str]]
+    """Number, label, small print."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """The answer of one study."""
+
+    kind: ClassVar[str] = "verdict"
+    title: str
+    answer: str
+    tone: Tone
+    chips: Sequence[Chip]
+    small: Sequence[str] = ()
+    target: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """An embedded picture, or, without `data`, a link to the file and why."""
+
+    kind: ClassVar[str] = "picture"
+    caption: str
+    alt: str
+    data: str = ""
+    link: str = ""
+    reason: str = ""
+    wide: bool = False
+    """Keeps a width that can be read, and scrolls on small screens."""
+    paper: bool = False
+    """Drawn for a white page."""
+    size: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video:
+    """An embedded video, or a link to the file and why."""
+
+    kind: ClassVar[str] = "video"
+    caption: str
+    data: str = ""
+    link: str = ""
+    reason: str = ""
+    wide: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """SVG that we drew."""
+
+    kind: ClassVar[str] = "drawing"
+    svg: Markup
+    caption: str
+    wide: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Legend:
+    """Samples of lines: name, colour, dash pattern (SVG)."""
+
+    kind: ClassVar[str] = "legend"
+    entries: Sequence[tuple[str, str, str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prose:
+    """HTML that was rendered from Markdown."""
+
+    kind: ClassVar[str] = "prose"
+    html: Markup
+
+
+@dataclass(frozen=True, kw_only=True)
+class Code:
+    """Text as it is."""
+
+    kind: ClassVar[str] = "code"
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Blocks side by side, as many as fit."""
+
+    kind: ClassVar[str] = "grid"
+    blocks: Sequence[Block]
+    least: int = 17
+    """Smallest width of a column, rem."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fold:
+    """Blocks that are shown on demand."""
+
+    kind: ClassVar[str] = "fold"
+    summary: str
+    blocks: Sequence[Block]
+    open: bool = False
+    key: str = ""
+
+
+Block = Table | Text | Items | Facts | Verdict | Picture | Video | Drawing | Legend | Prose | Code | Grid | Fold
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of the page with an entry in its table of contents."""
+
+    key: str
+    title: str
+    blocks: Sequence[Block]
+    about: str = field(default="")
