@@ -472,7 +472,8 @@ class ScenarioRow:
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
     try:
-        return _adapter(kind).validate_json(json.dumps(values), strict=True)
+        result: T = _adapter(kind).validate_json(json.dumps(values), strict=True)  # type: ignore[arg-type]
+        return result
     except TypeError as error:
         raise InputError(where, "values must be plain YAML", str(error)) from error
     except ValidationError as error:
@@ -481,7 +482,7 @@ def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
 
 
 @functools.cache
-def _adapter(kind: type[T]) -> TypeAdapter[T]:
+def _adapter(kind: Any) -> TypeAdapter[Any]:
     """Building one takes longer than a thousand uses of it."""
     return TypeAdapter(kind)
 

@@ -57,8 +57,8 @@ class Tune:
     """Row of the method table that is varied; its own settings, and its search row's, are the baseline (trial 0). What it does to
     predictions alone (`carry_over`, `average_seeds`) plays no part."""
     space: dict[str, Dimension]
-    """Setting -> values. Keys are dotted paths of `simulation`, `losses`, `search`, `fit`, `released_quirks`, and `clusters`, the
-    number of regions of the method's search."""
+    """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
+    `released_quirks`, and `clusters`, the number of regions of the method's search."""
     scenarios: tuple[Name, ...] = ()
     """Scenarios whose mean loss is minimised; empty: the configuration's."""
     seed: Whole = 0

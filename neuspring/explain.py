@@ -24,9 +24,9 @@ from neuspring.errors import InputError
 from neuspring.paper import MEASURES
 from neuspring.records import RECORD_FORMAT, StageRecord, canonical, digest_file, read_json
 from neuspring.stages import RESULT_ROLES
-from neuspring.tables import Collected
+from neuspring.tables import Collected, collect
 from neuspring.tables_cells import accounted, cells, counted, of_study
-from neuspring.tables_paper import Made, collect
+from neuspring.tables_paper import Made
 
 CONTENT = ("scenario", "method", "variant", "seed", "status", "reason", "notes", "settings", "data_digest")
 """What the key of a run is taken of, beside its files; see `stages.score`."""

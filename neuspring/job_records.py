@@ -5,6 +5,7 @@ One JSON file per job at results/jobs/<rule>/<wildcards>.json, beside its log at
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -108,9 +109,15 @@ class JobRecord:
     def load(cls, path: Path) -> JobRecord:
         """Read a record. Raises InputError if it is missing or damaged."""
         try:
-            return TypeAdapter(cls).validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
+            return _adapter().validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
         except ValidationError as error:
             raise InputError(path, "must be a job record", error.errors()[0]["msg"], "Delete it.") from error
+
+
+@functools.cache
+def _adapter() -> TypeAdapter[JobRecord]:
+    """Building it takes longer than using it for a thousand records."""
+    return TypeAdapter(JobRecord)
 
 
 def failure_lines(records: Iterable[JobRecord], results: Path) -> list[str]:

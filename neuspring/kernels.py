@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,11 @@ import warp as wp
 from filelock import FileLock
 
 _loaded: set[tuple[int, str]] = set()
+
+
+def quiet() -> None:
+    """Warp says nothing of modules that it loads, only of errors. Call this before it starts."""
+    wp.config.log_level = logging.ERROR
 
 
 def load(kernel: Any, device: Any) -> Any:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,8 @@ from neuspring.artifacts import write_text
 from neuspring.errors import InputError
 
 RECORD_FORMAT = 1
+COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
+"""Packages on whose versions results depend."""
 Status = Literal["ok", "failed"]
 
 
@@ -62,6 +65,8 @@ class StageRecord:
     """1, plus one for every time the stage continued from a checkpoint."""
     device: str = "cpu"
     machine: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Of the packages that compute."""
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -133,5 +138,6 @@ class Stopwatch:
             seconds=round(earlier_seconds + self.seconds, 3),
             peak_memory_mb=round(peak, 1),
             machine=f"{platform.machine()}, Python {platform.python_version()}",
+            versions={name: version(name) for name in COMPUTING},
             **values,
         )

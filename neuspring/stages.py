@@ -319,6 +319,7 @@ def score(
         "timings": {name: record.seconds for name, record in stages.items()} | {"score": round(clock.seconds, 3)},
         "peak_memory_mb": {name: record.peak_memory_mb for name, record in stages.items()},
         "machine": last.machine,
+        "versions": stages[twin_stage].versions,
         "scores_file": "scores.parquet",
         "histories": {name: _relative(path, folder) for name, path in histories.items()},
         "artifacts": {name: [_relative(path, folder) for path in paths] for name, paths in artefacts.items()},

@@ -42,6 +42,9 @@ Headings = Mapping[tuple[str, str], str]
 SHOWN = {"chamfer": (MM, 2), "track_error": (MM, 2), "psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (1.0, 4), "iou": (1.0, 3)}
 """Metric -> factor and digits in tables."""
 NOT_COMPUTED = "not computed"
+RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
+DAMAGED = "damaged record: "
+"""How the reason of a run begins whose files cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -53,21 +56,32 @@ class Collected:
 
 
 def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
-    """Read the records of every (scenario, method, seed); a run without a record is listed as missing."""
+    """Read the records of every (scenario, method, seed); a run without a record is missing, one with a damaged record failed."""
     tables, rows = [], []
     for identity, path in _records(results, scenarios, methods, seeds, "run.json"):
         if not path.is_file():
-            rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished", "notes": ""})
+            rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished"})
             continue
-        record = read_json(path, RECORD_FORMAT)
-        outcome = {"status": record["status"], "reason": record["reason"], "notes": "; ".join(record["notes"])}
-        timings = {f"seconds_{name}": value for name, value in record["timings"].items()}
-        memory = {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
-        averaged = {"averaged": record.get("params", {}).get("rollout.result.averaged", 1)}
-        images = {"images": json.dumps(record.get("images"))}
-        rows.append(identity | outcome | averaged | images | timings | memory)
-        tables.append(pd.read_parquet(path.parent / record["scores_file"]))
-    return Collected(_stacked(tables), pd.DataFrame(rows))
+        try:
+            facts, scores = _run(path)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            facts = {"status": "failed", "reason": f"{DAMAGED}{' '.join(str(error).split()) or type(error).__name__}"}
+        else:
+            tables.append(scores)
+        rows.append(identity | facts)
+    columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
+    runs = pd.DataFrame(rows, columns=list(columns))
+    return Collected(_stacked(tables), runs.fillna(dict.fromkeys(("notes", "source", "run_key"), "")))
+
+
+def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """What a table needs of a run.json, and its scores. Raises OSError, ValueError, KeyError, TypeError for a damaged one."""
+    record = read_json(path, RECORD_FORMAT)
+    facts = {name: record[name] for name in ("status", "reason", "source", "run_key")} | {"notes": "; ".join(record["notes"])}
+    facts |= {f"seconds_{name}": value for name, value in record["timings"].items()}
+    facts |= {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
+    facts |= {"averaged": record.get("params", {}).get("rollout.result.averaged", 1), "images": json.dumps(record.get("images"))}
+    return facts, pd.read_parquet(path.parent / record["scores_file"])[list(COLUMNS)]
 
 
 def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:

@@ -11,7 +11,6 @@ import dataclasses
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,11 @@ from neuspring.artifacts import write_text
 from neuspring.config import parse
 from neuspring.config_types import STRICT, Name
 from neuspring.figures_clusters import cluster_methods, clusters_figure
-from neuspring.metrics import COLUMNS, averages
+from neuspring.metrics import averages
 from neuspring.paper import MEASURES
 from neuspring.records import RECORD_FORMAT, read_json
 from neuspring.studies import Study
-from neuspring.tables import Collected
+from neuspring.tables import Collected, collect
 from neuspring.tables_cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
 from neuspring.tables_render import (
     PREAMBLE,
@@ -43,7 +42,6 @@ from neuspring.tables_render import (
 
 RELEASED_METHODS = ("phystwin", "baseline")
 """Our rows for the method whose scores per scenario are released."""
-RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
 VERDICTS = (
     "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
     "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
@@ -79,26 +77,6 @@ class Made:
     def load(cls, path: Path) -> Made:
         """Raises InputError."""
         return parse(cls, read_json(path, RECORD_FORMAT), str(path))
-
-
-def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
-    """As `tables.collect`, with `source` and `run_key` of every run; a run whose files cannot be read has failed."""
-    scores, rows = [], []
-    for scenario, method, seed in product(scenarios, methods, seeds):
-        path = Path(results) / scenario / method / str(seed) / "run.json"
-        try:
-            one = tables.collect(results, [scenario], [method], [seed])
-            record = read_json(path, RECORD_FORMAT) if path.is_file() else {"source": "", "run_key": ""}
-            row = one.runs.iloc[0].to_dict() | {name: record[name] for name in ("source", "run_key")}
-            scores += [one.scores[list(COLUMNS)]] if len(one.scores) else []
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            reason = f"damaged record: {' '.join(str(error).split()) or type(error).__name__}"
-            row = {"scenario": scenario, "method": method, "seed": seed, "status": "failed", "reason": reason}
-        rows.append(row)
-    found = pd.concat(scores, ignore_index=True) if scores else pd.DataFrame(columns=list(COLUMNS))
-    columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
-    table = pd.DataFrame(rows, columns=list(columns))
-    return Collected(found, table.fillna(dict.fromkeys(("notes", "source", "run_key"), "")))
 
 
 def write_study(

@@ -153,6 +153,8 @@ def yaml_text(value: Any) -> str:
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, tuple):
         return f"[{', '.join(map(yaml_text, value))}]"
+    if value == "":
+        return '""'
     # Six digits: 1/6 is meant, not its last bit.
     return repr(float(f"{value:.6g}")) if isinstance(value, float) else str(value)
 
@@ -171,6 +173,8 @@ def allowed(hint: Any) -> str:
         if arguments[-1] is Ellipsis:
             return f"list of {allowed(arguments[0])}"
         return f"[{', '.join(map(allowed, arguments))}]"
+    if dataclasses.is_dataclass(hint):
+        return "section"
     return "mapping" if origin is dict else PLAIN[hint]
 
 

@@ -14,6 +14,8 @@ from neuspring import config
 from neuspring.benchmark import Benchmark
 from neuspring.config import Config, Method, SearchRow, parse
 from neuspring.errors import InputError
+from neuspring.studies import read_studies
+from neuspring.tune_space import Plan
 
 ROOT = Path(__file__).parents[1]
 
@@ -171,7 +173,9 @@ def benchmark(root: Path, **values: Any) -> Benchmark:
     write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n")
     write(root / "methods.yaml", METHODS)
     write(root / "searches.yaml", SEARCHES)
+    write(root / "studies.yaml", "both: {title: t, reference: null, baseline: Plain, rows: {Plain: full, Later: not_there}}")
     tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml", "search_table": "searches.yaml"}
+    tables["study_table"] = "studies.yaml"
     return Benchmark.of({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
 
 
@@ -180,6 +184,7 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
     assert (list(made.scenarios), list(made.methods)) == (["rope"], ["long", "full"])
     assert list(made.searches) == ["uniform"], "shared by both, and no other"
     assert list(benchmark(tmp_path, methods=["ours", "coarse"]).searches) == ["pieces", "uniform"]
+    assert made.methods_of("both") == ("full",), "a row whose method does not exist is no error"
     assert made.data_path("rope") is None
     (tmp_path / "cable.csv").touch()
     found = benchmark(tmp_path, scenarios=["cable"], data_root=str(tmp_path))
@@ -290,7 +295,12 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_field"],
         ["mocap", "mocap_prediction"],
         ["mocap", "one_seed"],
-        ["phystwin"],
+        ["benchmark"],
+        ["benchmark", "tune"],
+        ["toy", "paper"],
+        ["toy", "tune"],
+        ["mocap", "paper"],
+        ["synthetic", "paper"],
     ],
 )
 def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
@@ -303,6 +313,20 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
     benchmark = Benchmark.of(values | {"data_root": str(tmp_path)}, ROOT)
     assert benchmark.compared_with in benchmark.methods
     assert set(benchmark.fits) <= set(tables.read_methods(ROOT / "config" / "methods.yaml"))
+    if benchmark.config.tune:
+        assert Plan.of(benchmark.config, benchmark.config.tune, ROOT)
+
+
+def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
+    whole, paper = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("benchmark", "paper"))
+    assert {name: whole[name] for name in paper} == paper
+    studies = read_studies(ROOT / "config" / "studies.yaml")
+    assert list(studies) == paper["studies"]
+    known = set(tables.read_methods(ROOT / "config" / "methods.yaml"))
+    named = {method for study in studies.values() for method in study.rows.values()}
+    assert named & known <= set(paper["methods"])
+    rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values()
+    assert {row.scenario for row in rows if row.source == "phystwin"} == set(whole["scenarios"])
 
 
 def test_every_method_that_is_shipped_is_valid():

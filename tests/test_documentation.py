@@ -20,8 +20,11 @@ def test_the_configuration_page_is_up_to_date_and_complete():
 
 def sections(kind: type) -> set[type]:
     """A dataclass of the configuration and every one nested in it."""
-    nested = [hint for hint in typing.get_type_hints(kind).values() if dataclasses.is_dataclass(hint)]
-    return {kind}.union(*map(sections, nested))
+    hints = list(typing.get_type_hints(kind).values())
+    for hint in hints:
+        # Sections that may be null, or that a mapping holds.
+        hints += [inner for inner in typing.get_args(hint) if not isinstance(inner, str)]
+    return {kind}.union(*(sections(hint) for hint in hints if dataclasses.is_dataclass(hint)))
 
 
 def test_every_section_is_on_the_page():
@@ -37,6 +40,8 @@ def test_shown_defaults_are_accepted_as_they_are_written():
     """Read as YAML by the strict configuration, they are the defaults (but for sigma, which is shown rounded)."""
     written = {}
     for title, kind in config_readme.KEYS.items():
+        if title.startswith("tune"):
+            continue  # null unless it is set
         place = written
         for name in [] if title == "(top level)" else title.split("."):
             place = place.setdefault(name, {})

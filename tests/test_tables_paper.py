@@ -31,7 +31,7 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
         rows += [(scenario, "rope", method, seed, *key, value, "", counts) for key, value in scores.items()]
         runs.append((scenario, method, seed, "ok", "", "", None, source, "k"))
     runs += [(*run, "failed", "it diverged", "", None, source, "k") for run in failed]
-    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(tables_paper.RUN_COLUMNS)))
+    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(tables.RUN_COLUMNS)))
 
 
 def cells_of(name: str, runs: Collected) -> pd.DataFrame:
@@ -342,7 +342,7 @@ def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values()
 
 def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_path):
     folder, out, _ = written
-    everything = tables_paper.collect(folder, RELEASED[:8], ["neuspring", "search_only", "phystwin"], [0, 1])
+    everything = tables.collect(folder, RELEASED[:8], ["neuspring", "search_only", "phystwin"], [0, 1])
     tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
     for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()

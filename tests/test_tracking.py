@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import json
 import os
@@ -15,19 +14,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pandas
 import pytest
 
-from neuspring import tracking
+from neuspring import tracking, tracking_query, tracking_store
 from neuspring.config import Tracking
 from neuspring.errors import InputError
+from neuspring.job_records import Attempt, JobRecord
+from tests.stores import STEPS, write_run
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = Tracking()
-STARTED, ENDED = "2026-11-21T10:00:00+00:00", "2026-11-21T10:05:30+00:00"
 STARTED_MS, ENDED_MS = 1795255200000, 1795255530000
-STEPS = 1100
-"""Points of the longest history: more than one call of `log_batch` takes."""
 
 
 @pytest.fixture(scope="module")
@@ -44,48 +41,6 @@ def results(tmp_path: Path, template: Path) -> Path:
     folder.mkdir()
     shutil.copy(template, folder / "mlflow.db")
     return folder
-
-
-def write_run(results: Path, scenario: str = "rope", seed: int = 0, **changes: Any) -> Path:
-    """A small run: 3 scores, 1 timing, 2 histories (one in another folder), 2 artifact folders."""
-    folder, search = results / scenario / "ours" / str(seed), results / scenario / "search-uniform"
-    for path in (folder, search):
-        path.mkdir(parents=True, exist_ok=True)
-    rows = [("future", "track_error", 0.0125, "m"), ("future", "chamfer", 0.005, "m"), ("train", "chamfer", float("nan"), "m")]
-    scores = pandas.DataFrame(rows, columns=["task", "metric", "value", "unit"])
-    scores.assign(scenario=scenario, category="toy", method="ours", seed=seed, frames=18).to_parquet(folder / "scores.parquet")
-    pandas.DataFrame({"step": range(STEPS), "metric": "loss", "value": 1.0}).to_parquet(folder / "fit.parquet")
-    pandas.DataFrame({"step": [0, 1, 1], "metric": ["best", "best", "sigma"], "value": [3.0, 2.0, 0.5]}).to_parquet(
-        search / "history.parquet"
-    )
-    (folder / "twin.npz").write_bytes(b"twin")
-    (search / "coarse.npz").write_bytes(b"coarse")
-    record = {
-        "format": 1,
-        "run_key": hashlib.sha256(f"{scenario} {seed}".encode()).hexdigest(),
-        "scenario": scenario,
-        "source": "toy",
-        "category": "toy",
-        "method": "ours",
-        "variant": {"search": "uniform", "fit": "springs", "clusters": 4, "frozen": False},
-        "seed": seed,
-        "status": "ok",
-        "reason": "",
-        "attempt": 1,
-        "commit": "abc123",
-        "data_digest": "d1",
-        "device": "cpu",
-        "started": STARTED,
-        "ended": ENDED,
-        "params": {f"fit.p{i}": i for i in range(120)} | {"fit.betas": [0.9, 0.99], "long": "x" * 900},
-        "timings": {"fit": 12.5},
-        "scores_file": "scores.parquet",
-        "histories": {"fit": "fit.parquet", "search": "../../search-uniform/history.parquet"},
-        "artifacts": {"twin": ["twin.npz"], "search": ["../../search-uniform/coarse.npz"]},
-    }
-    path = folder / "run.json"
-    path.write_text(json.dumps(record | changes))
-    return path
 
 
 def client_of(results: Path) -> Any:
@@ -107,14 +62,14 @@ def artifacts_of(results: Path, run: Any) -> set[str]:
 
 def python(code: str, *arguments: object, **options: Any) -> subprocess.Popen[str]:
     """Start a process that can import neuspring."""
-    environment = {name: value for name, value in os.environ.items() if name not in tracking.ENVIRONMENT}
+    environment = {name: value for name, value in os.environ.items() if name not in tracking_store.ENVIRONMENT}
     environment["PYTHONPATH"] = str(ROOT)
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, **options)
 
 
 def output(process: subprocess.Popen[str]) -> list[str]:
-    text, _ = process.communicate(timeout=60)
+    text, _ = process.communicate(timeout=240)
     assert process.returncode == 0
     return text.splitlines()
 
@@ -145,6 +100,41 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     assert {m.step: m.value for m in client.get_metric_history(run.info.run_id, "search.best")} == {0: 3.0, 1: 2.0}
     assert artifacts_of(results, run) == {"run.json", "twin", "twin/twin.npz", "search", "search/coarse.npz"}
     assert (results / "mlartifacts").is_dir()
+
+
+def write_job(results: Path, name: str, *attempts: Attempt) -> None:
+    JobRecord(rule=name.partition("/")[0], name=name, log=f"logs/{name}.log", attempts=list(attempts)).save(results)
+
+
+def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) -> None:
+    """A job is found from the record of its stage, also where another method's fit, or splats of all methods, are shared."""
+    records = ["../../search-uniform/0/search.json", "../../owner/0/fit.json", "../../appearance/0/appearance.json", "rollout.json"]
+    for name in records:
+        path = results / "rope" / "ours" / "0" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    samples: list[list[float | None]] = [[0.5, 90.0, 400.0, 50.0, 900.0], [2.6, 110.0, 500.0, None, None]]
+    used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilisation": 50.0}
+    first = Attempt(started="2026-11-21T09:00:00+00:00", outcome="transient", peak_memory_mb=9999.0)
+    write_job(results, "search/rope/uniform/0", first, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", **used))
+    for name in ("fit/rope/owner/0", "appearance/rope/0", "score/rope/ours/0", "render/rope/ours/0"):
+        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=64.0))
+    artifacts = {"records": records}
+    assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
+
+    (run,) = runs_of(results)
+    found = {name.removeprefix("system/"): value for name, value in run.data.metrics.items() if name.startswith("system/")}
+    peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
+    whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
+    last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
+    assert found == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, "no rollout: it has no job record"
+    history = client_of(results).get_metric_history(run.info.run_id, "system/search.memory_mb")
+    begin = STARTED_MS - 30 * 60_000
+    assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
+
+    (results / "jobs" / "fit" / "rope" / "owner" / "0.json").write_text("{")
+    with pytest.raises(InputError, match=r"0\.json"):
+        tracking.log_run(write_run(results, artifacts=artifacts, run_key="ab" * 32), results, SETTINGS)
 
 
 def test_batches_stay_within_the_limits_of_the_api(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +184,7 @@ tracking.log_run(Path(sys.argv[1]), Path(sys.argv[2]), Tracking())
         time.sleep(0.05)
     (alive,) = runs_of(results)
     client = client_of(results)
-    assert not tracking._close_if_free(client, alive, tracking._lock_path(results, alive.data.tags["run_key"]))
+    assert not tracking._close_if_free(client, alive, tracking_store.lock_path(results, alive.data.tags["run_key"]))
     logger.send_signal(signal.SIGKILL)
     logger.wait()
 
@@ -251,7 +241,11 @@ def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: p
     text = capsys.readouterr().err
     assert "warning: tracking: unreachable" in text and "secret" not in text + outcome
 
+    said = records[0].with_name("mlflow.txt")
+    said.write_text(f"{outcome}\n")
     assert tracking.sync(results, SETTINGS) == {"logged": [f"rope/ours/{seed}" for seed in range(3)]}
+    assert said.read_text() == "logged\n", "the workflow must not count the run as waiting for ever"
+    assert not records[1].with_name("mlflow.txt").exists()
 
 
 @pytest.mark.parametrize("damage", ["text", "postgres"])
@@ -296,6 +290,15 @@ for path in sys.argv[2:]:
     runs = runs_of(results)
     assert len(runs) == 8 and {run.data.tags["scenario"] for run in runs} == {f"s{i}" for i in range(8)}
     assert {run.info.status for run in runs} == {"FINISHED"}
+
+
+def test_results_that_another_commit_made_again_are_one_run_of_both(results: Path) -> None:
+    assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
+    again = write_run(results, commit="def456-dirty", ended="2026-11-21T12:00:00+00:00")
+    for _ in range(2):
+        assert tracking.log_run(again, results, SETTINGS) == "already logged"
+    (run,) = tracking_query.logged_runs(results, SETTINGS)
+    assert run.commits == {"abc123": ENDED_MS, "def456-dirty": STARTED_MS + 2 * 3600_000}
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -416,5 +419,5 @@ print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.env
       mlflow.telemetry.client.get_telemetry_client())
 """
     process = python(code, results, stderr=subprocess.PIPE)
-    text, errors = process.communicate(timeout=60)
+    text, errors = process.communicate(timeout=240)
     assert (text.split(), errors) == (["true", "true", "7", "None"], "")

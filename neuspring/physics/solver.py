@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import re
 import sys
@@ -24,7 +23,7 @@ import warp as wp
 
 from neuspring.artifacts import Simulation
 from neuspring.errors import InputError
-from neuspring.kernels import load
+from neuspring.kernels import load, quiet
 from neuspring.physics import contact, integrate, springs
 
 DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
@@ -34,7 +33,7 @@ DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
 def start_warp() -> None:
     """Initialise Warp once, quietly: kernels here carry their own adjoints."""
     wp.config.enable_backward = False
-    wp.config.log_level = logging.ERROR
+    quiet()
     with _without_driver_warning():
         wp.init()
 

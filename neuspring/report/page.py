@@ -11,7 +11,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
-from neuspring import tables, tables_paper
+from neuspring import tables
 from neuspring.artifacts import write_text
 from neuspring.config import Config
 from neuspring.errors import InputError
@@ -26,6 +26,8 @@ from neuspring.studies import Study
 
 TEMPLATES = Path(__file__).parent / "templates"
 MEGABYTE = 1_000_000
+MARKUP = 400
+"""Characters around an embedded picture."""
 MOST_SHOWN = 6
 """Methods that are drawn unless others are asked for."""
 
@@ -65,17 +67,22 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     material = gather(results, Path(output), options)
     cells = studies.study_cells(material) if material.choice.size else {}
     sections = _sections(material, cells)
+    sections |= _last(material, cells)
     # Pictures take the room that all else leaves.
     room = int(MEGABYTE * options.megabytes) - len(_page(material, list(sections.values()), written).encode())
-    media = Media(material.output, pictures.wanted(material), room, int(MEGABYTE * options.video_megabytes))
+    wanted = pictures.wanted(material)
+    media = Media(material.output, wanted, room - MARKUP * len(wanted), int(MEGABYTE * options.video_megabytes))
     for path, reason in media.damaged.items():
         material.lost(path, ValueError(reason))
-    sections["pictures"] = pictures.section(material, media)
-    # Last, since any section may come upon a damaged file.
-    sections["failures"] = failures.section(material)
-    sections["verdict"] = _summary(material, studies.verdicts(material, cells) if cells else [])
+    sections |= {"pictures": pictures.section(material, media)} | _last(material, cells)
     write_text(material.output, _page(material, list(sections.values()), written))
     return material.output
+
+
+def _last(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
+    """The sections that tell of damaged files, which any other may come upon."""
+    verdicts = studies.verdicts(material, cells) if cells else []
+    return {"failures": failures.section(material), "verdict": _summary(material, verdicts)}
 
 
 def gather(results: Path, output: Path, options: Options) -> Material:
@@ -83,7 +90,7 @@ def gather(results: Path, output: Path, options: Options) -> Material:
     damaged: list[Damaged] = []
     jobs = read_jobs(results, damaged)
     choice = _choice(results, options, on_disk(results, jobs))
-    collected = tables_paper.collect(results, choice.scenarios, choice.methods, choice.seeds)
+    collected = tables.collect(results, choice.scenarios, choice.methods, choice.seeds)
     return Material(
         results=results,
         output=output,
@@ -219,10 +226,10 @@ def _page(material: Material, sections: Sequence[Section], written: str) -> str:
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     choice = material.choice
     seeds = f"seeds {listed([str(seed) for seed in choice.seeds])}" if choice.seeds else "no seeds"
-    subtitle = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}; {material.results.resolve().name}"
+    numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"
     return environment.get_template("report.html.j2").render(
         title="NeuSpring: report",
-        subtitle=subtitle,
+        subtitle=f"{numbers}; {material.results.resolve().name}",
         written=written,
         sections=sections,
         symbols=SYMBOLS,

@@ -18,6 +18,7 @@ from neuspring.tables import HEADINGS, IMAGE_HEADINGS, SHOWN, TRANSFER_HEADINGS,
 from neuspring.tables_cells import LEAST_SCENARIOS
 
 Headings = Mapping[tuple[str, str], str]
+MOST_NOTES = 100
 Best = dict[tuple[str, str], float]
 
 
@@ -39,6 +40,7 @@ def section(material: Material, differences: pd.DataFrame) -> Section:
         if images:
             table = _differences(f"Pictures: paired difference to {baseline}", differences, images)
             blocks.append(Fold(summary="Paired differences of pictures", blocks=[table]))
+    blocks += _conditions(collected, usable, differences, baseline)
     blocks += _transfers(material)
     blocks += _breakdowns(collected)
     about = "Means weigh scenarios equally, ± standard deviation over seeds; below, the mean weighted by frames. Best in bold."
@@ -183,9 +185,14 @@ def _mean(value: float | None, key: tuple[str, str], best: float | None) -> Cell
     return Cell(text=number(factor * value, digits), value=value, best=value == best, mark="best")
 
 
-def conditions(collected: Collected) -> Items | None:
-    """Notes of runs that a reader of scores should know."""
-    noted = collected.runs[collected.runs["notes"].fillna("") != ""] if len(collected.runs) else collected.runs
-    if not len(noted):
-        return None
-    return Items(items=[f"{row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()])
+def _conditions(collected: Collected, usable: pd.DataFrame, differences: pd.DataFrame, baseline: str) -> list[Block]:
+    """How pictures were scored, or why they were not, in the words of the summary; and what runs noted."""
+    told = tables.image_lines(collected, usable, differences, baseline)
+    words = [line for line in told if line and not line.startswith(("|", "Paired"))]
+    blocks: list[Block] = [Items(items=words)] if words else []
+    noted: list[Any] = list(collected.runs[collected.runs["notes"] != ""].itertuples())
+    if noted:
+        notes = [f"{row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted[:MOST_NOTES]]
+        more = [f"{len(noted) - MOST_NOTES} more"] if len(noted) > MOST_NOTES else []
+        blocks.append(Fold(summary=f"{several(len(noted), 'run')} with notes", blocks=[Items(items=[*notes, *more])]))
+    return blocks

@@ -19,12 +19,10 @@ from neuspring.job_records import JobRecord
 from neuspring.metrics import COLUMNS
 from neuspring.records import RECORD_FORMAT, read_json
 from neuspring.studies import Study
-from neuspring.tables import Collected
+from neuspring.tables import DAMAGED, Collected
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """What a damaged record, table or picture raises."""
-DAMAGED = "damaged record: "
-"""How `tables_paper.collect` begins the reason of such a run."""
 METHOD_RECORDS = ("run.json", "rollout.json", "fit.json")
 METHOD_RULES = ("fit", "rollout", "render", "score")
 """Rules whose jobs are named <rule>/<scenario>/<method>/<seed>."""

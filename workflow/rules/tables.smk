@@ -64,6 +64,7 @@ rule report:
         studies=[study_table(name) for name in CONFIG.studies],
         perception=perception_tables(),
         sweeps=finished_sweeps(),
+        templates=sorted((ROOT / "neuspring/report/templates").iterdir()),
     output:
         REPORT,
     log:

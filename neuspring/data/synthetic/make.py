@@ -20,6 +20,7 @@ from neuspring.data.synthetic.sensor import measured, quantised
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.data.synthetic.vbd import VertexBlockDescent
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.kernels import quiet
 from neuspring.points import farthest
 from neuspring.progress import Progress
 from neuspring.records import digest_file
@@ -69,6 +70,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
 
     Raises InputError for an unknown scene, NumericalFailure for a clip that must not be shipped.
     """
+    quiet()
     engine_name, _, name = row.path.rpartition("/")
     if name not in SCENES or engine_name not in ENGINES:
         rule = f"must be a scene, or vbd/<scene> for the held-out engine; scenes: {sorted(SCENES)}"

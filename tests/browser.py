@@ -1,0 +1,140 @@
+"""A headless Chromium, driven through its debugging pipe: what a page looks like and complains about, at any width, offline."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any, Self
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+PATIENCE = 60.0
+CHECK = """
+(() => {
+  const page = document.documentElement;
+  const outside = [...document.querySelectorAll("main *, header *, nav *")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    return box.width && box.right > page.clientWidth + 1 && !one.closest(".scroll, pre, svg, .hidden");
+  });
+  return {
+    width: page.clientWidth, needed: page.scrollWidth, height: page.scrollHeight,
+    broken: [...document.images].filter((one) => !one.complete || !one.naturalWidth).map((one) => one.alt),
+    silent: [...document.images].filter((one) => !one.alt).length,
+    outside: outside.slice(0, 5).map((one) => one.tagName + " " + one.className + " " + one.textContent.slice(0, 40)),
+    loaded: performance.getEntriesByType("resource").map((one) => one.name).filter((name) => !name.startsWith("data:")),
+  };
+})()
+"""
+
+
+def chromium() -> str | None:
+    """The browser, if there is one."""
+    return next((found for name in NAMES if (found := shutil.which(name))), None)
+
+
+class Browser:
+    """`with Browser() as browser:`; pages are opened without network."""
+
+    def __enter__(self) -> Self:
+        program = chromium()
+        assert program is not None
+        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        to_browser, ours = os.pipe()
+        theirs, from_browser = os.pipe()
+        options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars"]
+        # The browser reads from descriptor 3 and writes to 4.
+        command = f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}'
+        self._process = subprocess.Popen(
+            ["/bin/bash", "-c", command, program, *options, f"--user-data-dir={self._folder.name}", "about:blank"],
+            pass_fds=(to_browser, from_browser),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_browser)
+        os.close(from_browser)
+        self._write, self._read, self._numbers, self._buffer = ours, theirs, itertools.count(1), b""
+        self.events: list[dict[str, Any]] = []
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        self.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=-1, uploadThroughput=-1)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        os.close(self._write)
+        os.close(self._read)
+        self._folder.cleanup()
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command of the DevTools protocol; returns its result."""
+        number = next(self._numbers)
+        message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
+        if getattr(self, "_session", None) and not method.startswith("Target."):
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._message()
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def _message(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._read], [], [], PATIENCE)
+            assert ready, "the browser does not answer"
+            part = os.read(self._read, 1 << 20)
+            assert part, "the browser has ended"
+            self._buffer += part
+        text, _, self._buffer = self._buffer.partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        if "method" in message:
+            self.events.append(message)
+        return message
+
+    def open(self, path: Path, width: int, height: int = 900, *, dark: bool = False, print_view: bool = False) -> None:
+        """Show a file in a window of a size in CSS pixels; below 600 as a phone does."""
+        self.events.clear()
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        self.call("Emulation.setEmulatedMedia", features=scheme, media="print" if print_view else "")
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        while not any(event["method"] == "Page.loadEventFired" for event in self.events):
+            self._message()
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def check(self) -> dict[str, Any]:
+        """What is wrong with the page: `CHECK`, once all pictures are decoded, with what it logged as `errors`."""
+        self.run("document.querySelectorAll('details').forEach((fold) => (fold.open = true))")
+        self.run("document.querySelectorAll('img').forEach((one) => (one.loading = 'eager'))")
+        self.run("Promise.allSettled([...document.images].map((one) => one.decode()))")
+        found: dict[str, Any] = self.run(CHECK)
+        logged = [event["params"]["entry"]["text"] for event in self.events if event["method"] == "Log.entryAdded"]
+        raised = [str(event["params"]) for event in self.events if event["method"] == "Runtime.exceptionThrown"]
+        asked = [event["params"]["request"]["url"] for event in self.events if event["method"] == "Network.requestWillBeSent"]
+        return found | {"errors": logged + raised, "asked": [url for url in asked if not url.startswith(("data:", "file:"))]}
+
+    def screenshot(self, path: Path, top: int | None = None, height: int = 900) -> None:
+        """The window as PNG, or from `top` on, CSS pixels, beyond the window."""
+        size = self.run("[document.documentElement.clientWidth, document.documentElement.scrollHeight]")
+        clip = {"x": 0, "y": top or 0, "width": size[0], "height": min(height, size[1]), "scale": 1}
+        options: dict[str, Any] = {"format": "png", "captureBeyondViewport": True}
+        answer = self.call("Page.captureScreenshot", **options, clip=clip)
+        path.write_bytes(base64.b64decode(answer["data"]))

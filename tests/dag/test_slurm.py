@@ -1,0 +1,129 @@
+"""A small benchmark on a real Slurm of one node with two stand-ins for GPUs, with a job cancelled on the way."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from neuspring.job_records import Attempt, read_jobs
+
+from . import slurm
+from .project import ROOT, SCENE, config_with, copy_workflow
+
+GPU_RULES = {"search", "fit", "rollout"}
+PATIENCE = 600
+"""s for the whole benchmark; it takes 100 on two idle cores."""
+
+
+@pytest.fixture(scope="module")
+def benchmark(tmp_path_factory):
+    """The results of a benchmark of two methods, what Slurm knows of its jobs, and the files there were when the fit was cancelled."""
+    project = copy_workflow(tmp_path_factory.mktemp("slurm") / "project")
+    # On the CPU, but asking for GPUs as on a cluster that has some.
+    overlay = config_with({"device": "auto", "fit": {"epochs": 40}})
+    (project / "overlay.yaml").write_text(yaml.safe_dump(overlay))
+    output = project / "output.txt"
+    try:
+        with slurm.one_node(), output.open("w") as file:
+            process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/slurm"),
+                    *("--default-resources", "slurm_partition=main", "--slurm-init-seconds-before-status-checks", "2"),
+                    *("--configfile", "config/config.yaml", "overlay.yaml"),
+                ],
+                cwd=project,
+                env=os.environ | {"PYTHONPATH": str(ROOT)},
+                stdout=file,
+                stderr=subprocess.STDOUT,
+            )
+            try:
+                before = cancel_fit_in_the_middle(project, process)
+                process.wait(timeout=PATIENCE)
+            finally:
+                process.kill()
+            submissions = slurm.submissions()
+    except slurm.NoSlurmError as error:
+        pytest.skip(str(error))
+    assert process.returncode == 0, output.read_text()
+    return project / "results", submissions, before
+
+
+def cancel_fit_in_the_middle(project: Path, process: subprocess.Popen) -> set[str]:
+    deadline = time.monotonic() + PATIENCE
+    while not (project / "results" / SCENE / "baseline" / "0" / "fit.partial.npz").exists():
+        assert process.poll() is None, (project / "output.txt").read_text()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    [fit] = [job for job in slurm.submissions() if job["Comment"].startswith("rule_fit") and job["JobState"] == "RUNNING"]
+    subprocess.run(["scancel", fit["JobId"]], check=True)
+    return records(project / "results")
+
+
+def records(results: Path) -> set[str]:
+    return {path.relative_to(results / SCENE).as_posix() for path in (results / SCENE).rglob("*.json") if path.parent.name == "0"}
+
+
+def named(submissions: list[dict[str, str]], name: str) -> list[dict[str, str]]:
+    return [job for job in submissions if job["Comment"].startswith(f"rule_{name}")]
+
+
+def attempts(results: Path) -> dict[str, list[Attempt]]:
+    return {job.name: job.attempts for job in read_jobs(results)}
+
+
+def test_a_benchmark_on_slurm_ends_with_all_runs_tables_and_records(benchmark):
+    results, submissions, before = benchmark
+    assert "search-uniform/0/search.json" in before
+    assert not {"baseline/0/fit.json", "baseline/0/run.json"} & before
+    runs = {f"{method}/0/{name}.json" for method in ("search_only", "baseline") for name in ("rollout", "run")}
+    assert records(results) == runs | {"search-uniform/0/search.json", "baseline/0/fit.json"}
+    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    assert len(scores) == 8
+    assert np.isfinite(scores["value"]).all()
+    assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
+    # observe, search, two of fit, and two groups of each of the two runs; the rest runs where Snakemake does.
+    assert len(submissions) == 8
+    assert sorted(job["JobState"] for job in submissions) == ["CANCELLED"] + ["COMPLETED"] * 7
+
+
+def test_gpu_jobs_ask_for_one_device_and_cpu_jobs_for_none(benchmark):
+    _, submissions, _ = benchmark
+    asked = {job["Comment"].removeprefix("rule_").split("_")[0]: job.get("TresPerJob") for job in submissions}
+    gpu = "gres:gpu:1"
+    assert asked == {"observe": None, "search": gpu, "fit": gpu, "prediction": gpu, "scores": None}
+    assert {job["Partition"] for job in submissions} == {"main"}
+
+
+def test_jobs_use_the_device_that_slurm_gave_them_and_share_none(benchmark):
+    results, _, _ = benchmark
+    jobs = attempts(results)
+    held: dict[str, list[tuple[datetime, datetime]]] = {}
+    for name, tries in jobs.items():
+        for attempt in tries:
+            assert len(attempt.devices) == (name.split("/")[0] in GPU_RULES), name
+            start = datetime.fromisoformat(attempt.started)
+            for device in attempt.devices:
+                held.setdefault(device, []).append((start, start + timedelta(seconds=attempt.seconds)))
+    assert set(held) == {"0", "1"}
+    for spans in held.values():
+        spans.sort()
+        assert all(end <= start for (_, end), (start, _) in zip(spans, spans[1:], strict=False))
+
+
+def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_its_checkpoint(benchmark):
+    results, submissions, _ = benchmark
+    first, second = named(submissions, "fit")
+    assert (first["JobState"], second["JobState"]) == ("CANCELLED", "COMPLETED")
+    assert [int(job["MinMemoryNode"].removesuffix("M")) for job in (first, second)] == [8000, 16000]
+    name = f"{SCENE}/baseline/0"
+    assert [attempt.outcome for attempt in attempts(results)[f"fit/{name}"]] == ["killed", "ok"]
+    assert json.loads((results / name / "fit.json").read_text())["attempts"] == 2
+    assert "continuing the fit after epoch" in (results / "logs" / "fit" / f"{name}.log").read_text()
