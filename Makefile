@@ -40,6 +40,8 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench_frame
 	$(BIN)/python -m tests.benchmarks.bench_adjoint
 	$(BIN)/python -m tests.benchmarks.bench_splats
+	$(BIN)/python -m tests.benchmarks.bench_start
+	$(BIN)/python -m tests.benchmarks.bench_workflow
 
 clean:
 	rm -rf .venv .snakemake

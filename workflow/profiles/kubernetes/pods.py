@@ -43,7 +43,7 @@ def manifest(properties: dict, script: Path) -> dict:
     """The Job of a job with these properties."""
     job = yaml.safe_load(TEMPLATE.read_text())
     resources = properties["resources"]
-    rule = properties.get("rule") or "-".join(sorted(properties["groupid"].split()))
+    rule = properties.get("rule") or properties["groupid"]
     job["metadata"]["generateName"] = f"neuspring-{rule.replace('_', '-').lower()}-"
     job["spec"]["activeDeadlineSeconds"] = 60 * resources["runtime"]
     # Memory as a limit too: what needs more ends as one job, and is tried again with more.
