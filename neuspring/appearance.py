@@ -19,11 +19,12 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from neuspring import config, figures_images, image_metrics
-from neuspring.artifacts import Observations, Trajectory, write_table
+from neuspring.artifacts import Observations, Trajectory
 from neuspring.config import Config
 from neuspring.config_images import Images
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_table
 from neuspring.lpips import Lpips
 from neuspring.lpips_weights import configured
 from neuspring.perception.lift import clean_masks, lifting_cameras

@@ -10,12 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
@@ -23,9 +20,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
 import numpy as np
 
 from neuspring.errors import InputError
+from neuspring.files import write_atomically
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
@@ -47,41 +45,6 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, op
         return field(metadata=metadata)
     empty = tuple(int(size) if size.isdigit() else 0 for size in sizes)
     return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write(temporary path)` beside `path`, flush it to disk, then rename it over `path`.
-
-    Raises InputError if the folder cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    except OSError as error:
-        raise InputError(
-            path.parent, "this folder must be writable", error.strerror, "Choose another results folder or fix its permissions."
-        ) from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically."""
-    write_atomically(path, lambda p: p.write_text(text, encoding="utf-8"))
-
-
-def write_table(table: pd.DataFrame, path: Path) -> Path:
-    """Write a Parquet file atomically; returns its path."""
-    write_atomically(path, lambda temporary: table.to_parquet(temporary, index=False))
-    return path
 
 
 @dataclass(frozen=True, kw_only=True)

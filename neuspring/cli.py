@@ -176,7 +176,7 @@ def _tables(a: argparse.Namespace) -> int:
 
 def _track_init(a: argparse.Namespace) -> int:
     from neuspring import tracking
-    from neuspring.artifacts import write_text
+    from neuspring.files import write_text
 
     outcome = tracking.init(a.results, read_settings(a.settings).tracking)
     write_text(a.output, json.dumps(outcome, indent=1, sort_keys=True) + "\n")
@@ -186,7 +186,7 @@ def _track_init(a: argparse.Namespace) -> int:
 
 def _log(a: argparse.Namespace) -> int:
     from neuspring import tracking
-    from neuspring.artifacts import write_text
+    from neuspring.files import write_text
 
     outcome = tracking.log_run(a.record, a.results, read_settings(a.settings).tracking)
     write_text(a.output, outcome + "\n")

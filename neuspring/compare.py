@@ -15,9 +15,9 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.artifacts import write_text
 from neuspring.config import Tracking
 from neuspring.errors import InputError
+from neuspring.files import write_text
 from neuspring.metrics import TASKS, UNITS
 from neuspring.tables import SHOWN, markdown, paired_differences
 from neuspring.tracking_query import LoggedRun, logged_runs

@@ -17,7 +17,8 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from neuspring.artifacts import Up, write_atomically
+from neuspring.artifacts import Up
+from neuspring.files import write_atomically
 
 DPI = 110
 MOST_SPRINGS = 20_000

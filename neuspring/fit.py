@@ -24,9 +24,10 @@ import pandas as pd
 import torch
 
 from neuspring import config
-from neuspring.artifacts import Observations, Twin, write_atomically
+from neuspring.artifacts import Observations, Twin
 from neuspring.config import Kind
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_atomically
 from neuspring.losses import FrameLoss
 from neuspring.motion import initial_velocity
 from neuspring.parameters import TwinParameters

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from neuspring.artifacts import write_text
+from neuspring.files import write_text
 from neuspring.records import RECORD_FORMAT, read_json
 
 NAME = "pictures.html"

@@ -14,9 +14,9 @@ from typing import Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from neuspring.artifacts import write_text
 from neuspring.config_types import STRICT
 from neuspring.errors import InputError
+from neuspring.files import write_text
 from neuspring.records import RECORD_FORMAT, read_json
 
 FOLDER, LOGS = "jobs", "logs"

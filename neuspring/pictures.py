@@ -12,11 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring import image_metrics
-from neuspring.artifacts import write_atomically
 from neuspring.config_images import Images
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, Capture
 from neuspring.errors import InputError
 from neuspring.figures_images import Pair
+from neuspring.files import write_atomically
 from neuspring.perception.results import Masks
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterise import Backend, choose_backend

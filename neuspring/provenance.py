@@ -18,9 +18,8 @@ from pathlib import Path
 PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
-NOT_NUMERICS = frozenset(
-    f"{PACKAGE}.{name}" for name in ("config", "config_gpus", "config_images", "config_perception", "config_tune", "progress", "records")
-)
+_DECLARED = ("config", "config_gpus", "config_images", "config_perception", "config_tune", "progress", "records")
+NOT_NUMERICS = frozenset(f"{PACKAGE}.{name}" for name in _DECLARED)
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 
 

@@ -19,8 +19,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from neuspring.artifacts import write_text
 from neuspring.errors import InputError
+from neuspring.files import write_text
 
 RECORD_FORMAT = 1
 COMPUTING = ("numpy", "scipy", "torch", "warp-lang")

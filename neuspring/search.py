@@ -20,8 +20,9 @@ import pandas as pd
 import torch
 
 from neuspring import config
-from neuspring.artifacts import Material, Observations, Simulation, Twin, write_atomically
+from neuspring.artifacts import Material, Observations, Simulation, Twin
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_atomically
 from neuspring.losses import FrameLoss, acceleration
 from neuspring.motion import initial_velocity
 from neuspring.physics import stability

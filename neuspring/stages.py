@@ -17,9 +17,10 @@ import numpy as np
 import pandas as pd
 
 from neuspring import config, figures, metrics, provenance
-from neuspring.artifacts import Observations, Trajectory, Twin, write_table, write_text
+from neuspring.artifacts import Observations, Trajectory, Twin
 from neuspring.config import Config, Kind, ScenarioRow
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_table, write_text
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
 RESULT_ROLES = ("twin", "trajectory")

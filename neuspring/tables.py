@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.artifacts import write_atomically, write_text
 from neuspring.figures_clusters import NAME as CLUSTERS
 from neuspring.figures_clusters import cluster_methods, clusters_figure
 from neuspring.figures_ratios import NAME as RATIOS
 from neuspring.figures_ratios import ratios_figure
+from neuspring.files import write_atomically, write_text
 from neuspring.metrics import COLUMNS, averages
 from neuspring.records import RECORD_FORMAT, StageRecord, read_json
 

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 from neuspring import paper, tables
-from neuspring.artifacts import write_text
 from neuspring.config import parse
 from neuspring.config_types import STRICT, Name
 from neuspring.figures_clusters import cluster_methods, clusters_figure
+from neuspring.files import write_text
 from neuspring.metrics import averages
 from neuspring.paper import MEASURES
 from neuspring.records import RECORD_FORMAT, read_json

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from neuspring.artifacts import write_text
+from neuspring.files import write_text
 from neuspring.records import StageRecord
 from neuspring.tables import markdown
 

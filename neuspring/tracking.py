@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from neuspring.artifacts import write_text
 from neuspring.config import Tracking
 from neuspring.errors import InputError
+from neuspring.files import write_text
 from neuspring.tracking_payload import Payload, RunRecord, cut, milliseconds, payload
 from neuspring.tracking_query import AGAIN, is_complete, search
 from neuspring.tracking_store import ARTIFACTS, connect, default_uri, lock, lock_path, masked, prepare, uri_of

@@ -25,10 +25,10 @@ from optuna.samplers import BaseSampler, TPESampler
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from neuspring import provenance
-from neuspring.artifacts import write_text
 from neuspring.config import Config
 from neuspring.config_tune import Dimension, Tune
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_text
 from neuspring.records import RECORD_FORMAT, now
 from neuspring.tune_records import FACTS, VALUES, label, labels, write_trial
 from neuspring.tune_space import Plan, holds, is_whole

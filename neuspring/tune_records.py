@@ -14,8 +14,8 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.artifacts import write_table, write_text
 from neuspring.config_tune import Tune
+from neuspring.files import write_table, write_text
 from neuspring.records import RECORD_FORMAT, canonical, read_json
 from neuspring.tune_space import Plan
 from neuspring.tune_store import Slot

@@ -14,10 +14,10 @@ import pandas as pd
 import yaml
 
 from neuspring import config
-from neuspring.artifacts import write_text
 from neuspring.benchmark import read_methods, read_searches
 from neuspring.config import Config
 from neuspring.config_tune import Tune
+from neuspring.files import write_text
 from neuspring.tables import markdown
 from neuspring.tune_records import FACTS, VALUES, labels, write_study, write_trial
 from neuspring.tune_space import CLUSTERS, Plan

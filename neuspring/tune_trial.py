@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from neuspring import config, stages
-from neuspring.artifacts import Observations, Twin, write_text
+from neuspring.artifacts import Observations, Twin
 from neuspring.config import Config
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_text
 from neuspring.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit
 from neuspring.provenance import code_digest
 from neuspring.records import StageRecord, Stopwatch, canonical, digest_file

@@ -11,8 +11,8 @@ from typing import Self
 import av
 import numpy as np
 
-from neuspring.artifacts import write_atomically
 from neuspring.errors import InputError
+from neuspring.files import write_atomically
 
 BT709 = 1
 """Code of BT.709 (ITU-T H.273) for matrix, primaries and transfer alike."""

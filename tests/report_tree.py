@@ -19,7 +19,8 @@ import numpy as np
 import pandas as pd
 
 from neuspring import config, paper
-from neuspring.artifacts import Observations, Scenario, Trajectory, write_table, write_text
+from neuspring.artifacts import Observations, Scenario, Trajectory
+from neuspring.files import write_table, write_text
 from neuspring.job_records import Attempt, JobRecord
 from neuspring.metrics import COLUMNS, UNITS
 from neuspring.records import StageRecord, digest_file

@@ -14,8 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuspring import artifacts
-from neuspring.artifacts import Artifact, Material, Observations, Scenario, Simulation, Topology, Trajectory, Twin, write_text
+from neuspring.artifacts import Artifact, Material, Observations, Scenario, Simulation, Topology, Trajectory, Twin
 from neuspring.errors import InputError
+from neuspring.files import write_text
 
 from .scenarios import observations, scenario
 

@@ -111,6 +111,7 @@ def test_declarations_and_reporting_do_not_count(copy):
 
 LEVELS = [
     {"errors"},
+    {"files"},
     {"config_types"},
     {"config_perception", "config_images", "config_gpus", "config_tune"},
     {"artifacts", "config", "progress", "kernels", "faults", "gpus"},

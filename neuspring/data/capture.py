@@ -25,12 +25,12 @@ import cv2
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from neuspring.artifacts import write_text
 from neuspring.config import parse
 from neuspring.config_types import STRICT, Finite, Name, Positive
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.errors import InputError
+from neuspring.files import write_text
 from neuspring.records import digest_file
 
 CAPTURE, TRACKS = "capture.json", "tracks.json"

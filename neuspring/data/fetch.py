@@ -20,13 +20,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from neuspring.artifacts import write_text
 from neuspring.data import phystwin
 from neuspring.data.conformance import released_cases
 from neuspring.data.departure import Departure, broken
 from neuspring.data.fetch_archive import CASES, Plan, archives, make_plan
 from neuspring.data.fetch_hub import Hub
 from neuspring.errors import InputError
+from neuspring.files import write_text
 from neuspring.progress import Progress
 from neuspring.records import now, read_json
 

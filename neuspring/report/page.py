@@ -12,10 +12,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from neuspring import tables
-from neuspring.artifacts import write_text
 from neuspring.config import Config
 from neuspring.errors import InputError
 from neuspring.figures_ratios import ratios_figure
+from neuspring.files import write_text
 from neuspring.records import now
 from neuspring.report import curves, dag, failures, pictures, prose, scores, setup, studies, work
 from neuspring.report.blocks import SYMBOLS, Block, Facts, Grid, Picture, Section, Text

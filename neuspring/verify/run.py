@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from neuspring.artifacts import Observations, write_text
+from neuspring.artifacts import Observations
 from neuspring.config_images import LpipsWeights
 from neuspring.data.conformance import read_case
 from neuspring.data.departure import Case
 from neuspring.data.phystwin import FINAL_DATA, SPLIT
 from neuspring.data.released import Released
 from neuspring.errors import InputError, NumericalFailure
+from neuspring.files import write_text
 from neuspring.lpips import Lpips
 from neuspring.lpips_weights import configured
 from neuspring.physics.solver import resolve_device

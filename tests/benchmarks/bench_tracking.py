@@ -1,9 +1,9 @@
-"""Time to log a run to MLflow: `python -m tests.benchmarks.bench_tracking [--writers 1 16] [--runs 5] [--repeats 3]`.
+"""Time to log a run to MLflow: `python -m tests.benchmarks.bench_tracking [--writers 1 16] [--runs 3] [--repeats 3]`.
 
 A run has 120 parameters, 1100 points of a loss and three files. The stores take turns within a repeat, so that other work of
-the machine meets all of them. Columns: median and longest time of `log_run`, and runs per second of all writers together, each as
-the median over repeats; last the median as a multiple of SQLite with the first count of writers in the same repeat. Writers import mlflow before
-they begin. Runs that did not arrive are counted; PostgreSQL takes part where it is installed.
+the machine meets all of them. Columns: median and longest time of `log_run`, runs per second of all writers together and runs that
+did not arrive; last the median as a multiple of that of SQLite with the first number of writers, in the same repeat. All but the
+count are medians over repeats. Writers import mlflow before they begin. PostgreSQL takes part where it is installed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def memory_mib(server: stores.Server) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--writers", type=int, nargs="+", default=[1, 16])
-    parser.add_argument("--runs", type=int, default=5, help="of every writer")
+    parser.add_argument("--runs", type=int, default=3, help="of every writer")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     with ExitStack() as stack:

@@ -41,10 +41,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from neuspring import config, figures_twin, figures_views, metrics, tables
-from neuspring.artifacts import Twin, write_text
+from neuspring.artifacts import Twin
 from neuspring.benchmark import read_scenarios
 from neuspring.data import toy
 from neuspring.errors import NumericalFailure
+from neuspring.files import write_text
 from neuspring.fit import FitProblem, fit
 from neuspring.losses import FrameLoss
 from neuspring.rollout import roll_out

@@ -1,4 +1,4 @@
-"""A Slurm of one node with fake GPUs for a test: started as root, without systemd, cgroups or accounting, and ended with the test."""
+"""A Slurm of one node with two stand-ins for GPUs: started by a test, as root, without systemd, cgroups or accounting."""
 
 import ctypes
 import fcntl
@@ -27,13 +27,13 @@ class NoSlurmError(Exception):
 
 
 @contextmanager
-def one_node(gpus: int = 2) -> Iterator[None]:
-    """A Slurm of one node that claims 8 CPUs and 64 GB, and hands out `gpus` GPUs, which are empty files. Raises NoSlurmError."""
+def one_node() -> Iterator[None]:
+    """A node that claims 8 CPUs, 64 GB and two GPUs, which jobs see as 0 and 1. Raises NoSlurmError where there can be none."""
     _check()
     with ExitStack() as stack:
         stack.enter_context(_own_settings())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="slurm-")))
-        _write(folder, gpus)
+        _write(folder)
         munge = {name: folder / f"munge.{name}" for name in ("key", "socket", "pid", "seed", "log")}
         files = {"key-file": "key", "socket": "socket", "pid-file": "pid", "seed-file": "seed", "log-file": "log"}
         options = [f"--{option}={munge[name]}" for option, name in files.items()]
@@ -47,8 +47,8 @@ def one_node(gpus: int = 2) -> Iterator[None]:
 
 
 def submissions() -> list[dict[str, str]]:
-    """All jobs so far, oldest first, as `scontrol` describes them: JobId, JobState, Comment, MinMemoryNode, TRES, ..."""
-    lines = _output("scontrol", "--oneliner", "--details", "show", "job").splitlines()
+    """All jobs so far, oldest first, as scontrol describes them: JobId, JobState, Comment, MinMemoryNode, TresPerJob, ..."""
+    lines = _output("scontrol", "--oneliner", "show", "job").splitlines()
     jobs = [dict(item.split("=", 1) for item in line.split() if "=" in item) for line in lines if line.startswith("JobId=")]
     return sorted(jobs, key=lambda job: int(job["JobId"]))
 
@@ -85,13 +85,12 @@ def _own_settings() -> Iterator[None]:
                 path.unlink(missing_ok=True)
 
 
-def _write(folder: Path, gpus: int) -> None:
+def _write(folder: Path) -> None:
     key = folder / "munge.key"
     key.write_bytes(os.urandom(1024))
     key.chmod(0o600)
-    for index in range(gpus):
-        (folder / f"gpu{index}").touch()
     host, (control, node) = _host(), _free_ports(2)
+    # Slurm wants character devices, and only looks whether they exist; every machine has these.
     (SETTINGS / "gres.conf").write_text(f"{MARK}Name=gpu File=/dev/null\nName=gpu File=/dev/zero\n")
     (SETTINGS / "slurm.conf").write_text(
         f"""{MARK}ClusterName=test
@@ -116,7 +115,7 @@ SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU_Memory
 SlurmdParameters=config_overrides
 GresTypes=gpu
-NodeName={host} NodeAddr=127.0.0.1 CPUs=8 RealMemory=64000 Gres=gpu:{gpus} State=UNKNOWN
+NodeName={host} NodeAddr=127.0.0.1 CPUs=8 RealMemory=64000 Gres=gpu:2 State=UNKNOWN
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
     )

@@ -1,5 +1,6 @@
 """A small benchmark on a real Slurm of one node with two stand-ins for GPUs, with a job cancelled on the way."""
 
+import itertools
 import json
 import os
 import subprocess
@@ -25,7 +26,7 @@ PATIENCE = 600
 
 @pytest.fixture(scope="module")
 def benchmark(tmp_path_factory):
-    """The results of a benchmark of two methods, what Slurm knows of its jobs, and the files there were when the fit was cancelled."""
+    """A benchmark's results of two methods, what Slurm knows of its jobs, and the records there were when its fit was cancelled."""
     project = copy_workflow(tmp_path_factory.mktemp("slurm") / "project")
     # On the CPU, but asking for GPUs as on a cluster that has some.
     overlay = config_with({"device": "auto", "fit": {"epochs": 40}})
@@ -115,7 +116,7 @@ def test_jobs_use_the_device_that_slurm_gave_them_and_share_none(benchmark):
     assert set(held) == {"0", "1"}
     for spans in held.values():
         spans.sort()
-        assert all(end <= start for (_, end), (start, _) in zip(spans, spans[1:], strict=False))
+        assert all(end <= start for (_, end), (start, _) in itertools.pairwise(spans))
 
 
 def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_its_checkpoint(benchmark):
