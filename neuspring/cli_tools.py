@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from neuspring.cli_options import Adder, read_settings
 from neuspring.errors import InputError
+from neuspring.files import write_text
 
 if TYPE_CHECKING:
     from neuspring.config import Config
@@ -21,10 +22,21 @@ def _sync(a: argparse.Namespace) -> int:
 
     settings = read_settings(a.settings).tracking
     tracking.init(a.results, settings)
-    outcomes = tracking.sync(a.results, settings, progress=print)
-    for outcome, names in outcomes.items():
-        print(f"{outcome}: {len(names)}")
+    outcomes = tracking.sync(a.results, settings, progress=print, under=a.under)
+    counts = "\n".join(f"{outcome}: {len(names)}" for outcome, names in outcomes.items())
+    print(counts)
+    if a.output:
+        # A step of the workflow: what could not be sent waits on disk and fails nothing.
+        write_text(a.output, f"{counts}\n")
+        return 0
     return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
+
+
+def _compare(a: argparse.Namespace) -> int:
+    from neuspring import compare
+
+    print(compare.compare(a.results, read_settings(a.settings).tracking, a.first, a.second, a.output), end="")
+    return 0
 
 
 def _ui(a: argparse.Namespace) -> int:
@@ -133,7 +145,13 @@ def _verify_released(a: argparse.Namespace) -> int:
 
 def add_commands(add: Adder) -> None:
     """Add these commands to the parser."""
-    add("sync", _sync, "send to MLflow what is missing there, and close runs that were killed", "results", "settings")
+    sync = add("sync", _sync, "send to MLflow what is missing there, and close runs that were killed", "results", "settings")
+    sync.add_argument("--under", type=Path, help="only the records under this folder of the results")
+    sync.add_argument("--output", type=Path, help="file for the counts; failures are then not an error")
+    compare = add("compare", _compare, "runs of two commits, from MLflow -> paired differences", "results", "settings")
+    compare.add_argument("first", metavar="COMMIT_A", help="a prefix will do; a copy with changes is another commit, ...-dirty")
+    compare.add_argument("second", metavar="COMMIT_B")
+    compare.add_argument("--output", type=Path, help="CSV file of the differences")
     ui = add("ui", _ui, "open the MLflow UI of a results folder", "results", "settings")
     ui.add_argument("--host", default="127.0.0.1")
     ui.add_argument("--port", type=int, default=5000)

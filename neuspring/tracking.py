@@ -73,8 +73,11 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
         return _unreachable(error, f"{record.name} is not logged; its files are complete, `sync` will log it")
 
 
-def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None) -> dict[str, list[str]]:
-    """Bring the index up to date with every run.json under `results`; on an empty database this rebuilds it.
+def sync(
+    results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None, under: Path | None = None
+) -> dict[str, list[str]]:
+    """Bring the index up to date with every run.json under `results`, or under its folder `under`; on an empty database this
+    rebuilds it.
 
     Also closes, as KILLED, the runs that killed loggers left RUNNING, and corrects the mlflow.txt beside a record that says
     that it was not logged. `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged"
@@ -88,7 +91,7 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
         progress(f"{name}: {outcome}")
 
     down = _close_leftovers(results, settings, note) if settings.enabled else None
-    for path in _records(results):
+    for path in _records(Path(under or results)):
         name = path.parent.relative_to(results).as_posix()
         if down:
             note(name, down)

@@ -634,6 +634,13 @@ def tuned_rows():
     return json.dumps(rows, sort_keys=True)
 
 
+def template_digest():
+    """Of the report's templates, which the digest of its code does not hold."""
+    folder = Path(needs.__file__).parent / "report" / "templates"
+    texts = [path.read_bytes() for path in sorted(folder.iterdir())]
+    return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
+
+
 def report_arguments(output=REPORT):
     values = settings.plain(CONFIG)
     # Where MLflow lies may hold a password, and concerns nothing that the report shows.

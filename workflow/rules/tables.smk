@@ -64,7 +64,6 @@ rule report:
         studies=[study_table(name) for name in CONFIG.studies],
         perception=perception_tables(),
         sweeps=finished_sweeps(),
-        templates=sorted((ROOT / "neuspring/report/templates").iterdir()),
     output:
         REPORT,
     log:
@@ -81,6 +80,7 @@ rule report:
         runtime=minutes("report", 20),
     params:
         arguments=report_arguments(),
+        templates=template_digest(),
         code=code_digest("neuspring.report"),
     shell:
         COMMON_JOB + " report {params.arguments:q}"
