@@ -21,12 +21,12 @@ from .project import ROOT, SCENE, config_with, copy_workflow
 
 GPU_RULES = {"search", "fit", "rollout"}
 PATIENCE = 600
-"""s for the whole benchmark; it takes 100 on two idle cores."""
+"""s for the whole benchmark; it took 225 on two cores that five processes shared."""
 
 
 @pytest.fixture(scope="module")
 def benchmark(tmp_path_factory):
-    """A benchmark's results of two methods, what Slurm knows of its jobs, and the records there were when its fit was cancelled."""
+    """A benchmark's results (two methods), what Slurm knows of its jobs, and the records there were when its fit was cancelled."""
     project = copy_workflow(tmp_path_factory.mktemp("slurm") / "project")
     # On the CPU, but asking for GPUs as on a cluster that has some.
     overlay = config_with({"device": "auto", "fit": {"epochs": 40}})

@@ -103,12 +103,30 @@ def job_prefix():
 
 shell.prefix(job_prefix())
 
-# Every job runs in a wrapper: GPU lease, log, record, cause of failure (`neuspring.job`).
-WRAPPED = "python -m neuspring.job --log {log:q} --attempt {resources.attempt}"
-COMMON_JOB = f"{WRAPPED} --quiet -- python -m neuspring"
-JOB = f"{WRAPPED} --scenario {{wildcards.scenario}} --work {{resources.work}} -- python -m neuspring"
-GPU_JOB = JOB.replace(" -- ", " --gpus {resources.gpu} -- ")
-COMMON_GPU_JOB = COMMON_JOB.replace("--quiet --", "--gpus {resources.gpu} --")
+
+def wrapped(options, command):
+    """A `neuspring` command in the wrapper that every job runs in: GPU lease, log, record, cause of failure (`neuspring.job`)."""
+    run = "python -m neuspring.job --log {log:q} --attempt {resources.attempt}"
+    return f"{run} {options} -- python -m neuspring {command}"
+
+
+def common_job(command):
+    return wrapped("--quiet", command)
+
+
+def common_gpu_job(command):
+    return wrapped("--gpus {resources.gpu}", command)
+
+
+def scenario_job(command):
+    return wrapped("--scenario {wildcards.scenario} --work {resources.work}", command)
+
+
+def gpu_job(command):
+    return wrapped(
+        "--scenario {wildcards.scenario} --work {resources.work} --gpus {resources.gpu}",
+        command,
+    )
 
 
 def attempt_number(wildcards, attempt):

@@ -32,10 +32,11 @@ rule appearance:
             stage="appearance.learn",
         ),
     shell:
-        GPU_JOB
-        + " appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
-        " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
-        " --output {output:q}"
+        gpu_job(
+            "appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
+            " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+            " --output {output:q}"
+        )
 
 
 rule render:
@@ -82,7 +83,8 @@ rule render:
             stage="appearance.render",
         ),
     shell:
-        GPU_JOB
-        + " render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
-        " --appearance {input.appearance:q} --rollout {input.rollout:q} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
+            " --appearance {input.appearance:q} --rollout {input.rollout:q} --settings {params.settings:q}"
+            " --device {resources.device} --threads {threads} --output {output:q}"
+        )

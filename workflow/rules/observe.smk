@@ -22,5 +22,6 @@ rule observe:
         code=reader_digest,
         perceived=perceived_options,
     shell:
-        JOB
-        + " observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"
+        scenario_job(
+            "observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"
+        )

@@ -22,8 +22,9 @@ rule synthesise:
         row=scenario_row,
         code=code_digest("neuspring.data.synthetic.make", stage="perceive.make_capture"),
     shell:
-        JOB
-        + " capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
+        scenario_job(
+            "capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
+        )
 
 
 rule capture:
@@ -52,8 +53,9 @@ rule capture:
         images=image_stamps,
         code=code_digest("neuspring.data.phystwin_raw", stage="perceive.make_capture"),
     shell:
-        JOB
-        + " capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
+        scenario_job(
+            "capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
+        )
 
 
 rule segment:
@@ -81,9 +83,10 @@ rule segment:
         images=image_stamps,
         code=segment_digest,
     shell:
-        GPU_JOB
-        + " segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
-        " --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
+            " --device {resources.device} --threads {threads} --output {output:q}"
+        )
 
 
 rule track:
@@ -113,9 +116,10 @@ rule track:
         images=image_stamps,
         code=backend_digest("track"),
     shell:
-        GPU_JOB
-        + " track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
-        " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
+            " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q}"
+        )
 
 
 rule lift:
@@ -149,9 +153,10 @@ rule lift:
             stage="perceive.lift",
         ),
     shell:
-        JOB
-        + " lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
-        " --settings {params.settings:q} --output {output:q}"
+        scenario_job(
+            "lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+            " --settings {params.settings:q} --output {output:q}"
+        )
 
 
 rule judge:
@@ -180,9 +185,10 @@ rule judge:
         settings=perception_settings("shape"),
         code=code_digest("neuspring.perception.judge", stage="perceive.judge"),
     shell:
-        JOB
-        + " judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
-        " --lifted {input.lifted:q} --settings {params.settings:q} --output {output:q}"
+        scenario_job(
+            "judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
+            " --lifted {input.lifted:q} --settings {params.settings:q} --output {output:q}"
+        )
 
 
 rule perception_table:
@@ -206,4 +212,4 @@ rule perception_table:
         arguments=perception_arguments(),
         code=code_digest("neuspring.tables_perception"),
     shell:
-        COMMON_JOB + " perception-table {params.arguments:q} --output {output:q}"
+        common_job("perception-table {params.arguments:q} --output {output:q}")

@@ -27,7 +27,8 @@ rule score:
         variant=variant,
         code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
     shell:
-        JOB
-        + " score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
-        " --rollout {input.rollout:q} {params.pictures:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
-        " --output {output:q}"
+        scenario_job(
+            "score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
+            " --rollout {input.rollout:q} {params.pictures:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
+            " --output {output:q}"
+        )

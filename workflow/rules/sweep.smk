@@ -32,9 +32,10 @@ if CONFIG.tune:
                 "neuspring.fit", "neuspring.search", stage="tune_trial.run"
             ),
         shell:
-            COMMON_GPU_JOB
-            + " tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
-            " --device {resources.device} --threads {threads} --output {output:q}"
+            common_gpu_job(
+                "tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
+                " --device {resources.device} --threads {threads} --output {output:q}"
+            )
 
     rule sweep_report:
         input:
@@ -57,8 +58,7 @@ if CONFIG.tune:
             settings=tune_settings(),
             code=code_digest("neuspring.tune_report"),
         shell:
-            COMMON_JOB
-            + " tune-report --settings {params.settings:q} --output {output:q}"
+            common_job("tune-report --settings {params.settings:q} --output {output:q}")
 
     rule log_sweep:
         input:
@@ -83,8 +83,9 @@ if CONFIG.tune:
             results=lambda wildcards, input: str(Path(input.store[0]).parent),
             folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
         shell:
-            COMMON_JOB
-            + " sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
+            common_job(
+                "sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
+            )
 
 
 rule sweep:

@@ -20,7 +20,7 @@ rule tables:
         arguments=table_arguments(),
         code=code_digest("neuspring.tables", "neuspring.gallery"),
     shell:
-        COMMON_JOB + " tables {params.arguments:q}"
+        common_job("tables {params.arguments:q}")
 
 
 # The paper's tables, one per study; rows whose method has not run yet say so.
@@ -46,7 +46,7 @@ rule study:
         definition=study_definition,
         code=code_digest("neuspring.tables_paper"),
     shell:
-        COMMON_JOB + " study {params.arguments:q}"
+        common_job("study {params.arguments:q}")
 
 
 for study_name in BENCHMARK.studies:
@@ -83,4 +83,4 @@ rule report:
         templates=template_digest(),
         code=code_digest("neuspring.report"),
     shell:
-        COMMON_JOB + " report {params.arguments:q}"
+        common_job("report {params.arguments:q}")

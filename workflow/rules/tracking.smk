@@ -18,8 +18,9 @@ rule track_init:
         settings=section("tracking"),
         results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
-        COMMON_JOB
-        + " track-init --results {params.results:q} --settings {params.settings:q} --output {output:q}"
+        common_job(
+            "track-init --results {params.results:q} --settings {params.settings:q} --output {output:q}"
+        )
 
 
 rule log_run:
@@ -45,6 +46,7 @@ rule log_run:
         settings=section("tracking"),
         results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
-        JOB
-        + " log --record {input.record:q} --results {params.results:q} --settings {params.settings:q}"
-        " --output {output:q}"
+        scenario_job(
+            "log --record {input.record:q} --results {params.results:q} --settings {params.settings:q}"
+            " --output {output:q}"
+        )

@@ -23,9 +23,10 @@ rule search:
         clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
         code=code_digest("neuspring.search"),
     shell:
-        GPU_JOB
-        + " search --observations {input.observations:q} --settings {params.settings:q}"
-        " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "search --observations {input.observations:q} --settings {params.settings:q}"
+            " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q}"
+        )
 
 
 rule fit:
@@ -54,9 +55,10 @@ rule fit:
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
         code=code_digest("neuspring.fit"),
     shell:
-        GPU_JOB
-        + " fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-        " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
+            " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q}"
+        )
 
 
 rule rollout:
@@ -86,9 +88,10 @@ rule rollout:
             "neuspring.rollout", "neuspring.motion", "neuspring.carry", stage="rollout"
         ),
     shell:
-        GPU_JOB
-        + " rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
-        " --device {resources.device} --threads {threads} --output {output:q}"
+        gpu_job(
+            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
+            " --device {resources.device} --threads {threads} --output {output:q}"
+        )
 
 
 rule transfer:
@@ -122,7 +125,8 @@ rule transfer:
             stage="transfer",
         ),
     shell:
-        GPU_JOB
-        + " transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
-        " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
-        " --output {output:q}"
+        gpu_job(
+            "transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
+            " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+            " --output {output:q}"
+        )
