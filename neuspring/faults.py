@@ -14,6 +14,8 @@ from typing import Literal
 
 TAIL = 40
 """Lines of output that are searched for a cause."""
+WARNING = re.compile(r"\s*warning\b", re.IGNORECASE)
+"""What a command went on after is not what ended it."""
 BAD_INPUT = 2
 """Exit status of `neuspring` for input that only another input can mend."""
 
@@ -44,13 +46,19 @@ PATTERNS = (
     (r"read-only file system", READ_ONLY),
     (r"cuda out of memory|OutOfMemoryError|CUDA_ERROR_OUT_OF_MEMORY|CUDA error 2: out of memory", GPU_MEMORY),
     (r"failed to allocate \d+ bytes on device 'cuda|CUBLAS_STATUS_ALLOC_FAILED", GPU_MEMORY),
-    (r"CUDA error: (unspecified launch failure|uncorrectable ECC|the launch timed out|unknown error)", LOST_DEVICE),
+    (r"CUDA error(?: \d+)?: (unspecified launch failure|uncorrectable ECC|the launch timed out|unknown error)", LOST_DEVICE),
+    (r"CUDA error(?: \d+)?: (an illegal memory access|.*is/are busy or unavailable)", LOST_DEVICE),
     (r"CUDA_ERROR_(ECC_UNCORRECTABLE|DEVICE_UNAVAILABLE|LAUNCH_TIMEOUT|UNKNOWN)|all CUDA-capable devices are busy", LOST_DEVICE),
-    (r"GPU is lost|fallen off the bus|no CUDA-capable device is detected", LOST_DEVICE),
-    (r"^MemoryError|cannot allocate memory|std::bad_alloc|DefaultCPUAllocator: (can't|not enough memory)", MEMORY),
-    (r"connection (refused|reset|timed out)|ConnectionError|could not (connect|translate host name)", UNREACHABLE),
-    (r"name or service not known|temporary failure in name resolution|server closed the connection", UNREACHABLE),
-    (r"database is locked|TimeoutError|read timed out", UNREACHABLE),
+    (
+        r"GPU is lost|GPU requires reset|fallen off the bus|no CUDA-capable device is detected|No CUDA GPUs are available",
+        LOST_DEVICE,
+    ),
+    (r"this machine has 0 CUDA devices", LOST_DEVICE),
+    (r"MemoryError|Unable to allocate|cannot allocate memory|std::bad_alloc", MEMORY),
+    (r"DefaultCPUAllocator: (can't|not enough memory)|can't start new thread|resource temporarily unavailable", MEMORY),
+    (r"connection (refused|reset|timed out|aborted)|ConnectionError|RemoteDisconnected|could not connect", UNREACHABLE),
+    (r"could not translate host name|name or service not known|temporary failure in name resolution", UNREACHABLE),
+    (r"server closed the connection|too many clients|AdminShutdown|database is locked|TimeoutError|timed out", UNREACHABLE),
     (r"stale file handle|input/output error|transport endpoint is not connected", STORAGE),
 )
 
@@ -61,14 +69,14 @@ def diagnose(status: int, output: Sequence[str]) -> Fault | None:
         return None
     # A shell reports the signal that ended its command as 128 + n.
     number = -status if status < 0 else status - 128 if 128 < status < 160 else 0
-    text = "\n".join(output[-TAIL:])
-    named = next((fault for pattern, fault in PATTERNS if re.search(pattern, text, re.IGNORECASE | re.MULTILINE)), None)
+    if number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        return STOPPED
+    text = "\n".join(line for line in output[-TAIL:] if not WARNING.match(line))
+    named = next((fault for pattern, fault in PATTERNS if re.search(pattern, text, re.IGNORECASE)), None)
     if named:
         return named
     if status == BAD_INPUT:
         return INPUT
-    if number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        return STOPPED
     if number == signal.SIGKILL:
         return Fault("transient", "killed by the system, most likely out of memory")
     if number:

@@ -53,11 +53,11 @@ def test_the_search_is_shared_and_nothing_reruns_without_a_change(finished):
 def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(finished):
     project, _ = finished
     planned = jobs(run(project, {"fit": {"epochs": 4}}, "--dry-run"))
-    assert planned == {"fit": 1, "rollout": 1, "score": 1, "log_run": 1, "tables": 1, "all": 1}
+    assert planned == {"fit": 1, "rollout": 1, "score": 1, "log_run": 1, "tables": 1, "report": 1, "all": 1}
     planned = jobs(run(project, {"tracking": {"experiment": "other"}}, "--dry-run"))
     assert planned == {"track_init": 1, "log_run": 2, "all": 1}
     planned = jobs(run(project, {"seeds": [0, 1]}, "--dry-run"))
-    assert planned == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "all": 1}
+    assert planned == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
 
 
 def test_methods_share_searches_and_fits(finished):
@@ -146,7 +146,7 @@ def test_bad_configuration_is_explained_before_any_job(place, changes, message):
         ({"seeds": []}, "seeds: at least one entry is required"),
         ({"seeds": [0, 0]}, "seeds: entries must differ"),
         ({"results": "a{b}"}, "results: string should match pattern"),
-        ({"device": "gpu"}, "device: string should match pattern"),
+        ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
         ({"search": {"ranges": {"object_neighbours": [0, 5]}}}, "object_neighbours: at least 2 is required"),
         ({"search": {"ranges": {"stiffness": [0.0, 2e5]}}}, "must hold the search's range of 0.0 to 200000.0"),
     ],

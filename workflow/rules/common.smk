@@ -88,7 +88,8 @@ def job_prefix():
     A prefix replaces Snakemake's own, without which a command that fails before a pipe would count as one that succeeded.
     """
     values = {
-        job.POOL: job.GIVEN if CLUSTER else ",".join(POOL),
+        # Only inside a job that a cluster started; with --jobs beside --cores Snakemake runs jobs here.
+        job.POOL: job.GIVEN if workflow.remote_exec else ",".join(POOL),
         job.SHARE: str(CONFIG.gpus.jobs_per_gpu),
     }
     exports = "".join(
@@ -127,6 +128,10 @@ def gpu_job(command):
         "--scenario {wildcards.scenario} --work {resources.work} --gpus {resources.gpu}",
         command,
     )
+
+
+# No GPU waits for one of its jobs while cores are taken by jobs that need none.
+GPU_FIRST = 10
 
 
 def attempt_number(wildcards, attempt):

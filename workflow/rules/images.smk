@@ -10,6 +10,7 @@ rule appearance:
         f"{RESULTS}/logs/appearance/{{scenario}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/appearance/{{scenario}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
@@ -52,6 +53,7 @@ rule render:
         f"{RESULTS}/logs/render/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/render/{{scenario}}/{{method}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT

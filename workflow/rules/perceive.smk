@@ -67,6 +67,7 @@ rule segment:
         f"{RESULTS}/logs/segment/{{scenario}}/{{camera}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/segment/{{scenario}}/{{camera}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
@@ -100,6 +101,7 @@ rule track:
         f"{RESULTS}/logs/track/{{scenario}}/{{camera}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/track/{{scenario}}/{{camera}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT

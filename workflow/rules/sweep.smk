@@ -15,6 +15,7 @@ if CONFIG.tune:
             f"{RESULTS}/benchmarks/tune/{CONFIG.tune.study}/{{worker}}.tsv"
         wildcard_constraints:
             worker=r"\d+",
+        priority: GPU_FIRST
         retries: 2
         conda:
             ENVIRONMENT

@@ -7,6 +7,7 @@ rule search:
         f"{RESULTS}/logs/search/{{scenario}}/{{search}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/search/{{scenario}}/{{search}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
@@ -39,6 +40,7 @@ rule fit:
         f"{RESULTS}/logs/fit/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/fit/{{scenario}}/{{method}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
@@ -71,6 +73,7 @@ rule rollout:
         f"{RESULTS}/logs/rollout/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/rollout/{{scenario}}/{{method}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
@@ -104,6 +107,7 @@ rule transfer:
         f"{RESULTS}/logs/transfer/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/transfer/{{scenario}}/{{method}}/{{seed}}.tsv"
+    priority: GPU_FIRST
     retries: 2
     conda:
         ENVIRONMENT
