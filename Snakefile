@@ -46,7 +46,7 @@ rule all:
 
 
 onstart:
-    tell_plan()
+    begin()
 
 
 onsuccess:

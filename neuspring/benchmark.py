@@ -73,7 +73,11 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
     where = "configuration, only"
     rule = "terms scenario=..., category=..., method=..., seed=..., each with names or patterns separated by commas"
     kept: dict[str, tuple[Any, ...]] = {"scenarios": config.scenarios, "methods": config.methods, "seeds": config.seeds}
-    for term in shlex.split(config.only):
+    try:
+        terms = shlex.split(config.only)
+    except ValueError as error:
+        raise InputError(where, rule, config.only, f"{error}.") from error
+    for term in terms:
         key, _, text = term.partition("=")
         names = {"scenario": "scenarios", "category": "scenarios", "method": "methods", "seed": "seeds"}
         if key not in names or not text:

@@ -25,7 +25,7 @@ from typing import IO
 
 from neuspring import faults, gpus
 from neuspring.errors import InputError
-from neuspring.job_records import LOGS, Attempt, JobRecord
+from neuspring.job_records import FOLDER, LOGS, STARTED, Attempt, JobRecord
 from neuspring.watch import Watch
 
 GIVEN = "given"
@@ -84,11 +84,16 @@ class Job:
 def run(job: Job) -> int:
     """Run a job; returns its exit status (1 if a signal ended it). Raises InputError if it needs more GPUs than there are."""
     record = replace(job.record, attempts=_earlier(job.record.path(job.results)))
-    if job.attempt > 1 and record.attempts and record.last.outcome == "permanent":
+    if job.attempt > 1 and record.attempts and record.last.outcome == "permanent" and _of_this_run(job.results, record.last):
         # The workflow cannot tell causes apart; its second try ends here.
         print(f"not tried again ({record.last.cause}): {record.last.message}", file=sys.stderr)
         return record.last.exit or 1
-    lease = _lease(job)
+    try:
+        lease = _lease(job)
+    except (InputError, TimeoutError) as error:
+        refused = Attempt(started=_moment(), outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT)
+        _save(record, refused, job.results)
+        raise
     try:
         devices, waited = (list(lease.devices), round(lease.waited, 3)) if lease else (_given(job), 0.0)
         begun = Attempt(started=_moment(), host=platform.node(), devices=devices, waited=waited)
@@ -108,6 +113,15 @@ def _results(log: Path) -> Path:
         if parent.name == LOGS:
             return parent.parent
     raise InputError(log, f"the log of a job must lie in a folder {LOGS} of the results")
+
+
+def _of_this_run(results: Path, attempt: Attempt) -> bool:
+    """Whether an attempt belongs to the run of the workflow that goes on now, which leaves a file when it starts."""
+    try:
+        begun = (results / FOLDER / STARTED).stat().st_mtime
+    except OSError:
+        return True
+    return datetime.fromisoformat(attempt.started).timestamp() >= begun
 
 
 def _earlier(path: Path) -> list[Attempt]:
@@ -180,17 +194,25 @@ def _execute(job: Job, lease: gpus.Lease | None, begun: Attempt) -> Attempt:
             kept.append(line)
             log.write(line)
             if not job.quiet:
-                print(line, end="", flush=True)
+                _tell(line)
         status = process.wait()
     fault = faults.diagnose(status, list(kept))
     ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
     if fault is None:
         return ended
     if job.quiet:
-        print("".join(kept), end="", file=sys.stderr)
+        _tell("".join(kept))
     again = " (may be tried again)" if fault.outcome == "transient" else ""
     print(f"{fault.cause}{again}. {fault.remedy}".strip(), file=sys.stderr)
     return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(kept)))
+
+
+def _tell(text: str) -> None:
+    """Print; a terminal that is gone, or a full disk behind our own output, must not end the job."""
+    try:
+        print(text, end="", flush=True)
+    except OSError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - for as long as this process lives
 
 
 class _Log:

@@ -20,6 +20,8 @@ from neuspring.files import write_text
 from neuspring.records import RECORD_FORMAT, read_json
 
 FOLDER, LOGS = "jobs", "logs"
+STARTED = ".started"
+"""File in FOLDER that is as old as the run of the workflow that goes on, or went on last."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
 """How an attempt ended. transient: may be tried again. running: it runs, or its wrapper was killed before it could say more."""
 
@@ -121,14 +123,27 @@ def _adapter() -> TypeAdapter[JobRecord]:
 
 
 def failure_lines(records: Iterable[JobRecord], results: Path) -> list[str]:
-    """What failed and why, a line a job, and where its log lies."""
-    return [
-        f"{record.name}: {record.last.cause} (attempt {len(record.attempts)}): {record.last.message}; {results / record.log}"
-        for record in records
-        if record.failed
-    ]
+    """What failed and why, a line a job, and where its log lies. A job that still says that it runs has lost its wrapper."""
+    lines = []
+    for record in records:
+        last = record.last
+        cause, message = (last.cause, last.message) if record.failed else ("its wrapper or machine vanished", f"on {last.host}")
+        if last.outcome != "ok":
+            lines.append(f"{record.name}: {cause} (attempt {len(record.attempts)}): {message}; {results / record.log}")
+    return lines
 
 
-def read_jobs(results: Path) -> list[JobRecord]:
-    """The records of all jobs of a results folder, by name. Raises InputError for a damaged one."""
-    return [JobRecord.load(path) for path in sorted((Path(results) / FOLDER).rglob("*.json"))]
+def read_jobs(results: Path, damaged: list[str] | None = None) -> list[JobRecord]:
+    """The records of all jobs of a results folder, by name.
+
+    What is wrong with damaged ones is added to `damaged`. Raises InputError for a damaged one where that is not given.
+    """
+    records = []
+    for path in sorted((Path(results) / FOLDER).rglob("*.json")):
+        try:
+            records.append(JobRecord.load(path))
+        except InputError as error:
+            if damaged is None:
+                raise
+            damaged.append(str(error))
+    return records

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from neuspring.errors import InputError
 from neuspring.job_records import JobRecord, read_jobs
 
 SHIPPED = Path(__file__).parent / "data" / "timings.csv"
@@ -48,34 +47,27 @@ class History:
     """(rule, kind, scenario or "" for all) -> median seconds per unit of work."""
     memory: Mapping[str, float] = field(default_factory=dict)
     """Rule -> largest resident memory, MiB."""
-    longest: Mapping[str, float] = field(default_factory=dict)
-    """Rule -> longest wall time, s."""
 
     @classmethod
     def of(cls, results: Path) -> History:
         """What the job records of a results folder say; damaged ones are passed over."""
-        try:
-            return cls.of_records(read_jobs(results))
-        except InputError:
-            return cls()
+        return cls.of_records(read_jobs(results, damaged=[]))
 
     @classmethod
     def of_records(cls, records: Iterable[JobRecord]) -> History:
-        """From job records; only attempts that succeeded count for times."""
+        """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
         seconds: dict[tuple[str, Kind, str], list[float]] = defaultdict(list)
         memory: dict[str, float] = defaultdict(float)
-        longest: dict[str, float] = defaultdict(float)
         for record in records:
             memory[record.rule] = max([memory[record.rule], *(a.peak_memory_mb for a in record.attempts)])
-            done = [attempt for attempt in record.attempts if attempt.outcome == "ok"]
-            if not done:
+            ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
+            if len(ends) == 1:
                 continue
-            last = done[-1]
-            kind: Kind = "gpu" if last.devices else "cpu"
-            longest[record.rule] = max(longest[record.rule], last.seconds)
+            kind: Kind = "gpu" if record.attempts[ends[-1]].devices else "cpu"
+            took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
             for scenario in {"", record.scenario}:
-                seconds[record.rule, kind, scenario].append(last.seconds / record.work)
-        return cls(rates={key: statistics.median(v) for key, v in seconds.items()}, memory=dict(memory), longest=dict(longest))
+                seconds[record.rule, kind, scenario].append(took / record.work)
+        return cls(rates={key: statistics.median(times) for key, times in seconds.items()}, memory=dict(memory))
 
 
 def shipped_rates(path: Path = SHIPPED) -> dict[tuple[str, str], Rate]:

@@ -11,7 +11,7 @@ import pytest
 
 from neuspring import gpus, job
 from neuspring.errors import InputError
-from neuspring.job_records import Attempt, JobRecord, read_jobs
+from neuspring.job_records import Attempt, JobRecord, failure_lines, read_jobs
 
 NAME = "search/rope/uniform/0"
 
@@ -132,3 +132,38 @@ def test_records_come_back_as_they_were_written(tmp_path):
     kept = JobRecord(rule="fit", name="fit/a/b/0", log="logs/fit/a/b/0.log", attempts=[attempt], scenario="a", work=3.0)
     kept.save(tmp_path)
     assert read_jobs(tmp_path) == [kept]
+
+
+def test_a_permanent_failure_of_an_earlier_run_does_not_stop_a_later_attempt(results):
+    assert run(results, "import sys; sys.exit(2)").returncode == 2
+    started = results / "jobs" / ".started"
+    started.touch()
+    os.utime(started, (time.time() + 60, time.time() + 60))
+    assert run(results, "print('ran')", "--attempt", "2").stdout == "ran\n"
+
+
+def test_a_full_disk_behind_the_output_does_not_end_the_job(results):
+    command = [sys.executable, "-m", "neuspring.job", "--log", str(results / "logs" / f"{NAME}.log"), "--"]
+    code = "print('x' * 100_000, flush=True); print('the end')"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*command, sys.executable, "-c", code], stdout=full, check=False)
+    assert done.returncode == 0
+    assert (results / "logs" / f"{NAME}.log").read_text().endswith("the end\n")
+
+
+def test_a_job_that_lost_its_wrapper_is_listed(tmp_path):
+    vanished = JobRecord(
+        rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[Attempt(started="2026-01-01T00:00:00+00:00", host="n1")]
+    )
+    (line,) = failure_lines([vanished], tmp_path)
+    assert line.startswith("fit/a: its wrapper or machine vanished (attempt 1): on n1")
+
+
+def test_damaged_records_do_not_hide_the_others(tmp_path):
+    JobRecord(rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[Attempt(started="2026-01-01T00:00:00+00:00")]).save(
+        tmp_path
+    )
+    (tmp_path / "jobs" / "fit" / "b.json").write_text("{")
+    damaged: list[str] = []
+    assert [record.name for record in read_jobs(tmp_path, damaged)] == ["fit/a"]
+    assert len(damaged) == 1

@@ -155,3 +155,12 @@ def test_only_takes_a_part_by_scenario_category_method_and_seed():
 def test_a_part_that_is_not_there_is_explained(only, message):
     with pytest.raises(InputError, match=message):
         Benchmark.of(config_with({"only": only}), ROOT)
+
+
+def test_a_job_that_went_on_after_a_kill_took_as_long_as_all_its_attempts():
+    times = {"ok": 50.0, "killed": 900.0}
+    attempts = [
+        Attempt(started="2026-01-01T00:00:00+00:00", seconds=times[outcome], outcome=outcome) for outcome in ("ok", "killed", "ok")
+    ]
+    history = plan.History.of_records([JobRecord(rule="fit", name="fit/a", log="", attempts=attempts, scenario="rope", work=10.0)])
+    assert plan.rate(job("fit"), history, {}) == plan.Rate(seconds=95.0, source="this results folder")

@@ -15,7 +15,7 @@ from neuspring import config as settings
 from neuspring import gpus, job, needs, plan, tune_space
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
-from neuspring.job_records import failure_lines, read_jobs
+from neuspring.job_records import FOLDER, STARTED, failure_lines, read_jobs
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
@@ -598,12 +598,20 @@ def tell_plan():
     """How much time the run is expected to take."""
     slots = {
         "cpu": 0 if CLUSTER else workflow.cores,
-        "gpu": 0 if CLUSTER else len(POOL) * CONFIG.gpus.jobs_per_gpu,
+        "gpu": workflow.global_resources["gpu"].value if POOL else 0,
     }
     jobs = needs.planned(
         workflow.dag.needrun_jobs(exclude_finished=False), Path(RESULTS)
     )
     print(plan.report(jobs, NEEDS.history, slots), flush=True)
+
+
+def begin():
+    """Leave a mark by which jobs tell this run's attempts from earlier ones."""
+    mark = Path(RESULTS) / FOLDER / STARTED
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    mark.touch()
+    tell_plan()
 
 
 def tell_plan_of_dry_run():
@@ -635,7 +643,9 @@ def sweep_targets(wildcards):
 
 def finished_sweeps():
     """A study costs much and is not asked for by `all`; the report shows one that is there."""
-    return [path for path in sweep_summaries() if Path(path).exists()]
+    # Not an input: changed settings would then run the whole study again.
+    found = [Path(path) for path in sweep_summaries() if Path(path).exists()]
+    return [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in found]
 
 
 def tune_settings():
@@ -679,10 +689,8 @@ def report_arguments(output=REPORT):
 
 def tell_failures():
     """What failed and why; the report says the same."""
-    try:
-        lines = failure_lines(read_jobs(Path(RESULTS)), Path(RESULTS))
-    except InputError as error:
-        lines = [str(error)]
+    damaged = []
+    lines = failure_lines(read_jobs(Path(RESULTS), damaged), Path(RESULTS)) + damaged
     print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
     print(
         f"Report so far: {TABLE_FOLDER}/so_far/report.html. The same command continues where this one stopped.",

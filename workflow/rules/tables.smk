@@ -63,7 +63,6 @@ rule report:
         tables=TABLES,
         studies=[study_table(name) for name in CONFIG.studies],
         perception=perception_tables(),
-        sweeps=finished_sweeps(),
     output:
         REPORT,
     log:
@@ -81,6 +80,7 @@ rule report:
     params:
         arguments=report_arguments(),
         templates=template_digest(),
+        sweeps=finished_sweeps(),
         code=code_digest("neuspring.report"),
     shell:
         common_job("report {params.arguments:q}")
