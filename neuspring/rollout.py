@@ -69,6 +69,17 @@ def roll_out(
     Raises InputError if the substep is beyond the stability bound.
     """
     stability.check(twin)
+    return simulate(twin, controller_points, device, progress, velocity)
+
+
+def simulate(
+    twin: Twin,
+    controller_points: np.ndarray,
+    device: str = "cpu",
+    progress: Callable[[int], None] | None = None,
+    velocity: np.ndarray | None = None,
+) -> Trajectory:
+    """As `roll_out`, whatever the stability bound says of the substep: the released simulator knows none."""
     solver = solver_for(twin, device)
     hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
     positions = [torch.tensor(twin.topology.nodes)]

@@ -5,7 +5,6 @@ prediction by the float64 reference simulation, pictures by the rasteriser's spe
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.artifacts import Material, Simulation, Twin
 from neuspring.data.released import Released
+from neuspring.data.unpickle import load_pickle
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
 from neuspring.splats import reference as rasteriser
@@ -233,7 +233,7 @@ def distances(case: Released) -> dict[str, list[float]]:
     """Chamfer distance (L1) and track error per frame."""
     data, positions = stored(case.folder), positions_of(case)
     surface = data["object_points"].shape[1] + len(data["surface_points"])
-    tracks = pickle.loads((case.folder / "gt_track_3d.pkl").read_bytes())
+    tracks = load_pickle(case.folder / "gt_track_3d.pkl")
     index = [int(np.argmin(np.linalg.norm(positions[0] - point, axis=1))) for point in tracks[0]]
     chamfer, error = [], []
     for t, nodes in enumerate(positions.astype(float)):
@@ -260,5 +260,5 @@ def picture_scores(case: Released) -> dict[str, list[float]]:
 
 def positions_of(case: Released) -> np.ndarray:
     """inference.pkl."""
-    positions: np.ndarray = pickle.loads(case.prediction.read_bytes())
+    positions: np.ndarray = load_pickle(case.prediction)
     return positions

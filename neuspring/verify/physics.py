@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from neuspring import metrics
 from neuspring.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
@@ -15,7 +14,7 @@ from neuspring.data.conformance import released_cases
 from neuspring.data.released import Checkpoint, Released, read_checkpoint, read_parameters, read_prediction
 from neuspring.errors import InputError
 from neuspring.progress import Progress
-from neuspring.rollout import Diverged, frames, solver_for
+from neuspring.rollout import simulate
 from neuspring.search import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.topology import uniform_topology
 from neuspring.verify.findings import Finding, Published, of_scores, require
@@ -112,24 +111,9 @@ def damped(twin: Twin, drag: float, dashpot: float) -> Twin:
 
 
 def replay(twin: Twin, controller_points: np.ndarray, device: str, label: str) -> Trajectory:
-    """As `roll_out`, whatever our bound of the substep says: the released simulator asks for none."""
-    solver = solver_for(twin, device)
-    hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
-    positions, diverged, reason = [torch.tensor(twin.topology.nodes)], None, ""
-    progress = Progress(f"replay {label}", len(hands) - 1)
-    try:
-        for frame, x, _ in frames(twin, solver, hands):
-            positions.append(x.cpu())
-            progress.update(frame)
-    except Diverged as end:
-        diverged, reason = end.frame, end.reason
-    return Trajectory(
-        positions=torch.stack(positions).numpy(),
-        frame_count=len(hands),
-        diverged_frame=diverged,
-        reason=reason,
-        collision_overflow=solver.collision_overflow,
-    )
+    """As the released simulator would: without asking whether the substep is within our bound."""
+    progress = Progress(f"replay {label}", len(controller_points) - 1)
+    return simulate(twin, controller_points, device, progress.update)
 
 
 def _springs(seen: Observations, parameters: dict[str, float]) -> Topology:
