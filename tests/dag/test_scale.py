@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import sys
 from datetime import datetime
 from itertools import pairwise
 
@@ -87,7 +88,7 @@ def test_a_study_is_a_target_and_explain_names_its_runs(finished):
     page = (project / "results" / "tables" / "studies" / "table2.md").read_text()
     assert "Model-A (PT)" in page
     assert "not run" in page
-    command = ["neuspring", "explain", "table2/Baseline/future/chamfer", "--results", "results"]
+    command = [sys.executable, "-m", "neuspring", "explain", "table2/Baseline/future/chamfer", "--results", "results"]
     told = subprocess.run(command, cwd=project, capture_output=True, text=True, check=False)
     assert told.returncode == 0, told.stdout + told.stderr
     key = json.loads((project / "results" / SCENE / "baseline" / "0" / "run.json").read_text())["run_key"]
@@ -122,7 +123,8 @@ def test_a_sweep_ends_with_its_best_and_every_trial_in_mlflow(place):
 def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(place, tmp_path):
     for name in released_cases():
         (tmp_path / "data" / "different_types" / name).mkdir(parents=True)
-    command = ["snakemake", "--profile", "workflow/profiles/default", "--cores", "8", "--dry-run", "--quiet", "rules"]
+    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
+    command += ["--cores", "8", "--dry-run", "--quiet", "rules"]
     command += ["--configfile", "config/benchmark.yaml", "--config", f"data_root={tmp_path}"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=200, check=True)
