@@ -18,12 +18,6 @@ include: "workflow/rules/tracking.smk"
 include: "workflow/rules/sweep.smk"
 
 
-# It is the main process that tries a job again, with more memory: inside a submitted job rules' own retries would multiply.
-if workflow.remote_exec:
-    for submitted in workflow.rules:
-        submitted.restart_times = 0
-
-
 # On a cluster these run where Snakemake runs: seconds of work each.
 localrules:
     all,
@@ -43,6 +37,16 @@ rule all:
         report=REPORT,
         perception=perception_tables(),
         tracked=tracked_runs(),
+
+
+# The last: a study is a target by its name, which must not be another's.
+include: "workflow/rules/studies.smk"
+
+
+# It is the main process that tries a job again, with more memory: inside a submitted job rules' own retries would multiply.
+if workflow.remote_exec:
+    for submitted in workflow.rules:
+        submitted.restart_times = 0
 
 
 onstart:

@@ -119,6 +119,9 @@ class Benchmark:
     """A validated configuration with the rows it names."""
 
     config: Config
+    """With what `only` leaves of scenarios, methods and seeds."""
+    whole: Config
+    """As it was given: what tables are laid out for, and whose seeds are averaged, whatever part of it is run now."""
     scenarios: dict[str, ScenarioRow]
     """Chosen ones, and those that twins are transferred to."""
     methods: dict[str, Method]
@@ -135,16 +138,16 @@ class Benchmark:
     @classmethod
     def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
         """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
-        config = parse(Config, values, "configuration")
+        whole = parse(Config, values, "configuration")
         for name in ("scenarios", "methods", "seeds"):
-            if not getattr(config, name):
+            if not getattr(whole, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required")
-        scenarios, methods = read_scenarios(root / config.scenario_table), read_methods(root / config.method_table)
-        _require_known("scenarios", config.scenarios, scenarios, config.scenario_table)
-        _require_known("methods", config.methods, methods, config.method_table)
-        studies = read_studies(root / config.study_table)
-        _require_known("studies", config.studies, studies, config.study_table)
-        config = chosen_part(config, scenarios)
+        scenarios, methods = read_scenarios(root / whole.scenario_table), read_methods(root / whole.method_table)
+        _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
+        _require_known("methods", whole.methods, methods, whole.method_table)
+        studies = read_studies(root / whole.study_table)
+        _require_known("studies", whole.studies, studies, whole.study_table)
+        config = chosen_part(whole, scenarios)
         searches = read_searches(root / config.search_table)
         wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
         _require_known("methods' search", wanted, searches, config.search_table)
@@ -158,6 +161,7 @@ class Benchmark:
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
+            whole,
             {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets)},
             {n: methods[n] for n in config.methods},
             {n: searches[n] for n in wanted},
@@ -184,8 +188,8 @@ class Benchmark:
     @property
     def compared_with(self) -> str:
         """The method that tables compare the others with."""
-        wanted = self.config.compare_with
-        return wanted if wanted in self.methods else self.config.methods[0]  # type: ignore[return-value]
+        wanted = self.whole.compare_with
+        return wanted if wanted in self.whole.methods else self.whole.methods[0]  # type: ignore[return-value]
 
     def methods_of(self, study: str) -> tuple[str, ...]:
         """The chosen methods that stand in a study's rows."""

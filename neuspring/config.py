@@ -10,19 +10,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, StringConstraints, TypeAdapter, ValidationError
 
 from neuspring.config_gpus import Gpus
 from neuspring.config_images import Images
 from neuspring.config_perception import Perception, Synthetic
 from neuspring.config_tune import Tune
-from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range
+from neuspring.config_types import STRICT, Count, Finite, Name, NonNegative, Positive, Range, masked, refuse_password
 from neuspring.errors import InputError
 
 T = TypeVar("T")
@@ -346,9 +347,14 @@ class Tracking:
     enabled: bool = True
     """Log runs to MLflow."""
     uri: str | None = None
-    """Tracking URI; null means SQLite at <results>/mlflow.db."""
+    """Tracking URI; null means SQLite at <results>/mlflow.db. No password in it: libpq reads PGPASSWORD or ~/.pgpass, MLflow's
+    client MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD."""
     experiment: Name = "neuspring"
     """Name of the MLflow experiment."""
+
+    def __post_init__(self) -> None:
+        if self.uri:
+            refuse_password("uri", self.uri, "PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,7 +377,7 @@ class Config:
     """Rows of the study table, the paper's tables, that `all` makes; each is also a target by its name."""
     transfers: dict[Name, tuple[Name, ...]] | None = None
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well, if it is chosen; null: none."""
-    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$")] = "results"
+    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(os.path.normpath)] = "results"
     """Folder that everything is written to."""
     tables: Name = "tables"
     """Folder for tables in the results folder; another name keeps the tables of another choice of methods apart."""
@@ -497,7 +503,8 @@ def _describe(problem: Any) -> str:
     hint = ""
     if isinstance(value, str) and problem["type"] in ("float_type", "int_type"):
         hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)"
-    return f"{path}: {problem['msg'].lower()}, received {value!r}{hint}"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{path}: {message[:1].lower()}{message[1:]}, received {masked(repr(value))}{hint}"
 
 
 def plain(settings: Any) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config_types import STRICT, Count, Name
+from neuspring.config_types import STRICT, Count, Name, refuse_password
 
 Whole = Annotated[int, Field(ge=0)]
 Number = int | Annotated[float, Field(allow_inf_nan=False)]
@@ -84,7 +84,7 @@ class Tune:
     def __post_init__(self) -> None:
         if not self.space:
             raise ValueError("space: at least one setting is required")
-        if self.storage and ":" in self.storage.partition("://")[2].rpartition("@")[0]:
-            raise ValueError("storage: a password would be shown by ps and in logs; set PGPASSWORD or ~/.pgpass instead")
+        if self.storage:
+            refuse_password("storage", self.storage, "PGPASSWORD or ~/.pgpass")
         if len(set(self.scenarios)) != len(self.scenarios):
             raise ValueError(f"scenarios: entries must differ, received {list(self.scenarios)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated
 
 from pydantic import ConfigDict, Field, StringConstraints
@@ -13,3 +14,14 @@ Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
+
+
+def masked(text: str) -> str:
+    """Text without the user and password of any URI in it."""
+    return re.sub(r"://[^/@\s]+@", "://***@", text)
+
+
+def refuse_password(key: str, uri: str, instead: str) -> None:
+    """Raise ValueError if a URI holds a password: command lines and logs of jobs would show it."""
+    if ":" in uri.partition("://")[2].partition("/")[0].rpartition("@")[0]:
+        raise ValueError(f"{key}: a password would be shown by ps and in logs; set {instead} instead")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from neuspring import benchmark as benchmarks
 from neuspring import gpus
 from neuspring.benchmark import Benchmark
 from neuspring.config_gpus import Gpus
+from neuspring.config_tune import Tune
 from neuspring.data import conformance
 from neuspring.errors import InputError
 from neuspring.job_records import JobRecord
@@ -25,8 +26,11 @@ HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
 
 
-def gpu_pool(settings: Gpus, device: str) -> tuple[str, ...]:
-    """The GPUs of this machine that jobs may use; none on a CPU. Raises InputError for one that is not there or not allowed."""
+def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[str, ...]:
+    """The GPUs of this machine that jobs may use; none on a CPU. Raises InputError for one that is not there or not allowed.
+
+    `plan_only`: a plan for other machines may be made where there is no GPU.
+    """
     if device == "cpu":
         return ()
     visible = gpus.visible_devices()
@@ -38,7 +42,7 @@ def gpu_pool(settings: Gpus, device: str) -> tuple[str, ...]:
         rule = "every device must be one that this run may use"
         value = f"{', '.join(missing)}; allowed: {', '.join(visible) or 'none'}"
         raise InputError("configuration, gpus.devices", rule, value, f"Correct it, or {gpus.VISIBLE}.")
-    if device == "cuda" and not chosen:
+    if device == "cuda" and not chosen and not plan_only:
         rule = "device: cuda needs a GPU that this run may use, and there is none"
         raise InputError("configuration, device", rule, device, f"Use device: cpu or auto, or correct {gpus.VISIBLE}.")
     return chosen
@@ -56,6 +60,22 @@ def gpu_slots(pool: tuple[str, ...], jobs_per_gpu: int, limit: int | None) -> in
     if limit < 1:
         raise InputError(where, "jobs on a GPU need one", limit, f"{remedy} Use device: cpu for none.")
     return limit
+
+
+def check_gpus(rules: Mapping[str, Mapping[str, Any]], pool: tuple[str, ...]) -> None:
+    """Raise InputError if resources that were set for a rule (--set-resources) name more GPUs than this machine has."""
+    for rule, resources in rules.items():
+        wanted = resources["gpu"].value if "gpu" in resources and not resources["gpu"].is_evaluable() else 0
+        if isinstance(wanted, int) and wanted > len(pool):
+            limit = f"a job has its GPUs at once, and there are {len(pool)} ({', '.join(pool) or 'none'})"
+            raise InputError(f"--set-resources {rule}:gpu", limit, wanted, "Ask for fewer.")
+
+
+def check_storage(tune: Tune, *, cluster: bool) -> None:
+    """Raise InputError if workers of a study on several machines would share an SQLite file, whose locks hold within one alone."""
+    if cluster and tune.workers > 1 and tune.storage is None:
+        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
+        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
 
 
 def planned(jobs: Iterable[Any], results: Path) -> list[Planned]:
@@ -115,21 +135,32 @@ class Needs:
         return self.frames(wildcards.scenario)
 
     def memory(self, rule: str, default: int) -> Callable[..., int]:
-        """MB to ask for: half as much again as earlier jobs of the rule needed, else `default`; times the attempt."""
+        """MB to ask for: half as much again as earlier jobs of the rule needed with the same scenario, else as those with others
+        or `default`, whichever is more. Later attempts ask for at least `default`, times the attempt."""
 
         def needed(wildcards: Any, attempt: int) -> int:
-            peak = self.history.memory.get(rule)
-            return attempt * (max(math.ceil(HEADROOM_MEMORY * peak), LEAST_MEMORY) if peak else default)
+            peaks = self.history.memory
+            return _asked(rule, wildcards, attempt, default, lambda key: HEADROOM_MEMORY * peaks.get(key, 0.0), LEAST_MEMORY)
 
         return needed
 
     def minutes(self, rule: str, default: int, work: Callable[[Any], int]) -> Callable[..., int]:
-        """Minutes to ask for: three times what earlier jobs took for as much work, else `default`; times the attempt."""
+        """Minutes to ask for: three times what earlier jobs took for as much work; otherwise as for memory."""
+
+        def expected(key: tuple[str, str], wildcards: Any) -> float:
+            rates, (name, scenario) = self.history.rates, key
+            rate = rates.get((name, self._kind, scenario)) or rates.get((name, "cpu", scenario))
+            return HEADROOM_TIME * rate * work(wildcards) / 60 if rate else 0.0
 
         def needed(wildcards: Any, attempt: int) -> int:
-            rate = self.history.rates.get((rule, self._kind, "")) or self.history.rates.get((rule, "cpu", ""))
-            if rate is None:
-                return attempt * default
-            return attempt * max(math.ceil(HEADROOM_TIME * rate * work(wildcards) / 60), LEAST_MINUTES)
+            return _asked(rule, wildcards, attempt, default, lambda key: expected(key, wildcards), LEAST_MINUTES)
 
         return needed
+
+
+def _asked(rule: str, wildcards: Any, attempt: int, default: int, known: Callable[[tuple[str, str]], float], least: int) -> int:
+    """What an attempt asks for, `known` being what earlier jobs of (rule, scenario or "" for all) tell; 0: nothing."""
+    own, others = known((rule, getattr(wildcards, "scenario", ""))), known((rule, ""))
+    asked = max(math.ceil(own), least) if own else max(math.ceil(others), default)
+    # What failed with as little as earlier jobs needed may have failed for want of it.
+    return asked if attempt == 1 else attempt * max(asked, default)

@@ -45,8 +45,8 @@ class History:
 
     rates: Mapping[tuple[str, Kind, str], float] = field(default_factory=dict)
     """(rule, kind, scenario or "" for all) -> median seconds per unit of work."""
-    memory: Mapping[str, float] = field(default_factory=dict)
-    """Rule -> largest resident memory, MiB."""
+    memory: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    """(rule, scenario or "" for all) -> largest resident memory, MiB."""
 
     @classmethod
     def of(cls, results: Path) -> History:
@@ -57,9 +57,11 @@ class History:
     def of_records(cls, records: Iterable[JobRecord]) -> History:
         """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
         seconds: dict[tuple[str, Kind, str], list[float]] = defaultdict(list)
-        memory: dict[str, float] = defaultdict(float)
+        memory: dict[tuple[str, str], float] = defaultdict(float)
         for record in records:
-            memory[record.rule] = max([memory[record.rule], *(a.peak_memory_mb for a in record.attempts)])
+            peak = max((attempt.peak_memory_mb for attempt in record.attempts), default=0.0)
+            for scenario in {"", record.scenario}:
+                memory[record.rule, scenario] = max(memory[record.rule, scenario], peak)
             ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
             if len(ends) == 1:
                 continue

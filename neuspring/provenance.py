@@ -9,7 +9,6 @@ everything, the rules that cost little (rollout, transfer, score) follow the fun
 from __future__ import annotations
 
 import ast
-import copy
 import functools
 import hashlib
 import subprocess
@@ -18,7 +17,7 @@ from pathlib import Path
 PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
-_DECLARED = ("config", "config_gpus", "config_images", "config_perception", "config_tune", "progress", "records")
+_DECLARED = ("config", "config_gpus", "config_images", "config_perception", "config_tune", "config_types", "progress", "records")
 NOT_NUMERICS = frozenset(f"{PACKAGE}.{name}" for name in _DECLARED)
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 
@@ -35,9 +34,15 @@ def _source(module: str) -> Path | None:
 
 @functools.cache
 def _tree(module: str) -> ast.Module:
+    """The syntax of a module, without its documentation."""
     path = _source(module)
     assert path is not None, module
-    return ast.parse(path.read_text(encoding="utf-8"))
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            # Any bare string is documentation: docstrings, and the notes under fields and constants.
+            node.body = [item for item in node.body if not _is_text(item)] or [ast.Pass()]
+    return tree
 
 
 @functools.cache
@@ -68,14 +73,6 @@ def used_modules(module: str) -> list[str]:
     return sorted(seen)
 
 
-def _without_docstrings(tree: ast.AST) -> str:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            # Any bare string is documentation: docstrings, and the notes under fields and constants.
-            node.body = [item for item in node.body if not _is_text(item)] or [ast.Pass()]
-    return ast.dump(tree)
-
-
 def _is_text(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
@@ -97,15 +94,14 @@ def _stage_code(stage: str) -> str:
     while waiting:
         name = waiting.pop()
         if name not in found:
-            found[name] = _without_docstrings(copy.deepcopy(functions[name]))
+            found[name] = ast.dump(functions[name])
             waiting += [node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name) and node.id in functions]
     return "".join(found[name] for name in sorted(found))
 
 
 @functools.cache
 def _module_code(module: str) -> bytes:
-    """What the code of a module is, without its documentation."""
-    return _without_docstrings(copy.deepcopy(_tree(module))).encode()
+    return ast.dump(_tree(module)).encode()
 
 
 @functools.cache

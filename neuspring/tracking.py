@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from neuspring.config import Tracking
+from neuspring.config_types import masked
 from neuspring.errors import InputError
 from neuspring.files import write_text
 from neuspring.tracking_payload import Payload, RunRecord, cut, milliseconds, payload
 from neuspring.tracking_query import AGAIN, is_complete, search
-from neuspring.tracking_store import ARTIFACTS, connect, default_uri, lock, lock_path, masked, prepare, uri_of
+from neuspring.tracking_store import ARTIFACTS, connect, default_uri, lock, lock_path, prepare, uri_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuspring.config import Tracking
+from neuspring.config_types import masked
 from neuspring.errors import InputError
-from neuspring.tracking_store import find, masked, uri_of
+from neuspring.tracking_store import find, uri_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

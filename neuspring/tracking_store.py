@@ -6,7 +6,6 @@ mlflow is imported only when it is used, after its environment is set.
 from __future__ import annotations
 
 import os
-import re
 import socket
 import sqlite3
 from contextlib import closing
@@ -44,11 +43,6 @@ def default_uri(results: Path) -> str:
 def uri_of(results: Path, settings: Tracking) -> str:
     """The tracking URI that the settings mean."""
     return settings.uri or default_uri(results)
-
-
-def masked(text: str) -> str:
-    """Text without the user and password of any URI in it."""
-    return re.sub(r"://[^/@\s]+@", "://***@", text)
 
 
 def find(results: Path, settings: Tracking) -> tuple[MlflowClient, str] | None:

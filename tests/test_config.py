@@ -110,12 +110,21 @@ MISTAKES = {
     "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
     "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),
+    "a password on command lines": (
+        "tracking: {uri: 'http://me:secret@host:5000'}",
+        "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",
+        "***@host",
+    ),
     "device": ("device: gpu", "device", "received 'gpu'"),
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
     "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
     "a mapping for a list": ("seeds: {a: 1}", "seeds"),
     "a date": ("results: 2026-01-01", "values must be plain YAML"),
 }
+
+
+def test_the_results_folder_has_one_spelling() -> None:
+    assert load("results: ./out//a/").results == "out/a"
 
 
 @pytest.mark.parametrize("name", MISTAKES)

@@ -3,9 +3,12 @@
 from types import SimpleNamespace
 
 import pytest
+from snakemake.resources import Resource
 
 from neuspring import config, needs, plan
 from neuspring.benchmark import Benchmark
+from neuspring.config_gpus import Gpus
+from neuspring.config_tune import Tune
 from neuspring.errors import InputError
 from neuspring.job_records import Attempt, JobRecord
 from tests.dag.project import ROOT, config_with
@@ -33,7 +36,7 @@ def test_times_scale_with_work_and_come_from_the_same_scenario_first():
 def test_attempts_that_failed_say_nothing_of_time_but_of_memory():
     history = plan.History.of_records([record("fit", "rope", 3, outcome="transient", memory=900.0)])
     assert plan.rate(job("fit"), history, {}) is None
-    assert history.memory == {"fit": 900.0}
+    assert history.memory == {("fit", ""): 900.0, ("fit", "rope"): 900.0}
 
 
 def test_what_is_not_recorded_comes_from_the_shipped_times_and_says_so():
@@ -92,9 +95,15 @@ def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_at
     record("fit", "rope", 125, 1000, memory=2000.0).save(tmp_path)
     wanted = needs.Needs(benchmark, "cpu")
     memory, minutes = wanted.memory("fit", 8000), wanted.minutes("fit", 480, lambda _: 4800)
-    assert [memory(None, attempt) for attempt in (1, 2)] == [3000, 6000]
-    # 0.125 s per unit: 600 s, times three.
-    assert [minutes(None, attempt) for attempt in (1, 2)] == [30, 60]
+    rope, cloth = SimpleNamespace(scenario="rope"), SimpleNamespace(scenario="cloth")
+    # 0.125 s per unit: 600 s, times three. A second attempt is not held to what may have been too little.
+    assert [memory(rope, attempt) for attempt in (1, 2, 3)] == [3000, 16000, 24000]
+    assert [minutes(rope, attempt) for attempt in (1, 2)] == [30, 960]
+    # Of another scenario no more is known than that it may need as much.
+    assert [memory(cloth, 1), minutes(cloth, 1)] == [8000, 480]
+    record("fit", "sloth", 125, 1000, memory=20000.0).save(tmp_path)
+    memory = needs.Needs(benchmark, "cpu").memory("fit", 8000)
+    assert [memory(cloth, 1), memory(rope, 1)] == [30000, 3000]
 
 
 @pytest.mark.parametrize(
@@ -130,6 +139,29 @@ def test_asking_for_more_than_there_is_ends_the_run_before_it_begins(monkeypatch
         needs.gpu_slots(needs.gpu_pool(chosen, device), chosen.jobs_per_gpu, limit)
 
 
+def test_a_plan_for_gpus_can_be_made_where_there_is_none(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert needs.gpu_pool(Gpus(), "cuda", plan_only=True) == ()
+
+
+def test_resources_set_for_a_rule_beyond_the_gpus_there_are_are_refused():
+    wishes = {"fit": {"gpu": Resource("gpu", 3)}, "search": {"mem_mb": Resource("mem_mb", 9000)}}
+    needs.check_gpus(wishes, ("0", "1", "2"))
+    with pytest.raises(InputError, match=r"--set-resources fit:gpu: .* there are 2 \(0, 1\); received 3"):
+        needs.check_gpus(wishes, ("0", "1"))
+
+
+def test_workers_on_several_machines_need_a_database_that_locks_across_them():
+    space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    study = {"study": "rate", "method": "baseline", "workers": 2, "space": space}
+    tune = config.parse(Tune, study, "test")
+    needs.check_storage(tune, cluster=False)
+    with pytest.raises(InputError, match="workers on several machines need storage"):
+        needs.check_storage(tune, cluster=True)
+    needs.check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
+    needs.check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
+
+
 def test_only_takes_a_part_by_scenario_category_method_and_seed():
     names = ["toy_rope_lift_smooth", "toy_rope_shake_smooth", "toy_cloth_lift_smooth"]
     all_of_it = {"scenarios": names, "methods": ["baseline", "clusters_2", "clusters_3"], "seeds": [0, 1, 2]}
@@ -141,6 +173,18 @@ def test_only_takes_a_part_by_scenario_category_method_and_seed():
     assert chosen("category=rope method=clusters_* seed=0,2") == (tuple(names[:2]), ("clusters_2", "clusters_3"), (0, 2))
     assert chosen("scenario=*_lift_* category=cloth")[0] == ("toy_cloth_lift_smooth",)
     assert chosen("")[0] == tuple(names)
+
+
+def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
+    part = {
+        "methods": ["search_only", "baseline"],
+        "seeds": [0, 1],
+        "compare_with": "baseline",
+        "only": "method=search_only seed=1",
+    }
+    made = Benchmark.of(config_with(part), ROOT)
+    assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
+    assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
 
 
 @pytest.mark.parametrize(

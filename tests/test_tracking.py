@@ -229,7 +229,7 @@ def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: p
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    away = Tracking(uri=f"http://user:secret@127.0.0.1:{port}")
+    away = Tracking(uri=f"http://secret@127.0.0.1:{port}")
     records = [write_run(results, seed=seed) for seed in range(3)]
     start = time.monotonic()
     outcome = tracking.log_run(records[0], results, away)
@@ -255,7 +255,7 @@ def test_a_damaged_database_or_absent_host_fails_at_once(results: Path, damage: 
     if damage == "text":
         (results / "mlflow.db").write_text("not a database " * 100)
     else:
-        settings = Tracking(uri="postgresql://user:secret@127.0.0.1:9/mlflow")
+        settings = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
     start = time.monotonic()
     assert tracking.log_run(write_run(results), results, settings).startswith("unreachable: ")
     assert tracking.init(results, settings)["outcome"].startswith("unreachable: ")

@@ -48,7 +48,8 @@ def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_
     assert [container["resources"]["requests"] for container in containers] == needs
     limits = [{"memory": "4000M"}, {"memory": "8000M", GPU: "1"}, {"memory": "16000M", GPU: "1"}]
     assert [container["resources"]["limits"] for container in containers] == limits
-    assert [job["spec"]["activeDeadlineSeconds"] for job in manifests] == [60 * minutes for minutes in (30, 240, 480)]
+    pods = [job["spec"]["template"]["spec"] for job in manifests]
+    assert [pod["activeDeadlineSeconds"] for pod in pods] == [60 * minutes for minutes in (30, 240, 480)]
     assert {job["spec"]["backoffLimit"] for job in manifests} == {0}
     # The evicted pod never began, so only the other one left a trace.
     ran = {job.name: [attempt.outcome for attempt in job.attempts] for job in read_jobs(place / "results")}

@@ -6,12 +6,15 @@ import subprocess
 import sys
 from datetime import datetime
 from itertools import pairwise
+from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from neuspring import gpus
 from neuspring.data.conformance import released_cases
 from neuspring.job_records import read_jobs
+from tests.perception.filmed import film, write_raw
 
 from .project import ROOT, SCENE, arguments, copy_workflow, jobs
 
@@ -60,7 +63,9 @@ def test_more_gpus_than_there_are_end_the_run_before_its_first_job(finished):
     assert "--resources gpu: there are 2 GPU slots (2 GPUs, gpus.jobs_per_gpu 1); received 3" in done.stdout + done.stderr
     done = snakemake(project, changes | {"gpus": {"devices": [0, 7]}}, "--dry-run", **TWO_GPUS)
     assert "received 7; allowed: 0, 1" in done.stdout + done.stderr
-    done = snakemake(project, changes | {"device": "cuda"}, "--dry-run", **{gpus.VISIBLE: ""})
+    done = snakemake(project, changes, "--dry-run", "--set-resources", "fit:gpu=3", **TWO_GPUS)
+    assert "--set-resources fit:gpu: a job has its GPUs at once, and there are 2 (0, 1); received 3" in done.stdout + done.stderr
+    done = snakemake(project, changes | {"device": "cuda"}, **{gpus.VISIBLE: ""})
     assert "device: cuda needs a GPU that this run may use, and there is none" in done.stdout + done.stderr
 
 
@@ -99,6 +104,22 @@ def test_a_part_of_the_runs_is_chosen_on_the_command_line(finished):
     project, changes, _ = finished
     planned = jobs(snakemake(project, changes | {"fit": {"epochs": 4}, "only": "method=baseline seed=1"}, "--dry-run", **TWO_GPUS))
     assert planned == {"fit": 1, "rollout": 1, "score": 1, "tables": 1, "report": 1, "all": 1}
+    # Made for a part, tables still show all that is there.
+    done = snakemake(project, changes | {"only": "method=search_only seed=1"}, **TWO_GPUS)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert jobs(done) == {"tables": 1, "report": 1, "all": 1}
+    runs = pd.read_csv(project / "results" / "tables" / "runs.csv")
+    assert sorted(zip(runs["method"], runs["seed"], strict=True)) == [(m, s) for m in ("baseline", "search_only") for s in (0, 1)]
+    assert set(runs["status"]) == {"ok"}
+
+
+def test_a_study_named_like_another_target_is_refused(finished):
+    project, changes, _ = finished
+    study = {"title": "t", "reference": None, "baseline": "a", "rows": {"a": "baseline"}}
+    (project / "config" / "other.yaml").write_text(json.dumps({"fit": study}))
+    done = snakemake(project, changes | {"study_table": "config/other.yaml"}, "--dry-run", **TWO_GPUS)
+    assert done.returncode == 1
+    assert "study fit: this is the name of another target; rename the study" in done.stdout + done.stderr
 
 
 def test_a_sweep_without_a_study_is_explained(finished):
@@ -126,11 +147,28 @@ def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(place, tmp_path)
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
     command += ["--cores", "8", "--dry-run", "--quiet", "rules"]
     command += ["--configfile", "config/benchmark.yaml", "--config", f"data_root={tmp_path}"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), gpus.VISIBLE: ""}
     done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=200, check=True)
     runs = 22 * 18 * 3
     expected = {"observe": 22, "track_init": 1, "search": 22 * 8 * 3, "fit": 22 * 13 * 3, "rollout": runs, "score": runs}
     expected |= {"log_run": runs, "study": 4, "tables": 1, "report": 1, "all": 1}
     assert jobs(done) == expected
     assert f"Expected: {sum(expected.values()) - 1} jobs, " in done.stdout
-    assert "PhysTwin" in done.stdout or "CPU-hours" in done.stdout
+    # Planned for GPUs, of which this machine need not have one.
+    assert "GPU-hours" in done.stdout and "PhysTwin" in done.stdout
+
+
+def test_damaged_data_of_one_scenario_stop_nobody_else_s_jobs(place):
+    case = write_raw(film(place / "mine" / "film"), place / "data" / "film")
+    (case / "metadata.json").write_text("{")
+    (case / "color" / "0" / "1.png").unlink()
+    (case / "color" / "0" / "1.png").symlink_to(place / "gone.png")
+    table = place / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + "film\tphystwin_raw\ttoy\tfilm\tfalse\ttrue\n")
+    targets = [f"results/{name}/observations.npz" for name in (SCENE, "film")]
+    done = snakemake(place, {"scenarios": [SCENE, "film"], "data_root": str(place / "data")}, "--", *targets)
+    assert done.returncode == 1
+    assert [Path(place / target).exists() for target in targets] == [True, False]
+    (failed,) = [job for job in read_jobs(place / "results") if job.failed]
+    assert (failed.rule, failed.scenario) == ("capture", "film")
+    assert "metadata.json" in failed.last.message

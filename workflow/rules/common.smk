@@ -20,6 +20,8 @@ from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
 ROOT = Path(workflow.basedir)
+# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs, not cores. Inside one of its jobs nothing is counted.
+CLUSTER = workflow.resource_settings.nodes is not None or workflow.remote_exec
 
 
 def checked_benchmark():
@@ -28,6 +30,7 @@ def checked_benchmark():
         benchmark = benchmarks.Benchmark.of(config, ROOT)
         if benchmark.config.tune:
             tune_space.Plan.of(benchmark.config, benchmark.config.tune, ROOT)
+            needs.check_storage(benchmark.config.tune, cluster=CLUSTER)
         results = Path(benchmark.config.results)
         try:
             results.mkdir(parents=True, exist_ok=True)
@@ -48,8 +51,6 @@ BENCHMARK = checked_benchmark()
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 DEVICE = CONFIG.device
-# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs, not cores. Inside one of its jobs nothing is counted.
-CLUSTER = workflow.resource_settings.nodes is not None or workflow.remote_exec
 
 
 def checked_pool():
@@ -59,7 +60,10 @@ def checked_pool():
     wanted = workflow.global_resources.get("gpu")
     limit = wanted.value if wanted else None
     try:
-        pool = needs.gpu_pool(CONFIG.gpus, DEVICE)
+        dryrun = workflow.output_settings.dryrun
+        pool = needs.gpu_pool(CONFIG.gpus, DEVICE, plan_only=dryrun)
+        overwritten = workflow.resource_settings.overwrite_resources
+        needs.check_gpus(overwritten, pool)
         if pool:
             slots = needs.gpu_slots(pool, CONFIG.gpus.jobs_per_gpu, limit)
             workflow.register_resource("gpu", slots)
@@ -76,7 +80,7 @@ def checked_pool():
 
 
 POOL = checked_pool()
-GPU = int(DEVICE != "cpu" and (CLUSTER or bool(POOL)))
+GPU = int(DEVICE == "cuda" or (DEVICE == "auto" and (CLUSTER or bool(POOL))))
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 memory, search_work, fit_work = NEEDS.memory, NEEDS.search, NEEDS.fit
 appearance_work, frame_work = NEEDS.appearance, NEEDS.scenario
@@ -131,7 +135,7 @@ def gpu_job(command):
 
 
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
-GPU_FIRST = 10
+GPU_FIRST = 10 * GPU
 
 
 def attempt_number(wildcards, attempt):
@@ -161,7 +165,7 @@ wildcard_constraints:
     method="|".join(map(re.escape, BENCHMARK.methods | BENCHMARK.fits)),
     search="|".join(map(re.escape, BENCHMARK.searches)),
     camera=r"[A-Za-z0-9][A-Za-z0-9_.-]*",
-    seed="|".join(map(str, CONFIG.seeds)),
+    seed="|".join(map(str, BENCHMARK.whole.seeds)),
     study="|".join(map(re.escape, BENCHMARK.studies)),
 
 
@@ -220,7 +224,11 @@ def raw_files(wildcards):
 
 
 def camera_files(wildcards, name):
-    cameras = BENCHMARK.cameras(wildcards.scenario)
+    try:
+        cameras = BENCHMARK.cameras(wildcards.scenario)
+    except InputError:
+        # Damaged data of one scenario end its own jobs, which say what is wrong, and nobody else's: not the planning of all.
+        cameras = ["0"]
     return [
         f"{RESULTS}/{wildcards.scenario}/perception/{camera}/{name}"
         for camera in cameras
@@ -274,7 +282,8 @@ def stamps(folder):
     digest = hashlib.sha256()
     kinds = [Path(folder) / kind for kind in ("color", "depth", "mask")]
     for path in sorted(path for kind in kinds for path in kind.rglob("*")):
-        facts = path.stat()
+        # A link without target must not end the planning either: whoever reads it says so.
+        facts = path.stat() if path.exists() else path.lstat()
         digest.update(f"{path} {facts.st_size} {facts.st_mtime_ns}".encode())
     return digest.hexdigest()[:16]
 
@@ -473,7 +482,7 @@ def twin_record(wildcards):
 
 
 def rollout_twins(wildcards):
-    """The records whose trajectories a prediction is made of: one, or those of all seeds."""
+    """The records whose trajectories a prediction is made of: one, or those of all seeds, whatever part of them runs now."""
     if not BENCHMARK.methods[wildcards.method].average_seeds:
         return [twin_record(wildcards)]
     return [
@@ -482,7 +491,7 @@ def rollout_twins(wildcards):
                 scenario=wildcards.scenario, method=wildcards.method, seed=seed
             )
         )
-        for seed in CONFIG.seeds
+        for seed in BENCHMARK.whole.seeds
     ]
 
 
@@ -576,21 +585,27 @@ def study_definition(wildcards):
     return json.dumps(settings.plain(BENCHMARK.studies[wildcards.study]))
 
 
+def transfer_option():
+    whole = BENCHMARK.whole
+    sources = [name for name in whole.transfers or {} if name in whole.scenarios]
+    return ["--transfers", *sources] if sources else []
+
+
 def benchmark_arguments(output):
-    """The results folder, and which runs it is to hold."""
+    """The results folder, and which runs it is to hold in the end, whatever part of them is run now."""
+    whole = BENCHMARK.whole
     return [
         *("--results", RESULTS, "--output", output),
-        *("--scenarios", *CONFIG.scenarios),
-        *("--methods", *CONFIG.methods, "--seeds", *map(str, CONFIG.seeds)),
+        *("--scenarios", *whole.scenarios),
+        *("--methods", *whole.methods, "--seeds", *map(str, whole.seeds)),
     ]
 
 
 def table_arguments(output=TABLE_FOLDER):
     return [
         *benchmark_arguments(output),
-        *(["--transfers", *BENCHMARK.transfers] if BENCHMARK.transfers else []),
-        "--baseline",
-        BENCHMARK.compared_with,
+        *transfer_option(),
+        *("--baseline", BENCHMARK.compared_with),
     ]
 
 
@@ -604,6 +619,10 @@ def tell_plan():
         workflow.dag.needrun_jobs(exclude_finished=False), Path(RESULTS)
     )
     print(plan.report(jobs, NEEDS.history, slots), flush=True)
+    if GPU and not CLUSTER and not POOL:
+        print(
+            "There is no GPU here: device: cuda will be refused when this is no dry run."
+        )
 
 
 def begin():
@@ -675,15 +694,15 @@ def template_digest():
 
 
 def report_arguments(output=REPORT):
-    values = settings.plain(CONFIG)
-    # Where MLflow lies may hold a password, and concerns nothing that the report shows.
+    values = settings.plain(BENCHMARK.whole) | {"only": ""}
+    # Where MLflow lies concerns nothing that the report shows.
     del values["tracking"]
     return [
         *("--results", RESULTS, "--output", output),
         *("--settings", json.dumps(values, sort_keys=True)),
         *("--table", str(ROOT / CONFIG.study_table), "--tables", CONFIG.tables),
         *("--baseline", BENCHMARK.compared_with),
-        *(["--transfers", *BENCHMARK.transfers] if BENCHMARK.transfers else []),
+        *transfer_option(),
     ]
 
 

@@ -45,12 +45,13 @@ def manifest(properties: dict, script: Path) -> dict:
     resources = properties["resources"]
     rule = properties.get("rule") or properties["groupid"]
     job["metadata"]["generateName"] = f"neuspring-{rule.replace('_', '-').lower()}-"
-    job["spec"]["activeDeadlineSeconds"] = 60 * resources["runtime"]
+    pod = job["spec"]["template"]["spec"]
+    # Of the pod: the time of a Job would run while it waits for a GPU.
+    pod["activeDeadlineSeconds"] = 60 * resources["runtime"]
     # Memory as a limit too: what needs more ends as one job, and is tried again with more.
     needs = {"cpu": str(properties["threads"]), "memory": f"{resources['mem_mb']}M"}
     limits = {"memory": needs["memory"]} | ({"nvidia.com/gpu": str(resources["gpu"])} if resources.get("gpu") else {})
-    container = job["spec"]["template"]["spec"]["containers"][0]
-    container |= {"command": ["/bin/sh", str(script)], "resources": {"requests": needs, "limits": limits}}
+    pod["containers"][0] |= {"command": ["/bin/sh", str(script)], "resources": {"requests": needs, "limits": limits}}
     return job
 
 
