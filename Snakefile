@@ -8,6 +8,12 @@ configfile: "config/config.yaml"
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/helpers/perceive.smk"
+include: "workflow/rules/helpers/images.smk"
+include: "workflow/rules/helpers/twin.smk"
+include: "workflow/rules/helpers/sweep.smk"
+include: "workflow/rules/helpers/tables.smk"
+include: "workflow/rules/helpers/hooks.smk"
 include: "workflow/rules/perceive.smk"
 include: "workflow/rules/observe.smk"
 include: "workflow/rules/twin.smk"

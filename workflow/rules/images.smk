@@ -18,7 +18,6 @@ rule appearance:
     resources:
         attempt=attempt_number,
         work=appearance_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("appearance", 8000),
         runtime=minutes("appearance", 240, appearance_work),
@@ -35,7 +34,7 @@ rule appearance:
     shell:
         gpu_job(
             "appearance --capture {input.capture:q} --masks {input.masks:q} {params.points} {input.points:q}"
-            " --settings {params.settings:q} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+            " --settings {params.settings:q} --seed {wildcards.seed} --threads {threads}"
             " --output {output:q}"
         )
 
@@ -61,7 +60,6 @@ rule render:
     resources:
         attempt=attempt_number,
         work=frame_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("render", 8000),
         runtime=minutes("render", 120, frame_work),
@@ -88,5 +86,5 @@ rule render:
         gpu_job(
             "render --capture {input.capture:q} --masks {input.masks:q} --observations {input.observations:q}"
             " --appearance {input.appearance:q} --rollout {input.rollout:q} --settings {params.settings:q}"
-            " --device {resources.device} --threads {threads} --output {output:q}"
+            " --threads {threads} --output {output:q}"
         )

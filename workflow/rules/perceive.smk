@@ -75,7 +75,6 @@ rule segment:
     resources:
         attempt=attempt_number,
         work=frame_work,
-        device=DEVICE,
         gpu=segment_gpu,
         mem_mb=memory("segment", 8000),
         runtime=minutes("segment", 120, frame_work),
@@ -86,7 +85,7 @@ rule segment:
     shell:
         gpu_job(
             "segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
-            " --device {resources.device} --threads {threads} --output {output:q}"
+            " --threads {threads} --output {output:q}"
         )
 
 
@@ -109,7 +108,6 @@ rule track:
     resources:
         attempt=attempt_number,
         work=frame_work,
-        device=DEVICE,
         gpu=track_gpu(),
         mem_mb=memory("track", 8000),
         runtime=minutes("track", 120, frame_work),
@@ -120,7 +118,7 @@ rule track:
     shell:
         gpu_job(
             "track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
-            " --settings {params.settings:q} --device {resources.device} --threads {threads} --output {output:q}"
+            " --settings {params.settings:q} --threads {threads} --output {output:q}"
         )
 
 

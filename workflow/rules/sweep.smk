@@ -35,7 +35,7 @@ if CONFIG.tune:
         shell:
             common_gpu_job(
                 "tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
-                " --device {resources.device} --threads {threads} --output {output:q}"
+                " --threads {threads} --output {output:q}"
             )
 
     rule sweep_report:

@@ -15,7 +15,6 @@ rule search:
     resources:
         attempt=attempt_number,
         work=search_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("search", 8000),
         runtime=minutes("search", 240, search_work),
@@ -26,7 +25,7 @@ rule search:
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
-            " --clusters {params.clusters} --seed {wildcards.seed} --device {resources.device} --threads {threads} --output {output:q}"
+            " --clusters {params.clusters} --seed {wildcards.seed} --threads {threads} --output {output:q}"
         )
 
 
@@ -48,7 +47,6 @@ rule fit:
     resources:
         attempt=attempt_number,
         work=fit_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("fit", 8000),
         runtime=minutes("fit", 480, fit_work),
@@ -59,7 +57,7 @@ rule fit:
     shell:
         gpu_job(
             "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-            " --kind {params.kind} --device {resources.device} --threads {threads} --output {output:q}"
+            " --kind {params.kind} --threads {threads} --output {output:q}"
         )
 
 
@@ -81,7 +79,6 @@ rule rollout:
     resources:
         attempt=attempt_number,
         work=frame_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("rollout", 4000),
         runtime=minutes("rollout", 60, frame_work),
@@ -93,7 +90,7 @@ rule rollout:
     shell:
         gpu_job(
             "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
-            " --device {resources.device} --threads {threads} --output {output:q}"
+            " --threads {threads} --output {output:q}"
         )
 
 
@@ -115,7 +112,6 @@ rule transfer:
     resources:
         attempt=attempt_number,
         work=frame_work,
-        device=DEVICE,
         gpu=GPU,
         mem_mb=memory("transfer", 4000),
         runtime=minutes("transfer", 60, frame_work),
@@ -131,6 +127,6 @@ rule transfer:
     shell:
         gpu_job(
             "transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
-            " --method {wildcards.method} --seed {wildcards.seed} --device {resources.device} --threads {threads}"
+            " --method {wildcards.method} --seed {wildcards.seed} --threads {threads}"
             " --output {output:q}"
         )
