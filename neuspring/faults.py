@@ -6,10 +6,11 @@ database) end a process from outside Python.
 
 from __future__ import annotations
 
+import errno
 import re
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 TAIL = 40
@@ -27,12 +28,15 @@ class Fault:
     outcome: Literal["transient", "permanent", "killed"]
     cause: str
     remedy: str = ""
+    device: Literal["", "suspect", "lost"] = ""
+    """What it says about the GPUs that were held; suspect: a job of its own making can end like this on a sound GPU too."""
 
 
 FULL = Fault("permanent", "no space left on the disk", "Free some space; the same command continues.")
 READ_ONLY = Fault("permanent", "the file system is read-only", "Make it writable; the same command continues.")
 GPU_MEMORY = Fault("transient", "out of GPU memory")
-LOST_DEVICE = Fault("transient", "the GPU was lost or failed")
+LOST_DEVICE = Fault("transient", "the GPU was lost or failed", device="lost")
+FAILED_DEVICE = replace(LOST_DEVICE, device="suspect")
 MEMORY = Fault("transient", "out of memory")
 UNREACHABLE = Fault("transient", "a store or host could not be reached")
 STORAGE = Fault("transient", "the storage failed")
@@ -40,20 +44,22 @@ INPUT = Fault("permanent", "bad input")
 UNKNOWN = Fault("permanent", "the program failed")
 CRASH = Fault("transient", "the process crashed")
 STOPPED = Fault("killed", "stopped from outside")
+MISSING = Fault("permanent", "the command was not found", "Install it, or correct PATH.")
+NOT_EXECUTABLE = Fault("permanent", "the command cannot be executed")
 
 PATTERNS = (
     (r"no space left on device|disk quota exceeded|database or disk is full", FULL),
     (r"read-only file system", READ_ONLY),
     (r"cuda out of memory|OutOfMemoryError|CUDA_ERROR_OUT_OF_MEMORY|CUDA error 2: out of memory", GPU_MEMORY),
     (r"failed to allocate \d+ bytes on device 'cuda|CUBLAS_STATUS_ALLOC_FAILED", GPU_MEMORY),
-    (r"CUDA error(?: \d+)?: (unspecified launch failure|uncorrectable ECC|the launch timed out|unknown error)", LOST_DEVICE),
-    (r"CUDA error(?: \d+)?: (an illegal memory access|.*is/are busy or unavailable)", LOST_DEVICE),
-    (r"CUDA_ERROR_(ECC_UNCORRECTABLE|DEVICE_UNAVAILABLE|LAUNCH_TIMEOUT|UNKNOWN)|all CUDA-capable devices are busy", LOST_DEVICE),
     (
         r"GPU is lost|GPU requires reset|fallen off the bus|no CUDA-capable device is detected|No CUDA GPUs are available",
         LOST_DEVICE,
     ),
-    (r"this machine has 0 CUDA devices", LOST_DEVICE),
+    (r"this machine has 0 CUDA devices|CUDA error(?: \d+)?: uncorrectable ECC|CUDA_ERROR_ECC_UNCORRECTABLE", LOST_DEVICE),
+    (r"CUDA error(?: \d+)?: (unspecified launch failure|the launch timed out|unknown error)", FAILED_DEVICE),
+    (r"CUDA error(?: \d+)?: (an illegal memory access|.*is/are busy or unavailable)", FAILED_DEVICE),
+    (r"CUDA_ERROR_(DEVICE_UNAVAILABLE|LAUNCH_TIMEOUT|UNKNOWN)|all CUDA-capable devices are busy", FAILED_DEVICE),
     (r"MemoryError|Unable to allocate|cannot allocate memory|std::bad_alloc", MEMORY),
     (r"DefaultCPUAllocator: (can't|not enough memory)|can't start new thread|resource temporarily unavailable", MEMORY),
     (r"connection (refused|reset|timed out|aborted)|ConnectionError|RemoteDisconnected|could not connect", UNREACHABLE),
@@ -84,8 +90,18 @@ def diagnose(status: int, output: Sequence[str]) -> Fault | None:
     return UNKNOWN
 
 
+def not_started(error: OSError) -> tuple[int, Fault]:
+    """(exit status as a shell gives it, cause) of a command that could not be started."""
+    if isinstance(error, FileNotFoundError):
+        return 127, MISSING
+    if error.errno in (errno.ENOMEM, errno.EAGAIN):
+        return 1, MEMORY
+    return 126, NOT_EXECUTABLE
+
+
 def last_words(output: Sequence[str]) -> str:
     """The last line of the output that says something, short."""
     lines = [line.strip() for line in output if line.strip()]
-    errors = [line for line in lines if "error" in line.lower() or "exception" in line.lower()]
+    words = [line for line in lines if not WARNING.match(line)]
+    errors = [line for line in words if "error" in line.lower() or "exception" in line.lower()]
     return (errors or lines or [""])[-1][:500]

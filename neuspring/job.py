@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import ctypes
 import os
 import platform
@@ -17,7 +18,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import IO
 
 from neuspring import faults, gpus
 from neuspring.errors import InputError
-from neuspring.job_records import FOLDER, LOGS, STARTED, Attempt, JobRecord
+from neuspring.job_records import LOGS, Attempt, JobRecord, alone, this_run
 from neuspring.watch import Watch
 
 GIVEN = "given"
@@ -40,7 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m neuspring.job", description="Run one job of the workflow.")
     parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
-    parser.add_argument("--attempt", type=int, default=1, help="1, or more where the workflow tries again")
     parser.add_argument("--scenario", default="", help="its scenario; jobs of one prefer the same GPU")
     parser.add_argument("--work", type=float, default=1.0, help="how much it has to do, in units of its rule")
     parser.add_argument("--quiet", action="store_true", help="output goes to the log alone, unless it fails")
@@ -57,7 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             results=results,
             log=a.log,
             gpus=a.gpus,
-            attempt=a.attempt,
             quiet=a.quiet,
         )
         return run(job)
@@ -76,30 +75,44 @@ class Job:
     results: Path
     log: Path
     gpus: int = 0
-    attempt: int = 1
-    """1, or more where the workflow tries again."""
     quiet: bool = False
 
 
 def run(job: Job) -> int:
-    """Run a job; returns its exit status (1 if a signal ended it). Raises InputError if it needs more GPUs than there are."""
+    """Run a job; returns its exit status (1 if a signal ended it). Raises InputError if it needs more GPUs than there are.
+
+    One run of a job at a time: a wrapper and its command may outlive Snakemake, and meet those of the next run at the same files.
+    """
+    with alone(job.record.path(job.results), _say) as lock:
+        return _run(job, lock)
+
+
+def _run(job: Job, lock: IO[str] | None) -> int:
+    # Only now: an earlier run may just have written them.
     record = replace(job.record, attempts=_earlier(job.record.path(job.results)))
-    if job.attempt > 1 and record.attempts and record.last.outcome == "permanent" and _of_this_run(job.results, record.last):
+    this = this_run(job.results)
+    if this and record.attempts and record.last.outcome == "permanent" and record.last.run == this:
         # The workflow cannot tell causes apart; its second try ends here.
         print(f"not tried again ({record.last.cause}): {record.last.message}", file=sys.stderr)
         return record.last.exit or 1
     try:
         lease = _lease(job)
     except (InputError, TimeoutError) as error:
-        refused = Attempt(started=_moment(), outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT)
+        refused = Attempt(
+            started=_moment(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT
+        )
         _save(record, refused, job.results)
         raise
     try:
         devices, waited = (list(lease.devices), round(lease.waited, 3)) if lease else (_given(job), 0.0)
-        begun = Attempt(started=_moment(), host=platform.node(), devices=devices, waited=waited)
+        begun = Attempt(started=_moment(), run=this, host=platform.node(), devices=devices, waited=waited)
         _save(record, begun, job.results)
-        ended = _execute(job, lease, begun)
+        # The command holds lock and slots too: they are free when it has ended, even if this process dies first.
+        held = [*([lock] if lock else []), *(lease.files if lease else ())]
+        ended, fault = _execute(job, held, _environment(job, lease), begun)
         _save(record, ended, job.results)
+        if lease:
+            _judge(lease, fault)
     finally:
         if lease:
             lease.release()
@@ -113,15 +126,6 @@ def _results(log: Path) -> Path:
         if parent.name == LOGS:
             return parent.parent
     raise InputError(log, f"the log of a job must lie in a folder {LOGS} of the results")
-
-
-def _of_this_run(results: Path, attempt: Attempt) -> bool:
-    """Whether an attempt belongs to the run of the workflow that goes on now, which leaves a file when it starts."""
-    try:
-        begun = (results / FOLDER / STARTED).stat().st_mtime
-    except OSError:
-        return True
-    return datetime.fromisoformat(attempt.started).timestamp() >= begun
 
 
 def _earlier(path: Path) -> list[Attempt]:
@@ -147,10 +151,31 @@ def _lease(job: Job) -> gpus.Lease | None:
     names = [name for name in pool.split(",") if name] or gpus.visible_devices()
 
     def waiting() -> None:
-        print(f"waiting for {job.gpus} of the GPUs {', '.join(names)}", file=sys.stderr, flush=True)
+        _say(f"waiting for {job.gpus} of the GPUs {', '.join(names)}")
+
+    def passing(marks: Mapping[str, gpus.Mark]) -> None:
+        _say("passed over: " + ", ".join(f"GPU {device} ({mark})" for device, mark in marks.items()))
 
     share = int(os.environ.get(SHARE, "1"))
-    return gpus.acquire(job.gpus, names, jobs_per_gpu=share, affinity=job.record.scenario, waiting=waiting)
+    affinity = job.record.scenario
+    return gpus.acquire(job.gpus, names, jobs_per_gpu=share, affinity=affinity, waiting=waiting, passing=passing)
+
+
+def _judge(lease: gpus.Lease, fault: faults.Fault | None) -> None:
+    """Note what the end of a job says about its GPUs, for the jobs after it."""
+    try:
+        if fault is None:
+            lease.worked()
+        elif fault.device:
+            lease.lost(gone=fault.device == "lost")
+    except OSError as error:
+        _say(f"warning: what became of GPU {', '.join(lease.devices)} could not be noted: {error}")
+
+
+def _say(text: str) -> None:
+    """Tell whoever watches the workflow; the log is the command's."""
+    with contextlib.suppress(OSError):  # a terminal that is gone must not end the job
+        print(text, file=sys.stderr, flush=True)
 
 
 def _moment() -> str:
@@ -169,42 +194,61 @@ def _environment(job: Job, lease: gpus.Lease | None) -> dict[str, str]:
     return dict(os.environ) if job.gpus else os.environ | {gpus.VISIBLE: ""}
 
 
-def _execute(job: Job, lease: gpus.Lease | None, begun: Attempt) -> Attempt:
-    """Run the command, its output into the log and our own; returns the finished attempt."""
-    start = time.monotonic()
-    kept: collections.deque[str] = collections.deque(maxlen=KEPT)
+def _execute(
+    job: Job, held: Sequence[IO[str]], environment: Mapping[str, str], begun: Attempt
+) -> tuple[Attempt, faults.Fault | None]:
+    """Run the command, its output into the log and our own; returns the finished attempt, and why it failed if it did."""
+    with _Log(job.log) as log:
+        log.write(f"# {begun.started} {shlex.join(job.command)}\n")
+        start = time.monotonic()
+        try:
+            process = _start(job.command, held, environment)
+        except OSError as error:
+            status, reason = faults.not_started(error)
+            log.write(f"{error}\n")
+            _say(f"{reason.cause}: {error}. {reason.remedy}".strip())
+            return replace(begun, outcome=reason.outcome, cause=reason.cause, message=str(error), exit=status), reason
+        with Watch(process.pid, begun.devices) as watch:
+            status, kept = _follow(process, log, quiet=job.quiet)
+    ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
+    fault = faults.diagnose(status, kept)
+    if fault is None:
+        return ended, None
+    if job.quiet:
+        _tell("".join(kept))
+    again = " (may be tried again)" if fault.outcome == "transient" else ""
+    _say(f"{fault.cause}{again}. {fault.remedy}".strip())
+    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(kept)), fault
+
+
+def _start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[str, str]) -> subprocess.Popen[str]:
+    """Start a command, which inherits `held`; signals that we get are passed on to it. Raises OSError."""
     process = subprocess.Popen(
-        job.command,
-        env=_environment(job, lease),
+        command,
+        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
         bufsize=1,
-        # The command holds the slots too: they are free when it has ended, even if this process dies first.
-        pass_fds=[file.fileno() for file in lease.files] if lease else [],
+        pass_fds=[file.fileno() for file in held],
         preexec_fn=_die_with_parent,
     )
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda received, frame: process.send_signal(received))
-    with Watch(process.pid, begun.devices) as watch, _Log(job.log) as log:
-        log.write(f"# {begun.started} {shlex.join(job.command)}\n")
-        assert process.stdout is not None
-        for line in process.stdout:
-            kept.append(line)
-            log.write(line)
-            if not job.quiet:
-                _tell(line)
-        status = process.wait()
-    fault = faults.diagnose(status, list(kept))
-    ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
-    if fault is None:
-        return ended
-    if job.quiet:
-        _tell("".join(kept))
-    again = " (may be tried again)" if fault.outcome == "transient" else ""
-    print(f"{fault.cause}{again}. {fault.remedy}".strip(), file=sys.stderr)
-    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(kept)))
+    return process
+
+
+def _follow(process: subprocess.Popen[str], log: _Log, *, quiet: bool) -> tuple[int, list[str]]:
+    """(exit status, last lines of the output) of a command, once it has ended."""
+    kept: collections.deque[str] = collections.deque(maxlen=KEPT)
+    assert process.stdout is not None
+    for line in process.stdout:
+        kept.append(line)
+        log.write(line)
+        if not quiet:
+            _tell(line)
+    return process.wait(), list(kept)
 
 
 def _tell(text: str) -> None:

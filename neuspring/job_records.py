@@ -5,12 +5,18 @@ One JSON file per job at results/jobs/<rule>/<wildcards>.json, beside its log at
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import functools
 import json
-from collections.abc import Iterable
+import os
+import platform
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import IO, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -20,8 +26,10 @@ from neuspring.files import write_text
 from neuspring.records import RECORD_FORMAT, read_json
 
 FOLDER, LOGS = "jobs", "logs"
-STARTED = ".started"
-"""File in FOLDER that is as old as the run of the workflow that goes on, or went on last."""
+RUN = ".run"
+"""File in FOLDER that names the run of the workflow that goes on, or went on last."""
+POLL = 0.2
+"""s between two looks whether an earlier run of a job has ended."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
 """How an attempt ended. transient: may be tried again. running: it runs, or its wrapper was killed before it could say more."""
 
@@ -45,6 +53,8 @@ class Attempt:
     exit: int | None = None
     """Exit status; negative: the signal that ended it."""
     host: str = ""
+    run: str = ""
+    """The run of the workflow that it belongs to (`begin_run`); empty where a job ran by itself."""
     devices: list[str] = field(default_factory=list)
     """GPUs held, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
     device_names: list[str] = field(default_factory=list)
@@ -114,6 +124,77 @@ class JobRecord:
             return _adapter().validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
         except ValidationError as error:
             raise InputError(path, "must be a job record", error.errors()[0]["msg"], "Delete it.") from error
+
+
+def begin_run(results: Path) -> None:
+    """Give the run of the workflow that begins a name, by which jobs tell its attempts from earlier ones.
+
+    A name and not a time: clocks of machines differ.
+    """
+    write_text(Path(results) / FOLDER / RUN, uuid.uuid4().hex)
+
+
+def this_run(results: Path) -> str:
+    """The name of the run that goes on; empty where there has been none."""
+    try:
+        return (Path(results) / FOLDER / RUN).read_text().strip()
+    except OSError:
+        return ""
+
+
+@contextlib.contextmanager
+def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | None]:
+    """Hold a job against other wrappers of it while its record at `record` is read and written and its command runs.
+
+    Where another one holds it, `waiting` is told once which, and we wait. Gives the file whose lock this is, for the command to
+    inherit: the job is then held until both have ended. None where files cannot be made or locked: then nothing is held.
+    """
+    # Snakemake removes a job's log before it starts the job, so that the log cannot be what is locked.
+    path = record.with_name(f"{record.name.removesuffix('.json')}.lock")
+    file = _held(path, waiting)
+    try:
+        yield file
+    finally:
+        if file:
+            # While it is held: whoever opened it meanwhile sees that it is no longer the one at this path.
+            with contextlib.suppress(OSError):
+                path.unlink()
+            file.close()
+
+
+def _held(path: Path, waiting: Callable[[str], object]) -> IO[str] | None:
+    told = False
+    while True:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = path.open("a+", encoding="utf-8")
+        except OSError:  # a disk that is full or read-only ends the job itself, with its name
+            return None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                _sign(file)
+                return file
+        except BlockingIOError:
+            if not told:
+                file.seek(0)
+                holder = file.read().strip() or "not known"
+                waiting(f"an earlier run of this job still goes on ({holder}); waiting for its end. If it is gone, delete {path}")
+                told = True
+            time.sleep(POLL)
+        except FileNotFoundError:
+            pass  # its holder has just ended and removed it
+        except OSError:  # some file systems of a network have no such locks
+            file.close()
+            return None
+        file.close()
+
+
+def _sign(file: IO[str]) -> None:
+    """Say who holds it."""
+    with contextlib.suppress(OSError):  # unbuffered: what a full disk does not take must not come back when it is closed
+        os.ftruncate(file.fileno(), 0)
+        os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
 
 
 @functools.cache

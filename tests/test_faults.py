@@ -42,6 +42,24 @@ def test_the_cause_is_read_off_status_and_output(status, output, outcome, cause)
     assert (fault.outcome, fault.cause) == (outcome, cause)
 
 
+@pytest.mark.parametrize(
+    ("line", "device"),
+    [
+        ("RuntimeError: No CUDA GPUs are available", "lost"),
+        ("neuspring: error: device: this machine has 0 CUDA devices; received cuda.", "lost"),
+        ("RuntimeError: CUDA error: uncorrectable ECC error encountered", "lost"),
+        ("Unable to determine the device handle for GPU0000:01:00.0: GPU is lost", "lost"),
+        # A kernel of the job's own can end like these, on a GPU that is sound.
+        ("RuntimeError: CUDA error: an illegal memory access was encountered", "suspect"),
+        ("Warp CUDA error 719: unspecified launch failure (in function wp_launch)", "suspect"),
+        ("torch.OutOfMemoryError: CUDA out of memory", ""),
+        ("ValueError: no", ""),
+    ],
+)
+def test_an_error_tells_whether_the_gpu_itself_is_lost(line, device):
+    assert faults.diagnose(1, [line]).device == device
+
+
 def test_success_is_no_fault_whatever_was_printed():
     assert faults.diagnose(0, ["CUDA out of memory (handled)"]) is None
 
@@ -55,4 +73,5 @@ def test_only_the_end_of_the_output_names_a_cause():
 def test_last_words_are_the_error_or_else_the_last_line():
     assert faults.last_words(["ValueError: no\n", "  at exit\n", "\n"]) == "ValueError: no"
     assert faults.last_words(["one\n", "two\n"]) == "two"
+    assert faults.last_words(["ValueError: no\n", "warning: on the CPU; cuda makes this an error\n"]) == "ValueError: no"
     assert faults.last_words([]) == ""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pynvml  # noqa: F401 - loaded once, not in each of 500 forks
 import pytest
@@ -47,13 +48,15 @@ def locked(file):
 
 
 def crowd(folder, jobs, at_once, seconds, crash, jobs_per_gpu=1):
-    """Run `jobs` holders, `at_once` at a time; returns the number of those that found a live holder on their slot."""
+    """Run `jobs` holders, `at_once` at a time; returns how many found a live holder on their slot or ended otherwise than meant."""
     violations, room = FORK.Queue(), threading.Semaphore(at_once)
 
     def one(duration):
         process = FORK.Process(target=hold, args=(folder, jobs_per_gpu, duration, crash, violations))
         process.start()
         process.join()
+        if process.exitcode != (-signal.SIGKILL if crash else 0):
+            violations.put(process.exitcode)
         room.release()
 
     threads = []
@@ -138,3 +141,169 @@ def test_a_folder_of_leases_that_cannot_be_used_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "file"))
     with pytest.raises(InputError, match="Set NEUSPRING_GPU_LOCKS"):
         gpus.lock_folder()
+
+
+def fail_on(device, folder, *, gone=True):
+    """A job that is lost on a device."""
+    lease = gpus.acquire(1, (device,), folder=folder, timeout=0)
+    lease.lost(gone=gone)
+    lease.release()
+
+
+def test_a_lost_device_is_passed_over_and_not_waited_for(tmp_path):
+    fail_on("0", tmp_path)
+    told = []
+    lease = gpus.acquire(1, ("0", "1"), affinity="rope", folder=tmp_path, passing=told.append)
+    assert lease.devices == ("1",)
+    assert [list(marks) for marks in told] == [["0"]]
+    assert "lost at" in str(told[0]["0"]) and "tried again from" in str(told[0]["0"])
+    # Device 0 has no holder; one waits for the other all the same.
+    with pytest.raises(TimeoutError):
+        gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0)
+    lease.release()
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0).devices == ("1",)
+
+
+@pytest.mark.parametrize(("boot", "age", "passed_over"), [("a", 60, True), ("b", 60, False), ("a", gpus.LOST_FOR + 60, False)])
+def test_a_loss_counts_until_the_machine_starts_again_or_for_a_while(tmp_path, monkeypatch, boot, age, passed_over):
+    start = tmp_path / "boot_id"
+    start.write_text("a")
+    monkeypatch.setattr(gpus, "BOOT", start)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now - age)
+    fail_on("0", tmp_path)
+    monkeypatch.setattr(time, "time", lambda: now)
+    start.write_text(boot)
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == (("1",) if passed_over else ("0",))
+
+
+def test_a_device_that_works_again_is_no_longer_passed_over(tmp_path):
+    fail_on("0", tmp_path)
+    mark = next(tmp_path.glob("*.lost"))
+    held = gpus.Lease(("0",), (), 0.0, (mark,))
+    held.worked()
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == ("0",)
+
+
+def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(tmp_path):
+    fail_on("0", tmp_path)
+    with pytest.raises(
+        InputError, match=r"a job needs 2 of the GPUs 0, 1, and too few are left; received GPU 0 \(lost at .*nvidia-smi"
+    ):
+        gpus.acquire(2, ("0", "1"), folder=tmp_path)
+    fail_on("1", tmp_path)
+    with pytest.raises(InputError, match=r"received GPU 0 \(lost at .*, GPU 1 \(lost at .*delete .*\*\.lost"):
+        gpus.acquire(1, ("0", "1"), folder=tmp_path)
+    for mark in tmp_path.glob("*.lost"):
+        mark.unlink()
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == ("0",)
+
+
+def test_a_device_lost_while_others_wait_for_it_ends_their_wait(tmp_path):
+    lease = gpus.acquire(1, ("0",), folder=tmp_path)
+
+    def lose():
+        lease.lost(gone=True)
+        lease.release()
+
+    with pytest.raises(InputError, match="too few are left"):
+        gpus.acquire(1, ("0",), folder=tmp_path, timeout=20, waiting=lose)
+
+
+def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(tmp_path):
+    fail_on("0", tmp_path, gone=False)
+    second = gpus.acquire(1, ("0", "1"), folder=tmp_path)
+    assert second.devices == ("1",)
+    with pytest.raises(TimeoutError):
+        gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0)
+    second.release()
+    fail_on("1", tmp_path, gone=False)
+    # None is beyond doubt: the one whose failure is longest ago comes first.
+    first = gpus.acquire(1, ("1", "0"), folder=tmp_path)
+    assert first.devices == ("0",)
+    first.worked()
+    first.release()
+    assert [gpus.acquire(1, ("1", "0"), folder=tmp_path).devices for _ in range(2)] == [("0",), ("0",)]
+
+
+def test_of_two_jobs_on_a_lost_device_the_one_that_knows_is_believed(tmp_path):
+    first, second = (gpus.acquire(1, ("0",), jobs_per_gpu=2, folder=tmp_path) for _ in range(2))
+    first.lost(gone=True)
+    second.lost(gone=False)
+    with pytest.raises(InputError, match="too few are left"):
+        gpus.acquire(1, ("0",), jobs_per_gpu=2, folder=tmp_path)
+
+
+def test_a_damaged_mark_counts_for_nothing(tmp_path):
+    for text in ("", "{", "[]", '{"time": "x"}'):
+        (tmp_path / "0.lost").write_text(text)
+        gpus.acquire(1, ("0",), folder=tmp_path, timeout=0).release()
+
+
+@pytest.fixture
+def private():
+    before = os.umask(0o077)
+    yield
+    os.umask(before)
+
+
+def mode(path):
+    return path.stat().st_mode & 0o7777
+
+
+@pytest.mark.usefixtures("private")
+def test_a_folder_that_is_made_for_sharing_is_open_to_all_users_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "chmod", lambda *_: None)  # another user may come before it
+    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
+    assert mode(gpus.lock_folder()) == 0o1777
+    lease = gpus.acquire(1, ("0",))
+    lease.lost(gone=True)
+    assert {path.name: mode(path) for path in (tmp_path / "locks").iterdir()} == dict.fromkeys(
+        ("allocation.lock", "0.0.lock", "0.lost"), 0o666
+    )
+    assert os.umask(0o077) == 0o077, "the user's own files stay private"
+
+
+def test_a_folder_that_was_there_keeps_its_rights(tmp_path, monkeypatch):
+    (tmp_path / "locks").mkdir(mode=0o750)
+    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
+    assert mode(gpus.lock_folder()) == 0o750
+
+
+def test_another_user_s_file_is_opened_as_the_kernel_allows_it_in_a_shared_folder(tmp_path, monkeypatch):
+    """With O_CREAT it does not, even where the file may be written to (fs.protected_regular, which is off on some machines)."""
+    gpus.acquire(1, ("0",), folder=tmp_path).release()
+    opened = []
+
+    def watched(path, flags, *rest):
+        opened.append(flags)
+        return os_open(path, flags, *rest)
+
+    os_open = os.open
+    monkeypatch.setattr(os, "open", watched)
+    gpus.acquire(1, ("0",), folder=tmp_path).release()
+    assert opened and not any(flags & os.O_CREAT for flags in opened)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="acts as two users")
+def test_two_users_share_devices(tmp_path, monkeypatch):
+    for parent in (tmp_path, *tmp_path.parents[:2]):
+        parent.chmod(0o755)
+    (tmp_path / "all").mkdir()
+    (tmp_path / "all").chmod(0o777)
+    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "all" / "locks"))
+    for user, expected in ((1001, ("0",)), (1002, ("1",)), (1001, ("1",))):
+        process = FORK.Process(target=lose_as, args=(user, expected))
+        process.start()
+        process.join(20)
+        assert process.exitcode == 0, (user, expected)
+
+
+def lose_as(user, expected):
+    """Lose device 0, if it is free to be lost, as another user with a private umask."""
+    os.umask(0o077)
+    os.setuid(user)
+    lease = gpus.acquire(1, ("0", "1"))
+    assert lease.devices == expected
+    if expected == ("0",):
+        lease.lost(gone=True)

@@ -1,5 +1,7 @@
 """The wrapper of every job: log, record, GPUs, causes, signals."""
 
+import errno
+import fcntl
 import json
 import os
 import signal
@@ -11,7 +13,7 @@ import pytest
 
 from neuspring import gpus, job
 from neuspring.errors import InputError
-from neuspring.job_records import Attempt, JobRecord, failure_lines, read_jobs
+from neuspring.job_records import Attempt, JobRecord, alone, begin_run, failure_lines, read_jobs
 
 NAME = "search/rope/uniform/0"
 
@@ -21,6 +23,7 @@ def results(tmp_path, monkeypatch):
     for name in (job.POOL, job.SHARE, gpus.VISIBLE):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
+    begin_run(tmp_path / "results")
     return tmp_path / "results"
 
 
@@ -51,10 +54,11 @@ def test_a_job_leaves_its_output_in_the_log_and_a_record(results):
 def test_a_permanent_failure_is_not_tried_again_but_the_next_run_tries(results):
     code = "import sys; print('neuspring: error: x: no', file=sys.stderr); sys.exit(2)"
     assert run(results, code).returncode == 2
-    again = run(results, "print('ran')", "--attempt", "2")
+    again = run(results, "print('ran')")
     assert (again.returncode, again.stdout) == (2, "")
     assert "not tried again (bad input): neuspring: error: x: no" in again.stderr
     assert [attempt.outcome for attempt in record(results).attempts] == ["permanent"]
+    begin_run(results)
     assert run(results, "print('ran')").returncode == 0
     assert [attempt.outcome for attempt in record(results).attempts] == ["permanent", "ok"]
 
@@ -62,7 +66,7 @@ def test_a_permanent_failure_is_not_tried_again_but_the_next_run_tries(results):
 def test_a_transient_failure_is_tried_again(results):
     assert run(results, "raise MemoryError").returncode == 1
     assert record(results).last.cause == "out of memory"
-    assert run(results, "pass", "--attempt", "2").returncode == 0
+    assert run(results, "pass").returncode == 0
     assert [attempt.outcome for attempt in record(results).attempts] == ["transient", "ok"]
 
 
@@ -134,12 +138,10 @@ def test_records_come_back_as_they_were_written(tmp_path):
     assert read_jobs(tmp_path) == [kept]
 
 
-def test_a_permanent_failure_of_an_earlier_run_does_not_stop_a_later_attempt(results):
-    assert run(results, "import sys; sys.exit(2)").returncode == 2
-    started = results / "jobs" / ".started"
-    started.touch()
-    os.utime(started, (time.time() + 60, time.time() + 60))
-    assert run(results, "print('ran')", "--attempt", "2").stdout == "ran\n"
+def test_a_job_by_itself_runs_whenever_it_is_asked_to(results):
+    by_hand = results.with_name("by_hand")
+    assert run(by_hand, "import sys; sys.exit(2)").returncode == 2
+    assert run(by_hand, "print('ran')").stdout == "ran\n"
 
 
 def test_a_full_disk_behind_the_output_does_not_end_the_job(results):
@@ -167,3 +169,173 @@ def test_damaged_records_do_not_hide_the_others(tmp_path):
     damaged: list[str] = []
     assert [record.name for record in read_jobs(tmp_path, damaged)] == ["fit/a"]
     assert len(damaged) == 1
+
+
+def test_a_dead_gpu_costs_one_job_one_attempt(results, monkeypatch, tmp_path):
+    monkeypatch.setenv(job.POOL, "0,1")
+    uses = tmp_path / "uses"
+    code = f"""import os, sys, time
+device = os.environ['{gpus.VISIBLE}']
+open({str(uses)!r}, 'a').write(device)
+time.sleep(0.05)
+if device == '0': sys.exit('RuntimeError: No CUDA GPUs are available')"""
+
+    def start(number):
+        log = results / "logs" / "fit" / f"{number}.log"
+        options = ["--log", str(log), "--gpus", "1", "--scenario", "rope"]
+        command = [sys.executable, "-m", "neuspring.job", *options, "--", sys.executable, "-c", code]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    jobs = 5
+    running = [start(number) for number in range(jobs)]
+    told = [process.communicate(timeout=60)[1] for process in running]
+    failed = [number for number, process in enumerate(running) if process.returncode]
+    assert len(failed) == 1
+    again = start(failed[0])
+    told.append(again.communicate(timeout=60)[1])
+    assert again.returncode == 0
+    assert (uses.read_text().count("0"), uses.read_text().count("1")) == (1, jobs)
+    assert "passed over: GPU 0 (lost at" in told[-1]
+    ended = [[attempt.outcome for attempt in found.attempts] for found in read_jobs(results)]
+    assert sorted(ended) == [["ok"]] * (jobs - 1) + [["transient", "ok"]]
+
+
+def test_where_all_gpus_are_lost_the_next_job_says_so(results, monkeypatch):
+    monkeypatch.setenv(job.POOL, "0")
+    assert run(results, "import sys; sys.exit('GPU is lost')", "--gpus", "1").returncode == 1
+    again = run(results, "print('ran')", "--gpus", "1")
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "too few are left; received GPU 0 (lost at" in again.stderr and "nvidia-smi" in again.stderr
+    assert (record(results).last.outcome, record(results).last.cause) == ("permanent", "no GPU")
+
+
+def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_job(results, monkeypatch):
+    monkeypatch.setenv(job.POOL, "0")
+    code = "import sys; sys.exit('CUDA error: an illegal memory access was encountered')"
+    assert run(results, code, "--gpus", "1").returncode == 1
+    assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n"
+    # It worked, so nothing is left against it.
+    assert [path.stat().st_size for path in (results.parent / "locks").glob("*.lost")] == [0]
+
+
+def wrap(results, code, *options):
+    command = [sys.executable, "-m", "neuspring.job", "--log", str(results / "logs" / f"{NAME}.log"), *options]
+    return subprocess.Popen([*command, "--", sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+
+
+def test_a_job_waits_for_the_end_of_its_earlier_run_before_it_takes_a_gpu(results, monkeypatch, tmp_path):
+    """As when Snakemake was killed and started again."""
+    monkeypatch.setenv(job.POOL, "0,1")
+    trace, end = tmp_path / "trace", tmp_path / "end"
+    code = f"""import os, time
+def note(text): open({str(trace)!r}, 'a').write(text + os.environ['{gpus.VISIBLE}'] + ' ')
+note('begin')
+while not os.path.exists({str(end)!r}): time.sleep(0.02)
+note('end')"""
+    first = wrap(results, code, "--gpus", "1")
+    wait_for(lambda: trace.exists() and trace.read_text())
+    # Snakemake removes the log of a job before it starts it.
+    (results / "logs" / f"{NAME}.log").unlink()
+    second = wrap(results, code, "--gpus", "1")
+    line = second.stderr.readline()
+    assert f"an earlier run of this job still goes on (pid {first.pid} on " in line
+    # While it waits it holds no GPU.
+    gpus.acquire(1, ("1",), timeout=0).release()
+    end.touch()
+    assert (first.wait(20), second.wait(20)) == (0, 0)
+    assert trace.read_text() == "begin0 end0 begin0 end0 "
+    assert second.stderr.read() == "", "told once"
+    assert [attempt.outcome for attempt in record(results).attempts] == ["ok", "ok"]
+    assert [path.name for path in (results / "jobs" / NAME).parent.iterdir()] == ["0.json"], "no lock is left"
+
+
+def test_a_job_is_held_while_its_command_lives_even_without_its_wrapper(results, tmp_path):
+    path = results / "jobs" / "fit" / "a.json"
+    with alone(path, pytest.fail) as lock:
+        child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=[lock.fileno()])
+        # As if the wrapper was killed: its descriptor is closed, its file stays.
+        os.link(path.with_name("a.lock"), tmp_path / "kept")
+    os.link(tmp_path / "kept", path.with_name("a.lock"))
+    told = []
+
+    def free(text):
+        told.append(text)
+        child.communicate(b"\n")
+
+    with alone(path, free) as lock:
+        assert lock is not None
+    assert len(told) == 1 and f"pid {os.getpid()} on " in told[0]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_a_command_inherits_the_locks_of_its_job(results, monkeypatch):
+    monkeypatch.setenv(job.POOL, "3")
+    code = "import glob, os; print(*sorted(os.path.realpath(fd) for fd in glob.glob('/proc/self/fd/*')), sep='\\n')"
+    held = [line for line in run(results, code, "--gpus", "1").stdout.splitlines() if line.endswith(".lock")]
+    assert held == [str(results.parent / "locks" / "3.0.lock"), str(results / "jobs" / f"{NAME}.lock")]
+
+
+def test_a_lock_whose_file_its_last_holder_removed_is_no_lock(tmp_path, monkeypatch):
+    lock, calls = tmp_path / "a.lock", []
+
+    def flock(*arguments):
+        if not calls:
+            lock.unlink()  # between our opening the file and locking it
+        calls.append(arguments)
+        real(*arguments)
+
+    real = fcntl.flock
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with alone(tmp_path / "a.json", pytest.fail):
+        assert lock.exists()
+    assert len(calls) == 2
+
+
+def test_a_lock_that_is_deleted_is_waited_for_no_longer(tmp_path):
+    path = tmp_path / "a.json"
+    with alone(path, pytest.fail), alone(path, lambda text: path.with_name("a.lock").unlink()) as lock:
+        assert lock is not None
+
+
+def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
+    def unsupported(*_):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", unsupported)
+    with alone(tmp_path / "a.json", pytest.fail) as lock:
+        assert lock is None
+
+
+def test_a_command_that_cannot_be_started_ends_with_its_cause_and_is_not_tried_again(results, tmp_path):
+    there = tmp_path / "there"
+    there.write_text("no program")
+    wrapper = [sys.executable, "-m", "neuspring.job", "--log", str(results / "logs" / f"{NAME}.log"), "--"]
+    for command, status, cause in (
+        (str(tmp_path / "nowhere"), 127, "the command was not found"),
+        (str(there), 126, "the command cannot be executed"),
+    ):
+        begin_run(results)
+        done = subprocess.run([*wrapper, command], capture_output=True, text=True, check=False)
+        last = record(results).last
+        assert (done.returncode, last.exit, last.outcome, last.cause) == (status, status, "permanent", cause)
+        assert command in last.message and cause in done.stderr and "Traceback" not in done.stderr
+        assert command in (results / "logs" / f"{NAME}.log").read_text().splitlines()[-1]
+    again = run(results, "print('ran')")
+    assert (again.returncode, again.stdout) == (126, "")
+
+
+@pytest.mark.parametrize(("held", "device", "told"), [("1", "auto", True), ("", "auto", False), ("1", "cpu", False)])
+def test_a_job_with_a_gpu_that_computes_on_the_cpu_says_so(monkeypatch, capsys, held, device, told):
+    import torch
+
+    from neuspring.physics import solver
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setenv(gpus.VISIBLE, held)
+    solver._warn_of_idle_gpu.cache_clear()
+    assert [solver.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == told
+    assert all("holds GPU 1, but torch finds no CUDA" in line and "device: cuda this is an error" in line for line in lines)
+    with pytest.raises(InputError, match="this machine has 0 CUDA devices"):
+        solver.resolve_device("cuda")

@@ -64,12 +64,26 @@ def resolve_device(device: str) -> str:
     if not DEVICES.fullmatch(device):
         raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device == "auto" and count == 0:
+        _warn_of_idle_gpu(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
     if device == "cpu" or (device == "auto" and count == 0):
         return "cpu"
     index = int(device.partition(":")[2] or 0)
     if index >= count:
         raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
     return f"cuda:{index}"
+
+
+@functools.cache
+def _warn_of_idle_gpu(held: str) -> None:
+    """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
+    if held.strip() not in ("", "-1"):
+        print(
+            f"warning: this job holds GPU {held}, but torch finds no CUDA (a CPU build, or a driver that does not match?): "
+            "it computes on the CPU. With device: cuda this is an error.",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ rule nap:
     log: "results/logs/nap/{{i}}.log"
     retries: 2
     resources: gpu=1, attempt=lambda wildcards, attempt: attempt
-    shell: "{python} -m neuspring.job --log {{log}} --attempt {{resources.attempt}} --gpus 1 -- {nap} && touch {{output}}"
+    shell: "{python} -m neuspring.job --log {{log}} --gpus 1 -- {nap} && touch {{output}}"
 """
 WELL = "sleep {seconds}"
 CRASH = """bash -c 'if [ {{resources.attempt}} = 1 ]; then sleep 0.$((RANDOM % 9)); kill -9 $$; fi; sleep {seconds}'"""

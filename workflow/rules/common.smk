@@ -15,7 +15,7 @@ from neuspring import config as settings
 from neuspring import gpus, job, needs, plan, tune_space
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
-from neuspring.job_records import FOLDER, STARTED, failure_lines, read_jobs
+from neuspring.job_records import begin_run, failure_lines, read_jobs
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
@@ -111,7 +111,7 @@ shell.prefix(job_prefix())
 
 def wrapped(options, command):
     """A `neuspring` command in the wrapper that every job runs in: GPU lease, log, record, cause of failure (`neuspring.job`)."""
-    run = "python -m neuspring.job --log {log:q} --attempt {resources.attempt}"
+    run = "python -m neuspring.job --log {log:q}"
     return f"{run} {options} -- python -m neuspring {command}"
 
 
@@ -136,10 +136,6 @@ def gpu_job(command):
 
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
 GPU_FIRST = 10 * GPU
-
-
-def attempt_number(wildcards, attempt):
-    return attempt
 
 
 def one(wildcards):

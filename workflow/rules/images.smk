@@ -16,7 +16,6 @@ rule appearance:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=appearance_work,
         gpu=GPU,
         mem_mb=memory("appearance", 8000),
@@ -58,7 +57,6 @@ rule render:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         gpu=GPU,
         mem_mb=memory("render", 8000),

@@ -12,7 +12,6 @@ rule observe:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("observe", 4000),
         runtime=minutes("observe", 30, frame_work),

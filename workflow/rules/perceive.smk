@@ -13,7 +13,6 @@ rule synthesise:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("capture", 4000),
         runtime=minutes("capture", 120, frame_work),
@@ -43,7 +42,6 @@ rule capture:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("capture", 4000),
         runtime=minutes("capture", 120, frame_work),
@@ -73,7 +71,6 @@ rule segment:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         gpu=segment_gpu,
         mem_mb=memory("segment", 8000),
@@ -106,7 +103,6 @@ rule track:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         gpu=track_gpu(),
         mem_mb=memory("track", 8000),
@@ -140,7 +136,6 @@ rule lift:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("lift", 8000),
         runtime=minutes("lift", 60, frame_work),
@@ -177,7 +172,6 @@ rule judge:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("judge", 4000),
         runtime=minutes("judge", 30, frame_work),
@@ -205,7 +199,6 @@ rule perception_table:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         mem_mb=memory("perception_table", 2000),
         runtime=minutes("perception_table", 10),
     params:

@@ -17,7 +17,6 @@ rule score:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("score", 4000),
         runtime=minutes("score", 30, frame_work),

@@ -13,7 +13,6 @@ rule study:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         mem_mb=memory("study", 2000),
         runtime=minutes("study", 10),
     params:

@@ -21,7 +21,6 @@ if CONFIG.tune:
             ENVIRONMENT
         threads: 1
         resources:
-            attempt=attempt_number,
             device=DEVICE,
             gpu=GPU,
             mem_mb=memory("tune", 8000),
@@ -52,7 +51,6 @@ if CONFIG.tune:
             ENVIRONMENT
         threads: 1
         resources:
-            attempt=attempt_number,
             mem_mb=memory("sweep", 4000),
             runtime=minutes("sweep", 20),
         params:
@@ -76,7 +74,6 @@ if CONFIG.tune:
             ENVIRONMENT
         threads: 1
         resources:
-            attempt=attempt_number,
             mem_mb=memory("log_sweep", 2000),
             runtime=minutes("log_sweep", 30),
         params:

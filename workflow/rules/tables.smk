@@ -13,7 +13,6 @@ rule tables:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         mem_mb=memory("tables", 2000),
         runtime=minutes("tables", 10),
     params:
@@ -39,7 +38,6 @@ rule report:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         mem_mb=memory("report", 4000),
         runtime=minutes("report", 20),
     params:

@@ -11,7 +11,6 @@ rule track_init:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         mem_mb=memory("track_init", 2000),
         runtime=minutes("track_init", 10),
     params:
@@ -38,7 +37,6 @@ rule log_run:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         mem_mb=memory("log_run", 2000),
         runtime=minutes("log_run", 10, frame_work),

@@ -13,7 +13,6 @@ rule search:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=search_work,
         gpu=GPU,
         mem_mb=memory("search", 8000),
@@ -45,7 +44,6 @@ rule fit:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=fit_work,
         gpu=GPU,
         mem_mb=memory("fit", 8000),
@@ -77,7 +75,6 @@ rule rollout:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         gpu=GPU,
         mem_mb=memory("rollout", 4000),
@@ -110,7 +107,6 @@ rule transfer:
         ENVIRONMENT
     threads: 1
     resources:
-        attempt=attempt_number,
         work=frame_work,
         gpu=GPU,
         mem_mb=memory("transfer", 4000),

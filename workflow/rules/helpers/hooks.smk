@@ -16,10 +16,7 @@ def tell_plan():
 
 
 def begin():
-    """Leave a mark by which jobs tell this run's attempts from earlier ones."""
-    mark = Path(RESULTS) / FOLDER / STARTED
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.touch()
+    begin_run(Path(RESULTS))
     tell_plan()
 
 
