@@ -62,12 +62,18 @@ def _check_data(a: argparse.Namespace) -> int:
 
 
 def _study(a: argparse.Namespace) -> int:
-    from neuspring import studies, tables_paper
+    from neuspring import studies, tables, tables_paper
 
     known = studies.read_studies(a.table)
     if a.study not in known:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(known)}")
-    print(tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output))
+    if a.scores:
+        text = tables_paper.write_collected(a.study, known[a.study], tables.read_scores(a.scores), a.output)
+    elif a.scenarios and a.methods and a.seeds:
+        text = tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output)
+    else:
+        raise InputError("study", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
+    print(text)
     return 0
 
 
@@ -156,7 +162,11 @@ def add_commands(add: Adder) -> None:
     ui.add_argument("--host", default="127.0.0.1")
     ui.add_argument("--port", type=int, default=5000)
 
-    study = add("study", _study, "run records -> one of the paper's tables, beside the paper's values", "results", "runs", "output")
+    study = add("study", _study, "run records -> one of the paper's tables, beside the paper's values", "results", "output")
+    study.add_argument("--scenarios", nargs="+")
+    study.add_argument("--methods", nargs="+")
+    study.add_argument("--seeds", nargs="+", type=int)
+    study.add_argument("--scores", type=Path, help="instead of run records: a scores.csv that tables wrote, on any machine")
     study.add_argument("--study", required=True, help="row of the study table")
     study.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from neuspring.errors import InputError
 from neuspring.figures_clusters import NAME as CLUSTERS
 from neuspring.figures_clusters import cluster_methods, clusters_figure
 from neuspring.figures_ratios import NAME as RATIOS
@@ -72,6 +73,21 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
     columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
     runs = pd.DataFrame(rows, columns=list(columns))
     return Collected(_stacked(tables), runs.fillna(dict.fromkeys(("notes", "source", "run_key"), "")))
+
+
+def read_scores(path: Path) -> Collected:
+    """The runs of a scores.csv that `write` wrote, without their records: all count as finished. Raises InputError."""
+    try:
+        scores = pd.read_csv(path)
+        scores = scores[list(COLUMNS)].astype({"value": float, "seed": int})
+    except (OSError, ValueError, KeyError) as error:
+        rule = f"must be a scores.csv with the columns {', '.join(COLUMNS)}"
+        raise InputError(path, rule, " ".join(str(error).split()), "Take the file from a folder of tables.") from error
+    runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
+    facts = {"status": "ok", "reason": "", "notes": "", "images": "null", "source": path.name, "run_key": "", "averaged": 1}
+    for name, value in facts.items():
+        runs[name] = value
+    return Collected(scores, runs)
 
 
 def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:

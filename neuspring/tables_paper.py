@@ -2,7 +2,8 @@
 
 Per study, in one folder: <study>.md and .tex (to read), .csv (a row per cell), _runs.csv (which runs count, and why not the
 others), _scenarios.csv, _categories.csv, .json (what the table was made of, for `neuspring explain`); where the released
-PhysTwin's method is a row also _released_phystwin.csv and .md, and for the number of regions _curve.png.
+PhysTwin's method is a row, and its scenarios are among the runs, also _released_phystwin.csv and .md; for the number of regions
+_curve.png.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ def _left_out(runs: pd.DataFrame, study: Study, name: str) -> str:
 def _write_released(name: str, study: Study, own: Collected, folder: Path) -> str:
     """The comparison with the released PhysTwin, if its method is a row; returns the section that names it."""
     method = next((method for method in RELEASED_METHODS if method in study.rows.values()), None)
-    if method is None:
+    if method is None or not own.runs["scenario"].isin(paper.scenarios()).any():
         return ""
     table, stem = released_comparison(own, method), f"{name}_released_phystwin"
     write_text(folder / f"{stem}.csv", table.to_csv(index=False))

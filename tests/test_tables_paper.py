@@ -1,5 +1,6 @@
 """The tables beside the paper's: its conventions, honest verdicts, nothing hidden."""
 
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +10,7 @@ import pandas as pd
 import pytest
 
 from neuspring import paper, tables, tables_cells, tables_paper, tables_render
+from neuspring.cli import main
 from neuspring.config import parse
 from neuspring.data.conformance import released_cases
 from neuspring.errors import InputError
@@ -17,7 +19,8 @@ from neuspring.studies import Study, read_studies
 from neuspring.tables import Collected
 from tests.study_runs import all_scores, write_benchmark, write_run
 
-STUDIES = read_studies(Path(__file__).resolve().parents[1] / "config" / "studies.yaml")
+STUDY_TABLE = Path(__file__).resolve().parents[1] / "config" / "studies.yaml"
+STUDIES = read_studies(STUDY_TABLE)
 RELEASED = sorted(paper.scenarios())
 CD, TE, IOU, PSNR = (("future", name) for name in ("chamfer", "track_error", "iou", "psnr"))
 Values = Mapping[tuple[str, str, int], Mapping[tuple[str, str], float]]
@@ -346,6 +349,26 @@ def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_p
     tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
     for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+
+
+def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
+    methods = {"baseline": 1.0, "neuspring": 0.8}
+    for number, (method, factor) in itertools.product(range(7), methods.items()):
+        write_run(tmp_path, f"cable_{number}", method, 0, {CD: 0.01 * factor * (1 + number)}, source="mocap")
+    names = [f"cable_{number}" for number in range(7)]
+    tables.write(tables.collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    tables_paper.write_study("table2", STUDIES["table2"], tmp_path, names, [0], methods, tmp_path / "records")
+    command = ["study", "--study", "table2", "--table", str(STUDY_TABLE), "--output", str(tmp_path / "scores")]
+    assert main([*command, "--scores", str(tmp_path / "tables" / "scores.csv")]) == 0
+    assert "same direction, confirmed" in capsys.readouterr().out
+    for name in ("table2.csv", "table2_scenarios.csv", "table2.md"):
+        assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
+    assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
+    assert main(command) == 2
+    assert "--scores, or --scenarios, --methods and --seeds" in capsys.readouterr().err
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    assert main([*command, "--scores", str(tmp_path / "other.csv")]) == 2
+    assert "other.csv: must be a scores.csv with the columns scenario, category" in capsys.readouterr().err
 
 
 def test_how_pictures_were_scored_is_said(tmp_path):
