@@ -84,10 +84,8 @@ def read_scores(path: Path) -> Collected:
         rule = f"must be a scores.csv with the columns {', '.join(COLUMNS)}"
         raise InputError(path, rule, " ".join(str(error).split()), "Take the file from a folder of tables.") from error
     runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
-    facts = {"status": "ok", "reason": "", "notes": "", "images": "null", "source": path.name, "run_key": "", "averaged": 1}
-    for name, value in facts.items():
-        runs[name] = value
-    return Collected(scores, runs)
+    nothing = {"reason": "", "notes": "", "images": "null", "run_key": ""}
+    return Collected(scores, runs.assign(status="ok", source=path.name, averaged=1, **nothing))
 
 
 def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:
