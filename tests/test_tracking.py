@@ -20,6 +20,7 @@ from neuspring import tracking, tracking_query, tracking_store
 from neuspring.config import Tracking
 from neuspring.errors import InputError
 from neuspring.job_records import Attempt, JobRecord
+from tests import loggers
 from tests.stores import STEPS, write_run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -274,18 +275,10 @@ def test_a_server_that_fails_midway_leaves_nothing_double(results: Path, monkeyp
     assert sorted(run.info.status for run in runs_of(results)) == ["FINISHED", "KILLED"]
 
 
-def test_processes_that_log_the_same_records_at_once_double_none(results: Path) -> None:
+def test_processes_that_log_the_same_records_at_once_double_none(results: Path, tmp_path: Path) -> None:
     records = [write_run(results, scenario=f"s{i}") for i in range(8)]
-    code = """
-import sys
-from pathlib import Path
-from neuspring import tracking
-from neuspring.config import Tracking
-for path in sys.argv[2:]:
-    print(tracking.log_run(Path(path), Path(sys.argv[1]), Tracking()))
-"""
-    processes = [python(code, results, *records) for _ in range(4)]
-    words = [word for process in processes for word in output(process)]
+    assert loggers.start([records] * 4, results, SETTINGS, tmp_path).wait(300) == 0, (tmp_path / "stderr").read_text()
+    words = [word for _, word, _ in loggers.outcomes(tmp_path)]
     assert sorted(words) == ["already logged"] * 24 + ["logged"] * 8
     runs = runs_of(results)
     assert len(runs) == 8 and {run.data.tags["scenario"] for run in runs} == {f"s{i}" for i in range(8)}

@@ -33,6 +33,11 @@ def copy_workflow(project: Path) -> Path:
     return project
 
 
+def copy_finished(finished: Path, project: Path) -> Path:
+    """A finished project's copy, to change at will; with its times, so that nothing in it is to be done."""
+    return Path(shutil.copytree(finished, project))
+
+
 def arguments(project: Path, changes=None, *extra: str) -> list[str]:
     overlay = project / "overlay.yaml"
     overlay.write_text(yaml.safe_dump(config_with(changes or {})))
@@ -49,10 +54,14 @@ def config_with(changes: dict) -> dict:
 def run(project: Path, changes=None, *extra: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(
-        arguments(project, changes, *extra), cwd=project, env=environment, capture_output=True, text=True, timeout=300, check=False
+        arguments(project, changes, *extra), cwd=project, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
 
 
 def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
-    lines = (result.stdout + result.stderr).split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
+    return planned_jobs(result.stdout + result.stderr)
+
+
+def planned_jobs(output: str) -> dict[str, int]:
+    lines = output.split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
     return {name: int(count) for name, count in (line.split() for line in lines) if name != "total"}

@@ -14,9 +14,9 @@ import pytest
 from neuspring.job_records import JobRecord, read_jobs
 from tests.data.phystwin_case import write_case
 
-from .project import ROOT, SCENE, arguments
+from .project import ROOT, SCENE, arguments, planned_jobs
 
-OTHER, RELEASED = "toy_blob_lift_smooth", "weird_package"
+RELEASED = "weird_package"
 SABOTAGE = '''
 """Lets chosen `neuspring` commands fail when they are first called; counts the calls of all."""
 import json, os, sys
@@ -49,9 +49,9 @@ def sabotage(tmp_path):
     return environment
 
 
-def start(place, changes, environment):
+def start(place, changes, environment, *extra):
     return subprocess.Popen(
-        arguments(place, changes), cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        arguments(place, changes, *extra), cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 
@@ -87,52 +87,58 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path
     whole = (case / "final_data.pkl").read_bytes()
     (case / "final_data.pkl").write_bytes(whole[:1000])
     changes = {
-        "scenarios": [SCENE, OTHER, RELEASED],
+        "scenarios": [SCENE, RELEASED],
         "methods": ["baseline"],
         "data_root": str(data),
-        "fit": {"epochs": 40},
+        "fit": {"epochs": 20},
         "tracking": {"uri": "http://127.0.0.1:9"},
     }
     faults = {
-        "memory": (["fit", f"/{SCENE}/"], "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."),
-        "killed": (["fit", f"/{OTHER}/"], ""),
+        "memory": (["search --", f"/{SCENE}/"], "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."),
+        "killed": (["fit --", f"/{SCENE}/"], ""),
         "corrupt": (["observe", RELEASED], ""),
     }
     process = start(place, changes, sabotage(**faults))
-    partial = results / OTHER / "baseline" / "0" / "fit.partial.npz"
+    partial = results / SCENE / "baseline" / "0" / "fit.partial.npz"
     wait_for(partial.exists, process)
-    wrapper = wrapper_of("fit", f"/{OTHER}/")
+    wrapper = wrapper_of("fit", f"/{SCENE}/")
     (command,) = wrapper.children()
     wrapper.send_signal(signal.SIGKILL)
     output, _ = process.communicate(timeout=240)
     assert process.returncode == 1, output
 
-    # Two of three scenarios are finished: one after another attempt, one from its checkpoint.
-    assert finished(results) == {SCENE, OTHER}
-    assert [attempt.outcome for attempt in record(results, f"fit/{SCENE}/baseline/0").attempts] == ["transient", "ok"]
-    assert record(results, f"fit/{SCENE}/baseline/0").attempts[0].cause == "out of GPU memory"
-    assert [attempt.outcome for attempt in record(results, f"fit/{OTHER}/baseline/0").attempts] == ["running", "ok"]
-    assert json.loads((results / OTHER / "baseline" / "0" / "fit.json").read_text())["attempts"] == 2
+    # The healthy scenario is finished and in the table: its search after another attempt, its fit from its checkpoint.
+    assert finished(results) == {SCENE}
+    assert "1/2" in output
+    assert [attempt.outcome for attempt in record(results, f"search/{SCENE}/uniform/0").attempts] == ["transient", "ok"]
+    assert record(results, f"search/{SCENE}/uniform/0").attempts[0].cause == "out of GPU memory"
+    assert [attempt.outcome for attempt in record(results, f"fit/{SCENE}/baseline/0").attempts] == ["running", "ok"]
+    assert json.loads((results / SCENE / "baseline" / "0" / "fit.json").read_text())["attempts"] == 2
     assert not command.is_running()
     # Bad data are read once, not three times, and named.
     assert sabotage.count("corrupt") == 1
     assert record(results, f"observe/{RELEASED}").last.cause == "bad input"
     assert f"observe/{RELEASED}: bad input (attempt 1)" in output
-    assert "final_data.pkl" in output
+    assert f"neuspring: error: {case / 'final_data.pkl'}" in output
+    assert "not tried again (bad input)" in output
+    assert "MissingOutputException" not in output, "the command fails by its status"
     # The server is away: the runs wait on disk.
     assert {path.read_text().split(":")[0] for path in results.glob("*/*/*/mlflow.txt")} == {"unreachable"}
     so_far = (results / "tables" / "so_far" / "summary.md").read_text()
     assert f"{RELEASED} / baseline / seed 0: missing" in so_far
+    assert f"{RELEASED} / baseline / seed 0: missing" in output
     report = (results / "tables" / "so_far" / "report.html").read_text()
     assert "bad input" in report
 
-    # Mended data: the same command does what is missing, and nothing again.
+    # Mended data: the same command does what is missing, and nothing again; the tables so far do not pass for the table.
     calls = {name: sabotage.count(name) for name in ("memory", "killed")}
     (case / "final_data.pkl").write_bytes(whole)
     process = start(place, changes, sabotage(**faults))
     output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
-    assert finished(results) == {SCENE, OTHER, RELEASED}
+    done_now = dict.fromkeys(("observe", "search", "fit", "rollout", "score", "log_run", "tables", "report", "all"), 1)
+    assert planned_jobs(output) == done_now
+    assert finished(results) == {SCENE, RELEASED}
     assert {name: sabotage.count(name) for name in calls} == calls
     assert not [job.name for job in read_jobs(results) if job.failed]
 
@@ -156,10 +162,12 @@ def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(place, tmp_p
     disk = tmp_path / "disk"
     mount(disk, "40k")
     try:
-        changes = {"methods": ["baseline"], "results": str(disk / "results"), "tracking": {"enabled": False}}
-        calls = {"observe": (["observe"], ""), "search": (["search "], ""), "fit": (["fit "], "")}
         results = disk / "results"
-        process = start(place, changes, sabotage(**calls))
+        changes = {"methods": ["search_only"], "results": str(results), "tracking": {"enabled": False}}
+        calls = {name: ([f"{name} --"], "") for name in ("observe", "search", "rollout")}
+        # What can fill the disk; the tables come after it.
+        target = ("--", f"{results}/{SCENE}/search_only/0/run.json")
+        process = start(place, changes, sabotage(**calls), *target)
         output, _ = process.communicate(timeout=240)
         assert process.returncode == 1, output
         assert "no space left on the disk. Free some space; the same command continues." in output
@@ -168,12 +176,12 @@ def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(place, tmp_p
 
         remount(disk, "size=100m")
         remount(disk, "ro")
-        process = start(place, changes, sabotage(**calls))
+        process = start(place, changes, sabotage(**calls), *target)
         output, _ = process.communicate(timeout=240)
         assert process.returncode == 1
         assert "this folder must be writable; received Read-only file system" in output
         remount(disk, "rw")
-        process = start(place, changes, sabotage(**calls))
+        process = start(place, changes, sabotage(**calls), *target)
         output, _ = process.communicate(timeout=240)
         assert process.returncode == 0, output
         # What was finished before the disk was full was not made again.

@@ -18,7 +18,7 @@ from neuspring.artifacts import Twin
 from neuspring.benchmark import Benchmark, read_scenarios
 from neuspring.errors import InputError
 
-from .project import ROOT, SCENE, arguments, config_with, copy_workflow, jobs, run
+from .project import ROOT, SCENE, arguments, config_with, copy_finished, copy_workflow, jobs, run
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +70,17 @@ def test_methods_share_searches_and_fits(finished):
     assert planned["rollout"] == planned["score"] == 11 * 2
 
 
-def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, place):
-    project, _ = finished
-    changes = {"methods": ["baseline"], "fit": {"epochs": 60}, "tracking": {"enabled": False}}
-    whole = run(project, changes)
+def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, tmp_path):
+    changes = {"methods": ["baseline"], "fit": {"epochs": 30}, "tracking": {"enabled": False}}
+    target = f"results/{SCENE}/baseline/0/fit.json"
+    # Both begin with the search that is there.
+    project, place = (copy_finished(finished[0], tmp_path / name) for name in ("whole", "killed"))
+    whole = run(project, changes, "--", target)
     assert whole.returncode == 0, whole.stdout + whole.stderr
+    assert jobs(whole) == {"fit": 1}
 
     process = subprocess.Popen(
-        arguments(place, changes),
+        arguments(place, changes, "--", target),
         cwd=place,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
@@ -95,7 +98,7 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
     assert not (folder / "fit.json").exists()
 
     run(place, changes, "--unlock")
-    continued = run(place, changes)
+    continued = run(place, changes, "--", target)
     assert continued.returncode == 0, continued.stdout + continued.stderr
     assert "continuing the fit after epoch" in continued.stdout + continued.stderr
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2

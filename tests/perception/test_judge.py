@@ -1,5 +1,6 @@
 """A synthetic capture, its truth, perfect perception of it, and the judge that tells perfect from spoilt."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -141,7 +142,9 @@ def test_the_backend_truth_needs_a_synthetic_capture(tmp_path):
 
 
 def test_another_capture_s_truth_is_refused(perfect, tmp_path):
-    other = create(tmp_path, replace(TINY, frames=5))
-    truth_path(other.folder).write_bytes(truth_path(perfect.capture.folder).read_bytes())
+    capture = Capture.load(shutil.copytree(perfect.capture.folder, tmp_path / "capture"))
+    shutil.copy(truth_path(perfect.capture.folder), truth_path(capture.folder))
+    assert truth_of(capture).certificate == perfect.truth.certificate
+    replace(perfect.truth, certificate=0.5).save(truth_path(capture.folder))
     with pytest.raises(InputError, match="another capture's"):
-        truth_of(other)
+        truth_of(capture)

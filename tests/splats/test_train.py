@@ -21,7 +21,7 @@ from tests.perception.filmed import EYES, intrinsics
 
 SIZE = (96, 64)
 HELD_OUT = (0.1, -0.55, 0.35)
-FAST = Appearance(iterations=600, degree=0, densify_from=10_000)
+FAST = Appearance(iterations=300, degree=0, densify_from=10_000)
 
 
 def view_from(eye, size=SIZE) -> View:
@@ -91,7 +91,7 @@ def test_training_is_deterministic_and_follows_its_seed():
 def test_the_number_of_splats_grows_where_they_are_too_coarse():
     truth = known_splats()
     shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
-    settings = dataclasses.replace(FAST, iterations=300, densify_from=50, densify_every=50, position_rate=1e-3)
+    settings = dataclasses.replace(FAST, iterations=160, densify_from=40, densify_every=40, position_rate=1e-3)
     start = first_splats(truth.means[::10], np.full((20, 3), 0.5), settings, 0.002)
     grown = train(start, shots, settings, 0, "warp")
     fixed = train(start, shots, dataclasses.replace(settings, densify_from=10_000), 0, "warp")
