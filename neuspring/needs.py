@@ -14,7 +14,7 @@ from neuspring import gpus
 from neuspring.benchmark import Benchmark
 from neuspring.config_gpus import Gpus
 from neuspring.config_tune import Tune
-from neuspring.data import conformance
+from neuspring.data.cases import released_cases
 from neuspring.errors import InputError
 from neuspring.job_records import JobRecord
 from neuspring.plan import History, Kind, Planned
@@ -111,7 +111,7 @@ class Needs:
         if row.source == "mocap":
             return config.mocap.frames or 1
         # Synthetic scenes have the names and lengths of the released ones.
-        facts = conformance.released_cases().get(Path(row.path).name)
+        facts = released_cases().get(Path(row.path).name)
         frames = int(facts["frames"]) if facts else 1
         return min(frames, config.synthetic.frames or frames) if row.source == "synthetic" else frames
 

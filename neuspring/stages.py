@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring import config, figures, metrics, provenance
+from neuspring import config, metrics, provenance
 from neuspring.artifacts import Observations, Trajectory, Twin
 from neuspring.config import Config, Kind, ScenarioRow
 from neuspring.errors import InputError, NumericalFailure
@@ -259,6 +259,9 @@ def score(
     observations = Observations.load(observations_path)
     stages = {name: StageRecord.load(path) for name, path in records.items()}
     last, folder = stages["rollout"], output.parent
+    # Only this stage draws, and matplotlib takes half a second of the start of a job.
+    from neuspring import figures
+
     trajectory = Trajectory.load(last.file("trajectory", records["rollout"])) if "trajectory" in last.files else None
     table = pd.DataFrame(columns=list(metrics.COLUMNS))
     if trajectory is not None:

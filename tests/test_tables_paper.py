@@ -12,7 +12,7 @@ import pytest
 from neuspring import paper, tables, tables_cells, tables_paper, tables_render
 from neuspring.cli import main
 from neuspring.config import parse
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.errors import InputError
 from neuspring.metrics import COLUMNS, averages
 from neuspring.studies import Study, read_studies

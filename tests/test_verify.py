@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from neuspring.artifacts import Observations
-from neuspring.data.conformance import PUBLISHED, read_case, released_cases
+from neuspring.data.cases import released_cases
+from neuspring.data.conformance import PUBLISHED, read_case
 from neuspring.data.departure import Case
 from neuspring.data.released import (
     Released,

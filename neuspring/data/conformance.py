@@ -5,9 +5,6 @@ They compare a case with its released results where these are present; a check t
 
 from __future__ import annotations
 
-import csv
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ from neuspring.artifacts import Observations
 from neuspring.config import ScenarioRow
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera
+from neuspring.data.cases import released_cases
 from neuspring.data.departure import Case, Departure, broken, note, unusual
 from neuspring.data.released import (
     best_checkpoint,
@@ -55,13 +53,6 @@ def read_case(case: Case) -> Observations | None:
         if not any(str(error).startswith(f"{d.file}: {d.message}") for d in case.found):  # a reason that no file check gave
             case.found.append(Departure(case.folder, "error", str(error)))
         return None
-
-
-@cache
-def released_cases() -> dict[str, dict[str, str]]:
-    """The table of the 22 released cases: case -> column -> text, empty where unknown."""
-    text = resources.files("neuspring.data").joinpath("phystwin22.csv").read_text(encoding="utf-8")
-    return {row["case"]: row for row in csv.DictReader(text.splitlines())}
 
 
 def check_table(case: Case, observations: Observations) -> None:

@@ -21,7 +21,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from neuspring.data import phystwin
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.data.departure import Departure, broken
 from neuspring.data.fetch_archive import CASES, Plan, archives, make_plan
 from neuspring.data.fetch_hub import Hub

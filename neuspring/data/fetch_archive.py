@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neuspring.data import phystwin
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.data.fetch_hub import Hub, HubFile, RemoteFile
 from neuspring.errors import InputError
 from neuspring.progress import Progress

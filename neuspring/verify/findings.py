@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.errors import InputError
 from neuspring.metrics import TASKS, UNITS, averages
 

@@ -10,7 +10,7 @@ from neuspring import metrics
 from neuspring.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
 from neuspring.config import Fit
 from neuspring.data import phystwin
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.data.released import Checkpoint, Released, read_checkpoint, read_parameters, read_prediction
 from neuspring.errors import InputError
 from neuspring.progress import Progress

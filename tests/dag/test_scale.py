@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from neuspring import gpus
-from neuspring.data.conformance import released_cases
+from neuspring.data.cases import released_cases
 from neuspring.job_records import read_jobs
 from tests.perception.filmed import film, write_raw
 

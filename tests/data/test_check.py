@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from neuspring.data.cases import released_cases
 from neuspring.data.check import Departure, check, render
-from neuspring.data.conformance import released_cases
 from neuspring.errors import InputError
 from tests.data.phystwin_case import dump, edit, stored, write_case, write_json, write_raw_frame, write_results
 

@@ -1,0 +1,14 @@
+"""The table of the 22 released PhysTwin cases, which says what is known of them before any data are read."""
+
+from __future__ import annotations
+
+import csv
+from functools import cache
+from importlib import resources
+
+
+@cache
+def released_cases() -> dict[str, dict[str, str]]:
+    """The table of the 22 released cases: case -> column -> text, empty where unknown."""
+    text = resources.files("neuspring.data").joinpath("phystwin22.csv").read_text(encoding="utf-8")
+    return {row["case"]: row for row in csv.DictReader(text.splitlines())}
