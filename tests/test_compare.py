@@ -157,7 +157,7 @@ def test_commits_are_compared_from_the_index_alone(tmp_path: Path) -> None:
 
 
 def test_a_store_that_does_not_answer_is_named(tmp_path: Path) -> None:
-    away = Tracking(uri="postgresql://user:secret@127.0.0.1:9/mlflow")
+    away = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
     with pytest.raises(InputError, match="MLflow must answer") as caught:
         compare.compare(tmp_path, away, OLD, NEW)
     assert "secret" not in str(caught.value)

@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -286,17 +287,16 @@ def test_another_user_s_file_is_opened_as_the_kernel_allows_it_in_a_shared_folde
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="acts as two users")
-def test_two_users_share_devices(tmp_path, monkeypatch):
-    for parent in (tmp_path, *tmp_path.parents[:2]):
-        parent.chmod(0o755)
-    (tmp_path / "all").mkdir()
-    (tmp_path / "all").chmod(0o777)
-    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "all" / "locks"))
-    for user, expected in ((1001, ("0",)), (1002, ("1",)), (1001, ("1",))):
-        process = FORK.Process(target=lose_as, args=(user, expected))
-        process.start()
-        process.join(20)
-        assert process.exitcode == 0, (user, expected)
+def test_two_users_share_devices(monkeypatch):
+    # pytest's own folders are closed to other users.
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o777)
+        monkeypatch.setenv(gpus.LOCKS, str(Path(folder) / "locks"))
+        for user, expected in ((1001, ("0",)), (1002, ("1",)), (1001, ("1",))):
+            process = FORK.Process(target=lose_as, args=(user, expected))
+            process.start()
+            process.join(20)
+            assert process.exitcode == 0, (user, expected)
 
 
 def lose_as(user, expected):
