@@ -123,7 +123,9 @@ class Benchmark:
     whole: Config
     """As it was given: what tables are laid out for, and whose seeds are averaged, whatever part of it is run now."""
     scenarios: dict[str, ScenarioRow]
-    """Chosen ones, and those that twins are transferred to."""
+    """Chosen ones, those that twins are transferred to, those of the tuning study."""
+    whole_scenarios: dict[str, ScenarioRow]
+    """Those of the whole configuration."""
     methods: dict[str, Method]
     searches: dict[str, SearchRow]
     fits: dict[str, Method]
@@ -158,11 +160,13 @@ class Benchmark:
         transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
         _require_alike(config, scenarios, transfers)
+        tuned = _tuned(whole, targets)
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
             whole,
-            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets)},
+            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + tuned)},
+            {n: scenarios[n] for n in whole.scenarios},
             {n: methods[n] for n in config.methods},
             {n: searches[n] for n in wanted},
             {n: methods[n] for n in owners.values()},
@@ -181,9 +185,12 @@ class Benchmark:
                 rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
                 raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
         chosen._require_data()
-        if config.tune:
-            _require_known("tune.scenarios", config.tune.scenarios, chosen.scenarios, "this configuration's scenarios")
         return chosen
+
+    @property
+    def tuned(self) -> tuple[str, ...]:
+        """The scenarios of the tuning study: a study keeps them, whatever part of the runs is made now."""
+        return self.whole.tune.scenarios or self.whole.scenarios if self.whole.tune else ()
 
     @property
     def compared_with(self) -> str:
@@ -238,6 +245,15 @@ class Benchmark:
                 )
             if not path.exists():
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+
+
+def _tuned(whole: Config, targets: tuple[str, ...]) -> tuple[str, ...]:
+    """The scenarios of the tuning study, if there is one. Raises InputError for those that the configuration does not have."""
+    if whole.tune is None:
+        return ()
+    known = dict.fromkeys(whole.scenarios + targets)
+    _require_known("tune.scenarios", whole.tune.scenarios, known, "this configuration's scenarios")
+    return whole.tune.scenarios or whole.scenarios
 
 
 def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:

@@ -170,7 +170,9 @@ def _tables(a: argparse.Namespace) -> int:
     transfers = tables.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
     print(tables.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
-    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, a.seeds[0], collected.scores, a.output)}")
+    finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
+    seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
+    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected.scores, a.output)}")
     return 0
 
 

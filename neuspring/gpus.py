@@ -179,14 +179,33 @@ def handle_of(library: Any, device: str) -> Any:
     return library.nvmlDeviceGetHandleByIndex(int(device)) if device.isdigit() else library.nvmlDeviceGetHandleByUUID(device)
 
 
-def _slot_names(pool: Sequence[str]) -> dict[str, str]:
-    """Device -> one name for it, whether it was given by index or by UUID."""
-    names = {device: device for device in pool}
+def _slot_names(pool: Sequence[str], folder: Path) -> dict[str, str]:
+    """Device -> one name for it, whether it was given by index or by UUID.
+
+    Of a device that is lost NVML tells no name. It keeps the one it had in this start of the machine, so that what is said against
+    it still holds, and nobody takes it for another one; a MIG name, or an index that is not there, is taken as it was given.
+    """
+    told: dict[str, str] = {}
     with nvml() as library:
         for device in pool if library else ():
-            with contextlib.suppress(Exception):  # a MIG name, or an index that is not there: take it as it was given
-                names[device] = str(library.nvmlDeviceGetUUID(handle_of(library, device)))
-    return {device: re.sub(r"[^A-Za-z0-9-]", "_", name) for device, name in names.items()}
+            with contextlib.suppress(Exception):
+                told[device] = str(library.nvmlDeviceGetUUID(handle_of(library, device)))
+    with _gate(folder), _open(folder / "names.json") as file:
+        known = _names_of_this_boot(file.read())
+        if told.items() - known.items():
+            known |= told
+            file.seek(0)
+            file.truncate()
+            file.write(json.dumps({"boot": _boot(), "names": known}))
+    return {device: re.sub(r"[^A-Za-z0-9-]", "_", known.get(device, device)) for device in pool}
+
+
+def _names_of_this_boot(text: str) -> dict[str, str]:
+    try:
+        facts = json.loads(text)
+        return dict(facts["names"]) if facts["boot"] == _boot() else {}
+    except (ValueError, KeyError, TypeError):
+        return {}
 
 
 def acquire(
@@ -210,7 +229,10 @@ def acquire(
         rule = f"a job needs {count} GPUs, more than there are"
         raise InputError("GPUs", rule, f"{len(pool)} ({', '.join(pool) or 'none'})", "Ask for fewer, or allow more.")
     folder = folder or lock_folder()
-    names = _slot_names(pool)
+    try:
+        names = _slot_names(pool, folder)
+    except OSError as error:
+        raise _unusable(folder, error) from error
     start, told = time.monotonic(), dict[str, Mark]()
     while True:
         try:

@@ -24,6 +24,10 @@ TRAIN = 0.7
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
+ON_GPU = frozenset({"search", "fit", "rollout", "transfer", "appearance", "render", "tune"})
+"""Rules that take a GPU where there is one."""
+EITHER = frozenset({"segment", "track"})
+"""Rules whose backend decides."""
 
 
 def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[str, ...]:
@@ -138,29 +142,37 @@ class Needs:
         """MB to ask for: half as much again as earlier jobs of the rule needed with the same scenario, else as those with others
         or `default`, whichever is more. Later attempts ask for at least `default`, times the attempt."""
 
-        def needed(wildcards: Any, attempt: int) -> int:
+        def known(scenario: str) -> float:
             peaks = self.history.memory
-            return _asked(rule, wildcards, attempt, default, lambda key: HEADROOM_MEMORY * peaks.get(key, 0.0), LEAST_MEMORY)
+            return HEADROOM_MEMORY * max(peaks.get((rule, kind, scenario), 0.0) for kind in self._kinds(rule))
+
+        def needed(wildcards: Any, attempt: int) -> int:
+            return _asked(wildcards, attempt, default, known, LEAST_MEMORY)
 
         return needed
 
     def minutes(self, rule: str, default: int, work: Callable[[Any], int]) -> Callable[..., int]:
         """Minutes to ask for: three times what earlier jobs took for as much work; otherwise as for memory."""
 
-        def expected(key: tuple[str, str], wildcards: Any) -> float:
-            rates, (name, scenario) = self.history.rates, key
-            rate = rates.get((name, self._kind, scenario)) or rates.get((name, "cpu", scenario))
+        def expected(scenario: str, wildcards: Any) -> float:
+            rate = max(self.history.rates.get((rule, kind, scenario), 0.0) for kind in self._kinds(rule))
             return HEADROOM_TIME * rate * work(wildcards) / 60 if rate else 0.0
 
         def needed(wildcards: Any, attempt: int) -> int:
-            return _asked(rule, wildcards, attempt, default, lambda key: expected(key, wildcards), LEAST_MINUTES)
+            return _asked(wildcards, attempt, default, lambda scenario: expected(scenario, wildcards), LEAST_MINUTES)
 
         return needed
 
+    def _kinds(self, rule: str) -> tuple[Kind, ...]:
+        """The jobs that tell something of a rule's next ones: a GPU takes other memory and time than the CPU."""
+        if self._kind == "gpu" and rule in ON_GPU:
+            return ("gpu",)
+        return ("cpu", "gpu") if rule in EITHER else ("cpu",)
 
-def _asked(rule: str, wildcards: Any, attempt: int, default: int, known: Callable[[tuple[str, str]], float], least: int) -> int:
-    """What an attempt asks for, `known` being what earlier jobs of (rule, scenario or "" for all) tell; 0: nothing."""
-    own, others = known((rule, getattr(wildcards, "scenario", ""))), known((rule, ""))
+
+def _asked(wildcards: Any, attempt: int, default: int, known: Callable[[str], float], least: int) -> int:
+    """What an attempt asks for, `known` being what earlier jobs of a scenario, or of all (""), tell; 0: nothing."""
+    own, others = known(getattr(wildcards, "scenario", "")), known("")
     asked = max(math.ceil(own), least) if own else max(math.ceil(others), default)
     # What failed with as little as earlier jobs needed may have failed for want of it.
     return asked if attempt == 1 else attempt * max(asked, default)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from neuspring.job_records import JobRecord, read_jobs
+from neuspring.job_records import Attempt, JobRecord, read_jobs
 
 SHIPPED = Path(__file__).parent / "data" / "timings.csv"
 Kind = Literal["cpu", "gpu"]
@@ -45,8 +45,8 @@ class History:
 
     rates: Mapping[tuple[str, Kind, str], float] = field(default_factory=dict)
     """(rule, kind, scenario or "" for all) -> median seconds per unit of work."""
-    memory: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    """(rule, scenario or "" for all) -> largest resident memory, MiB."""
+    memory: Mapping[tuple[str, Kind, str], float] = field(default_factory=dict)
+    """(rule, kind, scenario or "" for all) -> largest resident memory, MiB."""
 
     @classmethod
     def of(cls, results: Path) -> History:
@@ -57,19 +57,24 @@ class History:
     def of_records(cls, records: Iterable[JobRecord]) -> History:
         """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
         seconds: dict[tuple[str, Kind, str], list[float]] = defaultdict(list)
-        memory: dict[tuple[str, str], float] = defaultdict(float)
+        memory: dict[tuple[str, Kind, str], float] = defaultdict(float)
         for record in records:
-            peak = max((attempt.peak_memory_mb for attempt in record.attempts), default=0.0)
-            for scenario in {"", record.scenario}:
-                memory[record.rule, scenario] = max(memory[record.rule, scenario], peak)
+            for attempt in record.attempts:
+                for scenario in {"", record.scenario}:
+                    key = (record.rule, _kind(attempt), scenario)
+                    memory[key] = max(memory[key], attempt.peak_memory_mb)
             ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
             if len(ends) == 1:
                 continue
-            kind: Kind = "gpu" if record.attempts[ends[-1]].devices else "cpu"
+            kind = _kind(record.attempts[ends[-1]])
             took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
             for scenario in {"", record.scenario}:
                 seconds[record.rule, kind, scenario].append(took / record.work)
         return cls(rates={key: statistics.median(times) for key, times in seconds.items()}, memory=dict(memory))
+
+
+def _kind(attempt: Attempt) -> Kind:
+    return "gpu" if attempt.devices else "cpu"
 
 
 def shipped_rates(path: Path = SHIPPED) -> dict[tuple[str, str], Rate]:

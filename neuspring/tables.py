@@ -5,6 +5,7 @@ Only files are read (run.json and scores.parquet beside it), never MLflow.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -44,6 +45,8 @@ SHOWN = {"chamfer": (MM, 2), "track_error": (MM, 2), "psnr": (1.0, 2), "ssim": (
 """Metric -> factor and digits in tables."""
 NOT_COMPUTED = "not computed"
 RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
+LISTED = 12
+"""As many missing runs are listed one by one."""
 DAMAGED = "damaged record: "
 """How the reason of a run begins whose files cannot be read."""
 
@@ -76,7 +79,10 @@ def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], see
 
 
 def read_scores(path: Path) -> Collected:
-    """The runs of a scores.csv that `write` wrote, without their records: all count as finished. Raises InputError."""
+    """The runs of a scores.csv that `write` wrote, as the runs.csv beside it says how they ended. Raises InputError.
+
+    Without that file a run counts as finished if it has an error for every task that any run has: one that diverged has fewer.
+    """
     try:
         scores = pd.read_csv(path)
         scores = scores[list(COLUMNS)].astype({"value": float, "seed": int})
@@ -84,8 +90,17 @@ def read_scores(path: Path) -> Collected:
         rule = f"must be a scores.csv with the columns {', '.join(COLUMNS)}"
         raise InputError(path, rule, " ".join(str(error).split()), "Take the file from a folder of tables.") from error
     runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
-    nothing = {"reason": "", "notes": "", "images": "null", "run_key": ""}
-    return Collected(scores, runs.assign(status="ok", source=path.name, averaged=1, **nothing))
+    beside = path.with_name("runs.csv")
+    if beside.is_file():
+        table = pd.read_csv(beside).reindex(columns=[*RUN_COLUMNS, "averaged"])
+        return Collected(scores, table.fillna(dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"averaged": 1}))
+    errors = scores[scores["metric"] == "chamfer"]
+    tasks = runs.merge(errors.groupby(["scenario", "method", "seed"])["task"].nunique().reset_index(), how="left")["task"]
+    finished = tasks == errors["task"].nunique()
+    runs["status"] = np.where(finished, "ok", "failed")
+    runs["reason"] = np.where(finished, "", "its scores are not complete")
+    nothing = {"notes": "", "images": "null", "run_key": ""}
+    return Collected(scores, runs.assign(source=path.name, averaged=1, **nothing))
 
 
 def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:
@@ -95,7 +110,28 @@ def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     facts |= {f"seconds_{name}": value for name, value in record["timings"].items()}
     facts |= {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
     facts |= {"averaged": record.get("params", {}).get("rollout.result.averaged", 1), "images": json.dumps(record.get("images"))}
+    facts["settings"] = json.dumps({name: _digest(values) for name, values in record.get("settings", {}).items()})
     return facts, pd.read_parquet(path.parent / record["scores_file"])[list(COLUMNS)]
+
+
+def _digest(settings: Any) -> str:
+    """Of a stage's settings, whatever its seed."""
+    if isinstance(settings, dict):
+        settings = {name: value for name, value in settings.items() if name != "seed"}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def mixed_settings(runs: pd.DataFrame) -> str:
+    """A warning if finished runs of a method were made with different settings, as when `only` renewed a part; else nothing."""
+    if "settings" not in runs:
+        return ""
+    mixed: dict[str, list[str]] = {}
+    for method, part in runs[runs["status"] == "ok"].groupby("method", sort=False):
+        stages = pd.DataFrame([json.loads(text) for text in part["settings"].dropna() if text])
+        for stage in (name for name in stages if stages[name].nunique() > 1):
+            mixed.setdefault(str(stage), []).append(str(method))
+    where = "; ".join(f"{stage} of {', '.join(methods)}" for stage, methods in mixed.items())
+    return f"Runs were made with different settings ({where}): make the older ones again before they are compared." if mixed else ""
 
 
 def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
@@ -104,7 +140,11 @@ def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[s
     for identity, path in _records(results, sources, methods, seeds, "transfer.json"):
         if not path.is_file():
             continue
-        record = StageRecord.load(path)
+        try:
+            record = StageRecord.load(path)
+        except InputError as error:
+            rows.append(identity | {"status": "failed", "reason": f"{DAMAGED}{error}", "notes": ""})
+            continue
         diverged = record.facts.get("diverged", [])
         reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
         status = "ok" if record.status == "ok" and not diverged else "failed"
@@ -203,10 +243,13 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
     scenarios, seeds = collected.runs["scenario"].nunique(), collected.runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
-    spread = ", ± standard deviation over seeds" if seeds > 1 else ""
+    several = len(scores) > 0 and scores["seed"].nunique() > 1
+    spread = ", ± standard deviation over seeds" if several else ""
     lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
-    lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, seeds)
+    if warning := mixed_settings(collected.runs):
+        lines += [f"**{warning}**", ""]
+    lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, several)
     if differences is None:
         differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
@@ -221,14 +264,24 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     lines += image_lines(collected, scores, differences, baseline)
     bad = collected.runs[collected.runs["status"] != "ok"]
     if len(bad):
-        lines += ["", "Not in the averages:", ""]
-        lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in bad.itertuples()]
+        lines += ["", "Not in the averages:", "", *_not_counted(bad)]
     lines += _averaged_notes(collected.runs)
     noted = collected.runs[collected.runs["notes"] != ""]
     if len(noted):
         lines += ["", "Notes:", ""]
         lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
     return "\n".join(lines) + "\n"
+
+
+def _not_counted(bad: pd.DataFrame) -> list[str]:
+    """Failures one by one; runs that are missing too, unless they are many, as when `only` makes a part of them."""
+    missing = bad[bad["status"] == "missing"]
+    listed = bad if len(missing) <= LISTED else bad[bad["status"] != "missing"]
+    lines = [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in listed.itertuples()]
+    if len(missing) > LISTED:
+        counts = ", ".join(f"{method} {count}" for method, count in missing["method"].value_counts(sort=False).items())
+        lines.append(f"- {len(missing)} runs have not finished, or were not asked for ({counts}); runs.csv names them.")
+    return lines
 
 
 def _averaged_notes(runs: pd.DataFrame) -> list[str]:
@@ -245,7 +298,12 @@ def _averaged_notes(runs: pd.DataFrame) -> list[str]:
 
 
 def _method_table(
-    methods: list[str], means: pd.DataFrame, counts: pd.DataFrame, seeds: int, headings: Headings = HEADINGS, absent: str = "–"
+    methods: list[str],
+    means: pd.DataFrame,
+    counts: pd.DataFrame,
+    several: bool,
+    headings: Headings = HEADINGS,
+    absent: str = "–",
 ) -> list[str]:
     rows = []
     for method in methods:
@@ -259,7 +317,7 @@ def _method_table(
                 continue
             row, (factor, digits) = found.iloc[0], SHOWN[metric]
             spread = f" ± {factor * row['seed_std']:.{digits}f}" if np.isfinite(row["seed_std"]) else " ± –"
-            spread = spread if seeds > 1 else ""
+            spread = spread if several else ""
             cells.append(f"{factor * row['equal']:.{digits}f}{spread} ({factor * row['frames']:.{digits}f})")
         status = {str(name): int(value) for name, value in counts.loc[method].to_dict().items()}
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
@@ -321,7 +379,7 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
     lines += [f"{_image_conditions(drawn['images'])} Mean over scenarios; in brackets the frame-weighted mean.", ""]
     methods = list(dict.fromkeys(collected.runs["method"]))
     counts = runs.groupby(["method", "status"]).size().unstack(fill_value=0).reindex(methods, fill_value=0)
-    lines += _method_table(methods, averages(pictured), counts, runs["seed"].nunique(), IMAGE_HEADINGS, NOT_COMPUTED)
+    lines += _method_table(methods, averages(pictured), counts, pictured["seed"].nunique() > 1, IMAGE_HEADINGS, NOT_COMPUTED)
     lines += ["", f"Part of the surface that no camera sees in frame 0: {_unseen(drawn)}."]
     computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
     where = "in some runs " if "lpips" in computed else ""
@@ -412,13 +470,13 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     """The section on transferred twins; nothing if there are none."""
     if not len(collected.runs):
         return ""
-    methods, seeds = list(dict.fromkeys(collected.runs["method"])), collected.runs["seed"].nunique()
+    methods = list(dict.fromkeys(collected.runs["method"]))
     scores = comparable(collected)
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
     what = "Each twin on other recordings of the same object, all frames after the first: mean over targets, then over sources"
     lines = ["", "## Transfer", "", f"{what} (in brackets weighted by frames). A run is one source and seed.", ""]
     means = averages(scores) if len(scores) else pd.DataFrame()
-    lines += _method_table(methods, means, counts, seeds, TRANSFER_HEADINGS)
+    lines += _method_table(methods, means, counts, len(scores) > 0 and scores["seed"].nunique() > 1, TRANSFER_HEADINGS)
     differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"

@@ -109,7 +109,8 @@ def write_collected(name: str, study: Study, collected: Collected, folder: Path)
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
     write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
-    parts = [f"# {study.title}\n", *map(as_markdown, grids)]
+    warning = tables.mixed_settings(own.runs)
+    parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
     parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
     parts.append(_left_out(runs, study, name))
     if len(categories):

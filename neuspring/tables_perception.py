@@ -31,10 +31,13 @@ COLUMNS = {
 
 
 def collect(results: Path, scenarios: Iterable[tuple[str, str]]) -> pd.DataFrame:
-    """One row per judged scenario; `scenarios` are (name, category)."""
+    """One row per scenario that has been judged; `scenarios` are (name, category)."""
     rows = []
     for name, category in scenarios:
-        record = StageRecord.load(results / name / "perception" / "judged.json")
+        path = results / name / "perception" / "judged.json"
+        if not path.is_file():
+            continue
+        record = StageRecord.load(path)
         rows.append({"scenario": name, "category": category, **record.facts, "seconds": record.seconds})
     return pd.DataFrame(rows)
 

@@ -84,7 +84,9 @@ def sync(
     that it was not logged. `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged"
     (details on stderr) and "closed" (leftovers).
     """
-    results = Path(results)
+    results, under = Path(results).resolve(), Path(under or results).resolve()
+    if not under.is_relative_to(results):
+        raise InputError("--under", f"must lie in the results folder {results}", under)
     outcomes: dict[str, list[str]] = {}
 
     def note(name: str, outcome: str) -> None:
@@ -92,7 +94,7 @@ def sync(
         progress(f"{name}: {outcome}")
 
     down = _close_leftovers(results, settings, note) if settings.enabled else None
-    for path in _records(Path(under or results)):
+    for path in _records(under):
         name = path.parent.relative_to(results).as_posix()
         if down:
             note(name, down)

@@ -1,5 +1,6 @@
 """Leases: no two jobs on one slot, no slot lost to a crash, none idle while somebody waits."""
 
+import contextlib
 import fcntl
 import multiprocessing
 import os
@@ -260,7 +261,7 @@ def test_a_folder_that_is_made_for_sharing_is_open_to_all_users_at_once(tmp_path
     lease = gpus.acquire(1, ("0",))
     lease.lost(gone=True)
     assert {path.name: mode(path) for path in (tmp_path / "locks").iterdir()} == dict.fromkeys(
-        ("allocation.lock", "0.0.lock", "0.lost"), 0o666
+        ("allocation.lock", "names.json", "0.0.lock", "0.lost"), 0o666
     )
     assert os.umask(0o077) == 0o077, "the user's own files stay private"
 
@@ -307,3 +308,38 @@ def lose_as(user, expected):
     assert lease.devices == expected
     if expected == ("0",):
         lease.lost(gone=True)
+
+
+class Driver:
+    """NVML of a machine with two GPUs, of which those in `gone` have fallen off the bus."""
+
+    gone: tuple[str, ...] = ()
+
+    def nvmlDeviceGetHandleByIndex(self, index):
+        if str(index) in self.gone:
+            raise RuntimeError("GPU is lost")
+        return index
+
+    def nvmlDeviceGetUUID(self, handle):
+        return f"GPU-{handle}"
+
+
+def test_a_lost_device_keeps_its_name_where_the_driver_no_longer_tells_it(tmp_path, monkeypatch):
+    driver = Driver()
+    monkeypatch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(driver))
+    lease = gpus.acquire(1, ("0", "1"), folder=tmp_path)
+    driver.gone = lease.devices
+    lease.lost(gone=True)
+    lease.release()
+    passed = {}
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path, passing=passed.update).devices == ("1",)
+    assert list(passed) == ["0"]
+    # Where NVML does not start at all, a slot that is held under one name is not free under another.
+    monkeypatch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(None))
+    (other := tmp_path / "other").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(Driver()))
+        second = gpus.acquire(1, ("0",), folder=other)
+    with pytest.raises(TimeoutError):
+        gpus.acquire(1, ("0",), folder=other, timeout=0.1)
+    second.release()

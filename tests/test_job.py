@@ -331,11 +331,17 @@ def test_a_job_with_a_gpu_that_computes_on_the_cpu_says_so(monkeypatch, capsys, 
     from neuspring.physics import solver
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setenv(gpus.VISIBLE, held)
     solver._warn_of_idle_gpu.cache_clear()
     assert [solver.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == told
-    assert all("holds GPU 1, but torch finds no CUDA" in line and "device: cuda this is an error" in line for line in lines)
-    with pytest.raises(InputError, match="this machine has 0 CUDA devices"):
+    assert all("holds GPU 1, but this torch is a build for the CPU alone" in line for line in lines)
+    with pytest.raises(InputError, match="this torch is a build for the CPU alone"):
         solver.resolve_device("cuda")
+    # A torch that could use the GPU and does not find it: it is lost, and no reason to compute for hours without it.
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    for wanted in {"cuda", device if held else "cuda"} - {"cpu"}:
+        with pytest.raises(InputError, match="this machine has 0 CUDA devices"):
+            solver.resolve_device(wanted)

@@ -36,7 +36,7 @@ def test_times_scale_with_work_and_come_from_the_same_scenario_first():
 def test_attempts_that_failed_say_nothing_of_time_but_of_memory():
     history = plan.History.of_records([record("fit", "rope", 3, outcome="transient", memory=900.0)])
     assert plan.rate(job("fit"), history, {}) is None
-    assert history.memory == {("fit", ""): 900.0, ("fit", "rope"): 900.0}
+    assert history.memory == {("fit", "cpu", ""): 900.0, ("fit", "cpu", "rope"): 900.0}
 
 
 def test_what_is_not_recorded_comes_from_the_shipped_times_and_says_so():
@@ -104,6 +104,9 @@ def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_at
     record("fit", "sloth", 125, 1000, memory=20000.0).save(tmp_path)
     memory = needs.Needs(benchmark, "cpu").memory("fit", 8000)
     assert [memory(cloth, 1), memory(rope, 1)] == [30000, 3000]
+    # A job on the CPU says nothing of one on a GPU.
+    on_gpu = needs.Needs(benchmark, "gpu")
+    assert [on_gpu.memory("fit", 8000)(rope, 1), on_gpu.minutes("fit", 480, lambda _: 4800)(rope, 1)] == [8000, 480]
 
 
 @pytest.mark.parametrize(

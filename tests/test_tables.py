@@ -170,3 +170,29 @@ def test_missing_runs_are_listed(tmp_path):
     text = tables.write(found, "x", tmp_path / "tables")
     assert text.count("missing: no run.json") == 4
     assert (tmp_path / "tables" / "summary.md").is_file()
+
+
+def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
+    found = tables.collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
+    found.runs.loc[0, ["status", "reason"]] = ["failed", "diverged"]
+    text = tables.summary_text(found, "x")
+    assert "- s0 / x / seed 0: failed: diverged" in text
+    assert "- 17 runs have not finished, or were not asked for (" in text
+    assert "x 8" in text and "y 9" in text and "runs.csv names them" in text
+
+
+def test_no_spread_is_shown_where_one_seed_of_several_has_finished():
+    found = collected({("a", "x", 0): 0.010})
+    rest = pd.DataFrame([{"scenario": "a", "method": "x", "seed": 1, "status": "missing", "reason": "", "notes": ""}])
+    text = tables.summary_text(Collected(found.scores, pd.concat([found.runs, rest])), "x")
+    assert "10.00 (10.00)" in text
+    assert "standard deviation" not in text
+
+
+def test_runs_of_different_settings_are_pointed_out():
+    found = collected({("a", "x", 0): 0.010, ("a", "x", 1): 0.011, ("a", "y", 0): 0.010, ("a", "y", 1): 0.011})
+    digests = [{"search": "s", "fit": "f"}, {"search": "s", "fit": "g"}, {"search": "s"}, {"search": "s"}]
+    found.runs["settings"] = [json.dumps(row) for row in digests]
+    assert "Runs were made with different settings (fit of x): make the older ones again" in tables.summary_text(found, "x")
+    found.runs["settings"] = json.dumps(digests[0])
+    assert "different settings" not in tables.summary_text(found, "x")

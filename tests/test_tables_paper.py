@@ -364,6 +364,16 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     for name in ("table2.csv", "table2_scenarios.csv", "table2.md"):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
     assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
+    # Of a run that diverged the errors of one task remain, with or without the file that says so.
+    write_run(tmp_path, "cable_6", "neuspring", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged")
+    tables.write(tables.collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
+    other = scores[scores["task"] == "future"].assign(task="reconstruction")
+    pd.concat([scores, other]).to_csv(tmp_path / "tables" / "scores.csv", index=False)
+    for _ in range(2):
+        runs = tables.read_scores(tmp_path / "tables" / "scores.csv").runs.set_index(["scenario", "method"])["status"]
+        assert (runs["cable_6", "neuspring"], runs["cable_6", "baseline"]) == ("failed", "ok")
+        (tmp_path / "tables" / "runs.csv").unlink(missing_ok=True)
     assert main(command) == 2
     assert "--scores, or --scenarios, --methods and --seeds" in capsys.readouterr().err
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")

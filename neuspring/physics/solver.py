@@ -64,10 +64,15 @@ def resolve_device(device: str) -> str:
     if not DEVICES.fullmatch(device):
         raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if device == "auto" and count == 0:
-        _warn_of_idle_gpu(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
-    if device == "cpu" or (device == "auto" and count == 0):
+    held = os.environ.get("CUDA_VISIBLE_DEVICES", "").strip()
+    # A job that holds a GPU which CUDA does not find has lost it; but a torch without CUDA never finds one.
+    gone = bool(torch.version.cuda) and held not in ("", "-1")
+    if device == "auto" and count == 0 and not gone:
+        _warn_of_idle_gpu(held)
+    if device == "cpu" or (device == "auto" and count == 0 and not gone):
         return "cpu"
+    if not torch.version.cuda:
+        raise InputError("device", "this torch is a build for the CPU alone", device, "Install its CUDA build, or use device: cpu.")
     index = int(device.partition(":")[2] or 0)
     if index >= count:
         raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
@@ -79,8 +84,8 @@ def _warn_of_idle_gpu(held: str) -> None:
     """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
     if held.strip() not in ("", "-1"):
         print(
-            f"warning: this job holds GPU {held}, but torch finds no CUDA (a CPU build, or a driver that does not match?): "
-            "it computes on the CPU. With device: cuda this is an error.",
+            f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
+            "With device: cuda this is an error.",
             file=sys.stderr,
             flush=True,
         )

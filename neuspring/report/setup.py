@@ -18,6 +18,7 @@ from neuspring.report.prose import files
 from neuspring.report.sources import Material, Run
 from neuspring.report.words import listed, several
 from neuspring.report.work import machines
+from neuspring.tables import mixed_settings
 
 PACKAGES = (
     *("torch", "warp-lang", "newton", "numpy", "scipy", "scikit-learn", "opencv-python-headless", "cma"),
@@ -33,6 +34,8 @@ SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")
 def section(material: Material) -> Section:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
+    if warning := mixed_settings(material.collected.runs):
+        blocks.append(Text(text=warning, tone="warn"))
     blocks += _settings(material)
     variants = _variants(material.runs)
     if variants is not None:

@@ -15,13 +15,17 @@ from neuspring import config as settings
 from neuspring import gpus, job, needs, plan, tune_space
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
-from neuspring.job_records import begin_run, failure_lines, read_jobs
+from neuspring.job_records import begin_run, failure_lines, read_jobs, this_run
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 
 ROOT = Path(workflow.basedir)
-# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs, not cores. Inside one of its jobs nothing is counted.
-CLUSTER = workflow.resource_settings.nodes is not None or workflow.remote_exec
+# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs (--jobs), not cores, but for a dry run, where it makes cores 1.
+# Inside one of its jobs nothing is counted. Which executor was asked for is not known yet.
+CLUSTER = workflow.remote_exec or (
+    workflow.resource_settings.nodes is not None
+    and (workflow.resource_settings.cores is None or workflow.output_settings.dryrun)
+)
 
 
 def checked_benchmark():

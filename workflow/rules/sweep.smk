@@ -4,8 +4,7 @@ if CONFIG.tune:
     rule tune:
         input:
             observations=[
-                f"{RESULTS}/{name}/observations.npz"
-                for name in CONFIG.tune.scenarios or CONFIG.scenarios
+                f"{RESULTS}/{name}/observations.npz" for name in BENCHMARK.tuned
             ],
         output:
             f"{TUNE_FOLDER}/worker-{{worker}}.json",
@@ -21,7 +20,6 @@ if CONFIG.tune:
             ENVIRONMENT
         threads: 1
         resources:
-            device=DEVICE,
             gpu=GPU,
             mem_mb=memory("tune", 8000),
             runtime=2880,

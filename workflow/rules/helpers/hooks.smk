@@ -33,8 +33,12 @@ if workflow.is_main_process:
 def tell_failures():
     """What failed and why; the report says the same."""
     damaged = []
-    lines = failure_lines(read_jobs(Path(RESULTS), damaged), Path(RESULTS)) + damaged
+    jobs = read_jobs(Path(RESULTS), damaged)
+    now = [record for record in jobs if record.last.run == this_run(Path(RESULTS))]
+    lines = failure_lines(now, Path(RESULTS)) + damaged
     print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
+    if earlier := len(failure_lines(jobs, Path(RESULTS))) + len(damaged) - len(lines):
+        print(f"{earlier} jobs that failed in earlier runs have not been run again.")
     print(
         f"Report so far: {TABLE_FOLDER}/so_far/report.html. The same command continues where this one stopped.",
         flush=True,

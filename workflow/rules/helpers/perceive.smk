@@ -58,9 +58,9 @@ def camera_files(wildcards, name):
     ]
 
 
-def judged_scenarios():
-    """Scenarios of this run whose truth is known, and their categories."""
-    rows = {name: BENCHMARK.scenarios[name] for name in CONFIG.scenarios}
+def judged_scenarios(names=CONFIG.scenarios):
+    """Scenarios whose truth is known, and their categories."""
+    rows = {name: BENCHMARK.whole_scenarios[name] for name in names}
     return {
         name: row.category for name, row in rows.items() if row.source == "synthetic"
     }
@@ -71,7 +71,8 @@ def judged_records():
 
 
 def perception_arguments():
-    return ["--results", RESULTS, "--scenarios", json.dumps(judged_scenarios())]
+    everyone = judged_scenarios(BENCHMARK.whole.scenarios)
+    return ["--results", RESULTS, "--scenarios", json.dumps(everyone)]
 
 
 def perception_tables():

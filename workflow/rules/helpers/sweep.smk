@@ -30,7 +30,8 @@ def tune_settings():
         name: str(ROOT / getattr(CONFIG, name))
         for name in ("method_table", "search_table")
     }
-    chosen = json.loads(section(*names, "scenarios")) | tables
+    chosen = json.loads(section(*names)) | tables
+    chosen["scenarios"] = list(BENCHMARK.whole.scenarios)
     return json.dumps(chosen, sort_keys=True)
 
 
