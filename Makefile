@@ -1,4 +1,4 @@
-# make demo | test | lint | bench: each makes or reuses .venv by itself.
+# make install | demo | test | lint | bench: each makes or reuses .venv by itself.
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
@@ -8,7 +8,7 @@ CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: demo test lint format bench clean
+.PHONY: install demo test lint format bench clean
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
@@ -16,6 +16,8 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	$(PYTHON) -m venv .venv
 	PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@touch $@
+
+install: $(INSTALLED)
 
 demo: $(INSTALLED)
 	$(SNAKEMAKE) --cores $(CORES) --quiet rules

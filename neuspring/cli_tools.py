@@ -34,8 +34,10 @@ def _sync(a: argparse.Namespace) -> int:
 
 def _compare(a: argparse.Namespace) -> int:
     from neuspring import compare
+    from neuspring.provenance import commit_named
 
-    print(compare.compare(a.results, read_settings(a.settings).tracking, a.first, a.second, a.output), end="")
+    first, second = commit_named(a.first), commit_named(a.second)
+    print(compare.compare(a.results, read_settings(a.settings).tracking, first, second, a.output), end="")
     return 0
 
 
@@ -155,7 +157,9 @@ def add_commands(add: Adder) -> None:
     sync.add_argument("--under", type=Path, help="only the records under this folder of the results")
     sync.add_argument("--output", type=Path, help="file for the counts; failures are then not an error")
     compare = add("compare", _compare, "runs of two commits, from MLflow -> paired differences", "results", "settings")
-    compare.add_argument("first", metavar="COMMIT_A", help="a prefix will do; a copy with changes is another commit, ...-dirty")
+    compare.add_argument(
+        "first", metavar="COMMIT_A", help="or a prefix, HEAD~1, a branch; a copy with changes is another commit, ...-dirty"
+    )
     compare.add_argument("second", metavar="COMMIT_B")
     compare.add_argument("--output", type=Path, help="CSV file of the differences")
     ui = add("ui", _ui, "open the MLflow UI of a results folder", "results", "settings")

@@ -32,8 +32,12 @@ def text(found: Explanation) -> str:
         lines += [f"- {run.scenario} / seed {run.seed}: {run.why}{_command(run)}" for run in found.left_out]
     if found.runs:
         lines += ["", 'In MLflow (`neuspring ui`), a run has the tag run_key: search for tags.run_key = "...".']
-        lines.append("Commands make the run and all its stages again. Add the --configfile and --config of the benchmark,")
-        lines.append("where --configfile did not name them here. The same seed on the same type of device gives the same run_key.")
+        lines.append(
+            "Commands make the run and all its stages again, in place of these: check out the commit of the run first, and"
+        )
+        lines.append("to keep these give another folder, --config results=... They need the --configfile and --config of the")
+        lines.append("benchmark; name them to this command too (--configfile). The same seed on the same type of device gives the")
+        lines.append("same run_key.")
     checked = sum(run.files for run in found.runs)
     lines += ["", f"{checked} files compared with their digests; {len(found.problems) or 'nothing'} not as recorded"]
     lines += [f"- {problem}" for problem in found.problems]

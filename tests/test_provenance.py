@@ -174,3 +174,11 @@ LIGHT = [f"neuspring{name}" for name in ("", ".benchmark", ".config", ".cli", ".
 def test_imports_that_the_workflow_makes_at_start_are_light(module):
     code = f"import sys, {module}; print([m for m in ('torch', 'warp', 'mlflow', 'matplotlib', 'cma') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_a_commit_is_found_by_the_names_that_git_knows():
+    if not (here := provenance.commit().removesuffix("-dirty")):
+        pytest.skip("not a working copy")
+    assert provenance.commit_named("HEAD") == provenance.commit_named(here[:10]) == here
+    assert provenance.commit_named("no-such-commit") == "no-such-commit"
+    assert provenance.commit_named(f"{here}-dirty") == f"{here}-dirty"

@@ -15,7 +15,14 @@ from neuspring import config as settings
 from neuspring import gpus, job, needs, plan, tune_space
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
-from neuspring.job_records import begin_run, failure_lines, read_jobs, this_run
+from neuspring.job_records import (
+    FOLDER,
+    RUN,
+    begin_run,
+    failure_lines,
+    read_jobs,
+    this_run,
+)
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
 

@@ -34,3 +34,4 @@ for study_name in BENCHMARK.studies:
             study_name
         input:
             study_table(study_name),
+            tracked_runs(BENCHMARK.methods_of(study_name)),

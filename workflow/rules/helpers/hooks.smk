@@ -58,6 +58,7 @@ def report_end(failed):
         subprocess.run([*command, *page], check=False, stdout=subprocess.DEVNULL)
         tell_failures()
         return
+    tell_studies()
     if not Path(TABLES).exists():
         return
     print(f"\n{Path(TABLES).read_text()}")
@@ -68,6 +69,16 @@ def report_end(failed):
         f"Open in a browser: {REPORT} (everything), {TABLE_FOLDER}/pictures.html (videos of every method)"
     )
     tell_tracking()
+
+
+def tell_studies():
+    """Where the tables beside the paper's are that this run has made."""
+    begun = (Path(RESULTS) / FOLDER / RUN).stat().st_mtime
+    for name, path in ((name, Path(study_table(name))) for name in BENCHMARK.studies):
+        if path.exists() and path.stat().st_mtime >= begun:
+            print(
+                f"{name}: {path}; the runs behind a number: neuspring explain {name}/ROW/future/chamfer --results {shlex.quote(RESULTS)}"
+            )
 
 
 def tell_tracking():

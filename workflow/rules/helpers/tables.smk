@@ -9,9 +9,9 @@ def run_records(methods=CONFIG.methods):
     )
 
 
-def tracked_runs():
+def tracked_runs(methods=CONFIG.methods):
     return (
-        [path.replace("run.json", "mlflow.txt") for path in run_records()]
+        [path.replace("run.json", "mlflow.txt") for path in run_records(methods)]
         if CONFIG.tracking.enabled
         else []
     )
