@@ -24,7 +24,7 @@ PENALTY = 1e3
 """Costs above stand for candidates that could not be simulated."""
 MM = 1e3
 PANEL = (3.3, 2.1)
-FRAME = (0.16, 0.11, 0.81, 0.83)
+FRAME = (0.16, 0.11, 0.77, 0.83)
 """Of the axes in a panel; a layout that is computed takes most of the time."""
 FAINT = 0.5
 MOST_OPEN = 6
