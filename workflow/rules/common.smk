@@ -1,6 +1,7 @@
 # Validates the configuration before any job, and holds the helpers that rules use.
 import atexit
 import functools
+import gc
 import hashlib
 import json
 import shlex
@@ -25,6 +26,10 @@ from neuspring.job_records import (
 )
 from neuspring.lpips_weights import configured
 from neuspring.provenance import code_digest
+
+# The graph of jobs stays until the end. To look for garbage in it again and again, at last at the exit, is a fifth of a dry run.
+gc.set_threshold(100_000, 50, 100)
+atexit.register(gc.freeze)
 
 ROOT = Path(workflow.basedir)
 # On a cluster its scheduler hands out GPUs; Snakemake then counts jobs (--jobs), not cores, but for a dry run, where it makes cores 1.
