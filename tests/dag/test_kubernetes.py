@@ -25,15 +25,35 @@ def kubectl(folder, text: str) -> dict[str, str]:
     return os.environ | {"PATH": f"{folder}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
 
 
+def on_kubernetes(place):
+    """The command of a search in pods; a cluster's jobs are not counted by cores."""
+    target = f"results/{SCENE}/search-uniform/0/search.json"
+    command = arguments(place, {"device": "auto"}, "--seconds-between-status-checks", "1", "--", target)
+    command[command.index("workflow/profiles/default")] = "workflow/profiles/kubernetes"
+    cores = command.index("--cores")
+    del command[cores : cores + 2]
+    return command
+
+
+def test_cores_are_refused_before_any_pod(place, tmp_path):
+    if importlib.util.find_spec("snakemake_executor_plugin_cluster_generic") is None:
+        pytest.skip("needs snakemake-executor-plugin-cluster-generic: pip install 'neuspring[kubernetes]'")
+    command = on_kubernetes(place)
+    environment = kubectl(tmp_path / "bin", f'touch "{tmp_path / "asked"}"')
+    options = {"cwd": place, "env": environment, "capture_output": True, "text": True, "timeout": 300, "check": False}
+    done = subprocess.run([*command[:3], "--cores", "2", *command[3:]], **options)
+    assert done.returncode == 1
+    assert "--cores: a cluster's scheduler counts cores itself" in done.stderr
+    assert not (tmp_path / "asked").exists()
+
+
 def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_with_more_memory(place, tmp_path):
     if importlib.util.find_spec("snakemake_executor_plugin_cluster_generic") is None:
         pytest.skip("needs snakemake-executor-plugin-cluster-generic: pip install 'neuspring[kubernetes]'")
     pods = tmp_path / "pods"
     pods.mkdir()
     (pods / "evicted").write_text("1")
-    target = f"results/{SCENE}/search-uniform/0/search.json"
-    command = arguments(place, {"device": "auto"}, "--seconds-between-status-checks", "1", "--", target)
-    command[command.index("workflow/profiles/default")] = "workflow/profiles/kubernetes"
+    command = on_kubernetes(place)
     environment = kubectl(tmp_path / "bin", f'exec "{sys.executable}" "{ROOT}/tests/dag/kubectl.py" "$@"')
     # pods.py takes the environment's python3.
     (tmp_path / "bin" / "python3").symlink_to(sys.executable)

@@ -15,7 +15,20 @@ def tell_plan():
         )
 
 
+def refuse_cores_on_a_cluster():
+    """With --cores jobs were planned for the GPUs of this machine, which are not those of a cluster."""
+    if workflow.non_local_exec and not CLUSTER:
+        cause = InputError(
+            "--cores",
+            "a cluster's scheduler counts cores itself, and gives each job its GPU",
+            workflow.resource_settings.cores,
+            "Leave it out; --jobs limits how many jobs there are at once.",
+        )
+        raise WorkflowError(str(cause))
+
+
 def begin():
+    refuse_cores_on_a_cluster()
     begin_run(Path(RESULTS))
     tell_plan()
 
