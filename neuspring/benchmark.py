@@ -160,12 +160,14 @@ class Benchmark:
         transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
         _require_alike(config, scenarios, transfers)
-        tuned = _tuned(whole, targets)
+        if whole.tune:
+            of = "this configuration's scenarios"
+            _require_known("tune.scenarios", whole.tune.scenarios, dict.fromkeys(whole.scenarios + targets), of)
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
             whole,
-            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + tuned)},
+            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + _tuned(whole))},
             {n: scenarios[n] for n in whole.scenarios},
             {n: methods[n] for n in config.methods},
             {n: searches[n] for n in wanted},
@@ -190,7 +192,7 @@ class Benchmark:
     @property
     def tuned(self) -> tuple[str, ...]:
         """The scenarios of the tuning study: a study keeps them, whatever part of the runs is made now."""
-        return self.whole.tune.scenarios or self.whole.scenarios if self.whole.tune else ()
+        return _tuned(self.whole)
 
     @property
     def compared_with(self) -> str:
@@ -247,13 +249,9 @@ class Benchmark:
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
 
 
-def _tuned(whole: Config, targets: tuple[str, ...]) -> tuple[str, ...]:
-    """The scenarios of the tuning study, if there is one. Raises InputError for those that the configuration does not have."""
-    if whole.tune is None:
-        return ()
-    known = dict.fromkeys(whole.scenarios + targets)
-    _require_known("tune.scenarios", whole.tune.scenarios, known, "this configuration's scenarios")
-    return whole.tune.scenarios or whole.scenarios
+def _tuned(whole: Config) -> tuple[str, ...]:
+    """The scenarios of the tuning study; none without one."""
+    return whole.tune.scenarios or whole.scenarios if whole.tune else ()
 
 
 def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:

@@ -243,7 +243,7 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     counts = collected.runs.groupby(["method", "status"]).size().unstack(fill_value=0)
     scenarios, seeds = collected.runs["scenario"].nunique(), collected.runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
-    several = len(scores) > 0 and scores["seed"].nunique() > 1
+    several = _several_seeds(scores)
     spread = ", ± standard deviation over seeds" if several else ""
     lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
@@ -271,6 +271,11 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
         lines += ["", "Notes:", ""]
         lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
     return "\n".join(lines) + "\n"
+
+
+def _several_seeds(scores: pd.DataFrame) -> bool:
+    """Whether there is a spread over seeds to show."""
+    return len(scores) > 0 and scores["seed"].nunique() > 1
 
 
 def _not_counted(bad: pd.DataFrame) -> list[str]:
@@ -379,7 +384,7 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
     lines += [f"{_image_conditions(drawn['images'])} Mean over scenarios; in brackets the frame-weighted mean.", ""]
     methods = list(dict.fromkeys(collected.runs["method"]))
     counts = runs.groupby(["method", "status"]).size().unstack(fill_value=0).reindex(methods, fill_value=0)
-    lines += _method_table(methods, averages(pictured), counts, pictured["seed"].nunique() > 1, IMAGE_HEADINGS, NOT_COMPUTED)
+    lines += _method_table(methods, averages(pictured), counts, _several_seeds(pictured), IMAGE_HEADINGS, NOT_COMPUTED)
     lines += ["", f"Part of the surface that no camera sees in frame 0: {_unseen(drawn)}."]
     computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
     where = "in some runs " if "lpips" in computed else ""
@@ -476,7 +481,7 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     what = "Each twin on other recordings of the same object, all frames after the first: mean over targets, then over sources"
     lines = ["", "## Transfer", "", f"{what} (in brackets weighted by frames). A run is one source and seed.", ""]
     means = averages(scores) if len(scores) else pd.DataFrame()
-    lines += _method_table(methods, means, counts, len(scores) > 0 and scores["seed"].nunique() > 1, TRANSFER_HEADINGS)
+    lines += _method_table(methods, means, counts, _several_seeds(scores), TRANSFER_HEADINGS)
     differences = paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
     if len(differences):
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import multiprocessing
-import os
 import shutil
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from neuspring.records import StageRecord
 from neuspring.tracking_payload import RunRecord, payload
 from neuspring.tune_space import Plan
 from neuspring.tune_store import FileLocks, Store
-from tests import small
+from tests import small, stores
 
 START = {"object_radius": 0.045, "stiffness": 1.0e4}
 BASE = {"scenarios": ["small"], "search": {"rollouts": 11, "start": START}, "fit": {"epochs": 3, "checkpoint_every": 1}}
@@ -460,12 +459,13 @@ def test_two_workers_and_a_kill_make_exactly_the_trials_asked_for(folder, monkey
     two_workers(folder, study(trials=6, workers=2, pruner="none"))
 
 
-@pytest.mark.skipif("NEUSPRING_TEST_POSTGRES" not in os.environ, reason="NEUSPRING_TEST_POSTGRES, a database's URI, is not set")
+@pytest.mark.skipif(bool(stores.without_postgres()), reason=stores.without_postgres())
 def test_postgresql_holds_a_study(folder, monkeypatch):
     monkeypatch.setattr(stages, "search", stages.search)
-    chosen = study(study=f"test-{os.getpid()}", trials=6, workers=2, pruner="none", storage=os.environ["NEUSPRING_TEST_POSTGRES"])
-    two_workers(folder, chosen)
-    assert "6 of 6 trials" in report(folder, chosen)
+    with stores.postgres() as cluster:
+        chosen = study(trials=6, workers=2, pruner="none", storage=cluster.database("study"))
+        two_workers(folder, chosen)
+        assert "6 of 6 trials" in report(folder, chosen)
     assert not (folder / tune_store.DATABASE).exists()
 
 

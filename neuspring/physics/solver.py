@@ -65,11 +65,12 @@ def resolve_device(device: str) -> str:
         raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     held = os.environ.get("CUDA_VISIBLE_DEVICES", "").strip()
+    holds = held not in ("", "-1")
     # A job that holds a GPU which CUDA does not find has lost it; but a torch without CUDA never finds one.
-    gone = bool(torch.version.cuda) and held not in ("", "-1")
-    if device == "auto" and count == 0 and not gone:
-        _warn_of_idle_gpu(held)
-    if device == "cpu" or (device == "auto" and count == 0 and not gone):
+    lost = holds and bool(torch.version.cuda)
+    if device == "cpu" or (device == "auto" and count == 0 and not lost):
+        if device == "auto" and holds:
+            _warn_of_idle_gpu(held)
         return "cpu"
     if not torch.version.cuda:
         raise InputError("device", "this torch is a build for the CPU alone", device, "Install its CUDA build, or use device: cpu.")
@@ -82,13 +83,12 @@ def resolve_device(device: str) -> str:
 @functools.cache
 def _warn_of_idle_gpu(held: str) -> None:
     """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
-    if held.strip() not in ("", "-1"):
-        print(
-            f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
-            "With device: cuda this is an error.",
-            file=sys.stderr,
-            flush=True,
-        )
+    print(
+        f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
+        "With device: cuda this is an error.",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 @dataclass(frozen=True)
