@@ -1,15 +1,14 @@
 """Leases: no two jobs on one slot, no slot lost to a crash, none idle while somebody waits."""
 
 import contextlib
-import fcntl
 import multiprocessing
+import multiprocessing.connection
 import os
 import random
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -20,60 +19,44 @@ from neuspring import gpus
 from neuspring.errors import InputError
 
 EIGHT = tuple(map(str, range(8)))
-DYING = 0.03
-"""s, far below the time for which slots are held here."""
 FORK = multiprocessing.get_context("fork")
 
 
-def hold(folder, jobs_per_gpu, seconds, crash, violations):
-    """Lease a device, look whether its last holder still is there, sleep, and end by SIGKILL or in good order."""
+def hold(folder, jobs_per_gpu, seconds, crash):
+    """Lease a device, note the begin and the end of it in the journal of its slot, and end by SIGKILL or in good order."""
     lease = gpus.acquire(1, EIGHT, jobs_per_gpu=jobs_per_gpu, folder=folder)
-    # A holder locks a file of its own for its slot, so that another holder can see it.
-    with open(folder / f"{os.path.basename(lease.files[0].name)}.holder", "a") as mark:
-        if not locked(mark):
-            # The kernel lets go of a killed process's files one by one; whoever is still there after this time is alive.
-            time.sleep(DYING)
-            if not locked(mark):
-                violations.put(mark.name)
-        time.sleep(seconds)
-        if crash:
-            os.kill(os.getpid(), signal.SIGKILL)
+    journal = os.open(folder / f"{os.path.basename(lease.files[0].name)}.journal", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.write(journal, f"{os.getpid()}\n".encode())
+    time.sleep(seconds)
+    # Both notes are written while the slot is held, so that those of two holders alternate only if both held it.
+    os.write(journal, f"{os.getpid()}\n".encode())
+    if crash:
+        os.kill(os.getpid(), signal.SIGKILL)
     lease.release()
 
 
-def locked(file):
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 def crowd(folder, jobs, at_once, seconds, crash, jobs_per_gpu=1):
-    """Run `jobs` holders, `at_once` at a time; returns how many found a live holder on their slot or ended otherwise than meant."""
-    violations, room = FORK.Queue(), threading.Semaphore(at_once)
-
-    def one(duration):
-        process = FORK.Process(target=hold, args=(folder, jobs_per_gpu, duration, crash, violations))
-        process.start()
-        process.join()
-        if process.exitcode != (-signal.SIGKILL if crash else 0):
-            violations.put(process.exitcode)
-        room.release()
-
-    threads = []
-    for duration in seconds(jobs):
-        room.acquire()
-        threads.append(threading.Thread(target=one, args=(duration,)))
-        threads[-1].start()
-    for thread in threads:
-        thread.join()
-    return violations.qsize()
+    """Run `jobs` holders, `at_once` at a time; returns how many ended otherwise than meant, and the journals of the slots."""
+    # Started and awaited by one thread: two that wait for children can take each other's exit codes.
+    waiting, running, ended = list(seconds(jobs)), [], []
+    while waiting or running:
+        while waiting and len(running) < at_once:
+            running.append(FORK.Process(target=hold, args=(folder, jobs_per_gpu, waiting.pop(), crash)))
+            running[-1].start()
+        multiprocessing.connection.wait([process.sentinel for process in running])
+        alive = [process for process in running if process.is_alive()]
+        ended += [process.exitcode for process in running if process not in alive]
+        running = alive
+    wrong = [code for code in ended if code != (-signal.SIGKILL if crash else 0)]
+    return wrong, [path.read_text().split() for path in folder.glob("*.journal")]
 
 
 def test_no_slot_is_given_twice_or_lost_when_500_holders_are_killed(tmp_path):
     draw = random.Random(0)
-    assert crowd(tmp_path, 500, 16, lambda n: (draw.uniform(0.05, 0.1) for _ in range(n)), crash=True) == 0
+    wrong, journals = crowd(tmp_path, 500, 16, lambda n: (draw.uniform(0.05, 0.1) for _ in range(n)), crash=True)
+    assert not wrong
+    assert sum(map(len, journals)) == 2 * 500
+    assert all(journal[::2] == journal[1::2] for journal in journals)
     held = [gpus.acquire(1, EIGHT, folder=tmp_path, timeout=5) for _ in EIGHT]
     assert sorted(lease.devices[0] for lease in held) == list(EIGHT)
 
