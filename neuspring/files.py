@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from neuspring.errors import InputError
 
@@ -47,3 +49,11 @@ def write_table(table: pd.DataFrame, path: Path) -> Path:
     """Write a Parquet file atomically; returns its path."""
     write_atomically(path, lambda temporary: table.to_parquet(temporary, index=False))
     return path
+
+
+def write_history(steps: Any, columns: Mapping[str, pd.Series], path: Path) -> Path:
+    """Write metrics over steps as MLflow takes them, long: step, metric, value; missing values are left out."""
+    import pandas as pd
+
+    parts = [pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": v.to_numpy(float)}) for name, v in columns.items()]
+    return write_table(pd.concat(parts).dropna().reset_index(drop=True), path)

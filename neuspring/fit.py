@@ -10,12 +10,10 @@ parameters of the epoch's start, halves the learning rates and is reported.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +23,9 @@ import torch
 
 from neuspring import config
 from neuspring.artifacts import Observations, Twin
+from neuspring.checkpoint import Checkpoint
 from neuspring.config import Kind
 from neuspring.errors import InputError, NumericalFailure
-from neuspring.files import write_atomically
 from neuspring.losses import FrameLoss
 from neuspring.motion import initial_velocity
 from neuspring.parameters import TwinParameters
@@ -102,49 +100,22 @@ class _State:
     def save(self, path: Path, key: str, seconds: float) -> None:
         arrays = {f"values.{k}": v for k, v in self.values.items()} | {f"best.{k}": v for k, v in self.best_values.items()}
         arrays |= {f"moments.{k}": v for k, v in self.moments.items()}
-        meta = {
-            "key": key,
-            "epoch": self.epoch,
-            "rate": self.rate,
-            "history": self.history,
-            "rollbacks": self.rollbacks,
-            "best_epoch": self.best_epoch,
-            "best_loss": self.best_loss,
-            "best_substeps": self.best_substeps,
-            "overflow": self.overflow,
-            "substeps": self.substeps,
-            "attempts": self.attempts,
-            "seconds": seconds,
-        }
-        arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as stream:
-                np.savez(stream, **arrays)  # type: ignore[arg-type]
-
-        write_atomically(path, write)
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("values", "moments", "best_values")}
+        Checkpoint(arrays, plain | {"seconds": seconds}).save(path, key)
 
     @classmethod
     def load(cls, path: Path | None, key: str) -> _State | None:
-        if path is None or not path.is_file():
+        found = Checkpoint.load(path, key, "the fit")
+        if found is None:
             return None
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            meta = json.loads(arrays.pop("meta").tobytes())
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            print(f"{path}: unreadable ({error}); the fit starts afresh")
-            return None
-        if meta.pop("key") != key:
-            print(f"{path}: made with other inputs or settings; the fit starts afresh")
-            return None
+        arrays = found.arrays
 
         def part(prefix: str) -> dict[str, np.ndarray]:
             return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
-        print(f"continuing the fit after epoch {meta['epoch']}")
-        meta["attempts"] += 1
-        return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **meta)
+        print(f"continuing the fit after epoch {found.values['epoch']}")
+        plain = found.values | {"attempts": found.values["attempts"] + 1}
+        return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **plain)
 
 
 class TwinFit:

@@ -7,7 +7,6 @@ the heads are files (`lpips_weights`); nothing is downloaded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torch.nn.functional import conv2d, max_pool2d, relu
 
 from neuspring.errors import InputError
 from neuspring.lpips_weights import BACKBONE_ADDRESS, find_weights
+from neuspring.weight_files import read_tensors
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
 """Of the picture and after each convolution."""
@@ -34,28 +34,6 @@ SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
 LEAST_NORM = 1e-10
 """Added to the length of a feature before dividing by it."""
-
-
-def _read(path: Path, shapes: Mapping[str, tuple[int, ...]], device: str) -> list[torch.Tensor]:
-    """The named tensors of a state dict, float32. Raises InputError if one is absent, or has another shape or kind."""
-    remedy = "Delete the file and get it again."
-    try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # A damaged file fails in any way: there is no list of what the unpickler raises.
-        line = str(error).partition("\n")[0]
-        raise InputError(path, "this file must hold weights", f"{type(error).__name__}: {line}", remedy) from error
-    if not isinstance(stored, dict):
-        raise InputError(path, "this file must hold a state dict", type(stored).__name__, remedy)
-    tensors = []
-    for name, shape in shapes.items():
-        value = stored.get(name)
-        if not isinstance(value, torch.Tensor) or value.shape != shape or not value.is_floating_point():
-            received = f"{value.dtype} {list(value.shape)}" if isinstance(value, torch.Tensor) else type(value).__name__
-            raise InputError(path, f"`{name}` must be a float tensor {list(shape)}", received, remedy)
-        if not value.isfinite().all():
-            raise InputError(path, f"`{name}` must be finite", None, remedy)
-        tensors.append(value.to(device, torch.float32))
-    return tensors
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +58,9 @@ class Lpips:
             for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
         }
         biases = {f"features.{layer}.bias": (after,) for layer, after in zip(LAYERS, CHANNELS[1:], strict=True)}
-        tensors = _read(weights.backbone, {**shapes, **biases}, device)
+        tensors = read_tensors(weights.backbone, {**shapes, **biases}, device)
         linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
-        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], _read(weights.heads, linear, device))
+        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """What follows each ReLU [B, channels, h, w], of normalised pictures [B, 3, H, W]."""

@@ -18,7 +18,8 @@ from pathlib import Path
 PACKAGE = "neuspring"
 STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parent
-_DECLARED = ("config", "config_gpus", "config_images", "config_perception", "config_tune", "config_types", "progress", "records")
+_SECTIONS = ("baselines", "gpus", "gs_dynamics", "images", "perception", "spring_gaus", "tune", "types")
+_DECLARED = ("config", *(f"config_{name}" for name in _SECTIONS), "progress", "records")
 NOT_NUMERICS = frozenset(f"{PACKAGE}.{name}" for name in _DECLARED)
 """Declarations and reporting: configured values reach a rule as parameters of their own."""
 

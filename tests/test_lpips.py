@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuspring import lpips_weights
+from neuspring import lpips_weights, weight_files
 from neuspring.errors import InputError
 from neuspring.lpips import Lpips
 from neuspring.lpips_weights import Weights, find_weights
@@ -200,7 +200,7 @@ def test_an_unreadable_cached_file_is_a_reason(hub, monkeypatch):
     def denied(path):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(lpips_weights, "digest_file", denied)
+    monkeypatch.setattr(weight_files, "digest_file", denied)
     assert "cannot be read (Permission denied)" in str(find_weights())
 
 
