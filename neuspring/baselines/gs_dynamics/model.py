@@ -1,0 +1,32 @@
+"""A trained GS-Dynamics model: the weights of its network, and how graphs are made for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from neuspring.artifacts import Artifact, array
+from neuspring.baselines.gs_dynamics.network import Dynamics, weight_count
+from neuspring.baselines.gs_dynamics.rules import Rules
+from neuspring.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class GsDynamicsModel(Artifact):
+    """Knows no object: it moves whatever structure points it is given."""
+
+    kind: ClassVar[str] = "gs_dynamics"
+    weights: np.ndarray = array("W", np.float32, "1", "matrices and biases of the network, in the order of network.layers")
+    rules: Rules
+
+    def check(self) -> None:
+        wanted = weight_count(self.rules)
+        if len(self.weights) != wanted:
+            raise InputError("gs_dynamics.weights", f"{wanted} weights are required", len(self.weights))
+
+    def dynamics(self, device: str) -> Dynamics:
+        """The network on a device."""
+        return Dynamics(self.rules, torch.tensor(self.weights, device=device))

@@ -1,0 +1,73 @@
+"""How structure points follow particles through one step.
+
+Each particle b has a rotation R_b that best maps the offsets to its neighbours in the graph (Kabsch; the least turn where they are
+on a line, none where there are none). A point at x follows the particles b, with displacements u_b, by weights
+w_b ~ 1 / max(|x - b|, 0.1 mm):
+
+    x' = x + sum_b w_b [(R_b - 1) (x - b) + u_b].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.baselines.gs_dynamics.graph import Graph
+from neuspring.baselines.gs_dynamics.rules import Rules
+from neuspring.kernels import load
+from neuspring.physics.solver import start_warp
+from neuspring.splats.skinning_kernels import turn_nodes
+
+CLOSE = 1e-4
+"""Distances are floored here where a weight is made of them, m."""
+
+
+def neighbour_table(graph: Graph) -> np.ndarray:
+    """[P, k] int32: whom each particle feels among particles, filled up with itself, which says nothing of its rotation."""
+    chosen = graph.among_particles
+    receivers, senders = (ends[chosen].cpu().numpy() for ends in (graph.receivers, graph.senders))
+    order = np.argsort(receivers, kind="stable")
+    receivers, senders = receivers[order], senders[order]
+    slot = np.arange(len(receivers)) - np.searchsorted(receivers, receivers)
+    table = np.repeat(np.arange(graph.particles, dtype=np.int32)[:, None], int(slot.max(initial=0)) + 1, axis=1)
+    table[receivers, slot] = senders
+    return table
+
+
+def turns(graph: Graph, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """Rotations [P, 3, 3] of particles that moved from `before` to `after` [P, 3], m."""
+    start_warp()
+    count = graph.particles
+    table: Any = wp.array(neighbour_table(graph), dtype=int, device="cpu")
+    places: list[Any] = [
+        wp.array(points.cpu().numpy().astype(np.float32), dtype=wp.vec3, device="cpu") for points in (before, after)
+    ]
+    rotations, ranks = wp.zeros(count, dtype=wp.mat33, device="cpu"), wp.zeros(count, dtype=int, device="cpu")
+    # A hundred particles: the CPU is as fast as any device.
+    wp.launch(load(turn_nodes, "cpu"), count, [*places, table, rotations, ranks], device="cpu")
+    return torch.tensor(rotations.numpy(), dtype=before.dtype, device=before.device)
+
+
+def carry(
+    points: torch.Tensor, particles: torch.Tensor, rotations: torch.Tensor, displacements: torch.Tensor, rules: Rules
+) -> torch.Tensor:
+    """Points [N, 3] m after particles [P, 3] m with rotations [P, 3, 3] moved by displacements [P, 3], m."""
+    weights = blend_weights(torch.cdist(points, particles, compute_mode="donot_use_mm_for_euclid_dist"), rules)
+    bend = rotations - torch.eye(3, dtype=points.dtype, device=points.device)
+    # sum_b w_b [B_b (x - b) + u_b] = (sum_b w_b B_b) x + sum_b w_b (u_b - B_b b), relative to a centre to keep digits.
+    centre = particles.mean(dim=0)
+    shift = displacements - torch.einsum("bij,bj->bi", bend, particles - centre)
+    turned = torch.einsum("nij,nj->ni", (weights @ bend.flatten(1)).view(-1, 3, 3), points - centre)
+    return points + turned + weights @ shift
+
+
+def blend_weights(distance: torch.Tensor, rules: Rules) -> torch.Tensor:
+    """[N, P], rows add up to 1, of distances [N, P], m: of all particles, or of the nearest."""
+    weights = 1 / distance.clamp(min=CLOSE)
+    if rules.propagation == "nearest":
+        kept = weights.topk(min(rules.nearest, weights.shape[1]), dim=1).indices
+        weights = torch.zeros_like(weights).scatter(1, kept, weights.gather(1, kept))
+    return weights / weights.sum(dim=1, keepdim=True)

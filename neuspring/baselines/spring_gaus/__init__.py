@@ -1,0 +1,1 @@
+"""Spring-Gaus: anchors with directed springs, trained through splats."""

@@ -1,0 +1,81 @@
+"""What the anchors of a frame are compared with: silhouettes of the splats that follow them, or points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from neuspring.baselines.spring_gaus.graph import Binding
+from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
+from neuspring.losses import FrameLoss
+from neuspring.splats.model import Gaussians
+from neuspring.splats.rasterise import Backend, rasterise
+from neuspring.splats.view import View
+
+
+class Follower:
+    """Points that follow anchors by fixed weights, on a device."""
+
+    def __init__(self, binding: Binding, device: str) -> None:
+        self.indices = torch.tensor(binding.indices, device=device).long()
+        self.weights = torch.tensor(binding.weights, device=device)
+
+    def __call__(self, anchors: torch.Tensor) -> torch.Tensor:
+        """Weighted means [P, 3] of anchors [N, 3]."""
+        # A bag of rows: its gradient needs no [P, k, 3] in memory.
+        weights = self.weights.to(anchors.dtype)
+        return torch.nn.functional.embedding_bag(self.indices, anchors, per_sample_weights=weights, mode="sum")
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouettes:
+    """Silhouettes of the splats, all white on black, against the object's mask; one camera at random per frame and iteration."""
+
+    splats: Gaussians
+    follower: Follower
+    views: Mapping[str, View]
+    masks: Mapping[tuple[str, int], tuple[torch.Tensor, torch.Tensor]]
+    """(camera, frame) -> bool [H, W]: the object, and what counts."""
+    loss: SilhouetteLoss
+    backend: Backend
+    seed: int
+
+    def __call__(self, iteration: int, frame: int, anchors: torch.Tensor) -> torch.Tensor | None:
+        """Loss of anchors [N, 3], m; None where no camera has the frame."""
+        cameras = [name for name in self.views if (name, frame) in self.masks]
+        if not cameras:
+            return None
+        # Stateless, so that a continued training draws the same cameras.
+        drawn = np.random.default_rng([self.seed, iteration, frame]).integers(len(cameras))
+        name = cameras[int(drawn)]
+        mask, counts = self.masks[name, frame]
+        return self.loss(self.cover(anchors, self.views[name]) * counts, (mask & counts).float())
+
+    def cover(self, anchors: torch.Tensor, view: View) -> torch.Tensor:
+        """Coverage [H, W] of the splats in a view: what they show in white on black."""
+        splats, means = self.splats, self.follower(anchors)
+        white = torch.ones_like(means)
+        return rasterise(means, splats.quaternions, splats.scales, splats.opacities, white, view, backend=self.backend).alpha
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Chamfer and track loss of structure points in displacement form: s_t = s_0 + sum w (a_t - a_0)."""
+
+    nodes: torch.Tensor
+    """[P, 3] m, in frame 0."""
+    rest: torch.Tensor
+    """Anchors [N, 3] m in frame 0."""
+    follower: Follower
+    loss: FrameLoss
+
+    def __call__(self, iteration: int, frame: int, anchors: torch.Tensor) -> torch.Tensor:
+        """Loss of anchors [N, 3], m."""
+        return self.loss(frame, self.moved(anchors))
+
+    def moved(self, anchors: torch.Tensor) -> torch.Tensor:
+        """Structure points [P, 3], m."""
+        return self.nodes + self.follower(anchors - self.rest)

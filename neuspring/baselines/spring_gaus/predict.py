@@ -1,0 +1,60 @@
+"""Open-loop rollout of a Spring-Gaus model, and both of its outputs: structure points, and the centres of its splats."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from neuspring.artifacts import Observations, Trajectory
+from neuspring.baselines.results import Prediction
+from neuspring.baselines.spring_gaus.graph import Binding
+from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.objectives import Follower
+from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.rollout import FAR
+
+
+@torch.no_grad()
+def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tuple[torch.Tensor, str]:
+    """Anchors [F, N, 3], m, under controllers [T, C, 3], m, from frame 0; and why F < T: empty where it is not."""
+    solver = AnchorSolver(model.graph, model.physics, model.substeps, device)
+    parameters = model.parameters(model.tensors(device))
+    start, hands = torch.tensor(model.velocity, device=device), torch.tensor(controllers, dtype=torch.float32, device=device)
+    x = torch.tensor(model.anchors, device=device)
+    v, kept = torch.zeros_like(x), [x]
+    for frame in range(1, len(hands)):
+        # As in training: v0 is added on entering a frame and taken away on leaving it.
+        x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
+        v = v - start
+        near = (x.abs() < FAR).all(dim=1)
+        if not bool(near.all()):
+            return torch.stack(kept), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
+        kept.append(x)
+    return torch.stack(kept), ""
+
+
+def predict(model: SpringGausModel, observations: Observations, centres: np.ndarray | None, device: str) -> Prediction:
+    """Both outputs over all frames; `centres` [G, 3], m, of the splats in frame 0 (None: the model has no splats)."""
+    anchors, reason = roll_out(model, observations.controller_points, device)
+    nodes = torch.tensor(observations.nodes, device=device)
+    follow = Follower(Binding.of(observations.nodes, model.anchors, model.bound_anchors), device)
+    positions = torch.stack([nodes + follow(frame - anchors[0]) for frame in anchors]).cpu().numpy()
+    frames = len(observations.controller_points)
+    diverged = len(anchors) if reason else None
+    trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
+    facts = {"anchors": len(model.anchors), "substeps": model.substeps}
+    if centres is None:
+        return Prediction(trajectory, facts)
+    follow = Follower(Binding.of(centres, model.anchors, model.bound_anchors), device)
+    moved = torch.stack([follow(frame) for frame in anchors]).cpu().numpy()
+    return Prediction(trajectory, facts | contraction(centres, moved[0]), moved)
+
+
+def contraction(centres: np.ndarray, bound: np.ndarray) -> dict[str, float]:
+    """What binding by absolute positions does to centres [G, 3], m, already in frame 0: mean shift, m, and ratio of sizes.
+
+    Size: root mean square distance from the mean.
+    """
+    before, after = (float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) for points in (centres, bound))
+    shift = float(np.linalg.norm(bound - centres, axis=1).mean())
+    return {"frame0_shift": shift, "frame0_size_ratio": after / before if before else 1.0}

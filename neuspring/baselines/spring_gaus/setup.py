@@ -1,0 +1,106 @@
+"""What Spring-Gaus is trained on: anchors drawn from splats or structure points, and the objective over the training frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuspring.artifacts import Observations
+from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
+from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.objectives import Follower, Points, Silhouettes
+from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
+from neuspring.baselines.spring_gaus.train import Objective, Problem
+from neuspring.baselines.spring_gaus.vgg16 import Vgg16
+from neuspring.config import Config
+from neuspring.config_spring_gaus import SpringGaus
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.errors import InputError
+from neuspring.losses import FrameLoss
+from neuspring.perception.results import masks_of_cameras
+from neuspring.pictures import view_of
+from neuspring.splats.model import Gaussians, Splats
+from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.view import View
+
+CELLS = (0.01, 0.001)
+"""m, of the grids that anchors are drawn from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Masks of the training frames, and the splats that are to cover them."""
+
+    splats: Splats
+    views: dict[str, View]
+    masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor]]
+    """(camera, frame) -> bool [H, W]: the object, and what counts."""
+    backend: Backend
+
+    @classmethod
+    def of(cls, folder: Path, records: Sequence[Path], splats: Path, settings: Config, device: str) -> Seen:
+        """From a capture, the records of its masks and a file of splats. Frames of the future are not read."""
+        capture, images = Capture.load(folder), settings.images
+        perceived = masks_of_cameras(capture, records)
+        masks = {}
+        for name, found in perceived.items():
+            for frame in (frame for frame in range(capture.train_end) if capture.has(name, frame)):
+                labels = torch.tensor(found.labels[frame], device=device)
+                covered = (labels == HANDS) & settings.baselines.spring_gaus.ignore_hands
+                masks[name, frame] = labels == OBJECT, ~covered
+        views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
+        return cls(Splats.load(splats), views, masks, choose_backend(images.backend, device))
+
+
+def problem(
+    observations: Observations, seen: Seen | None, settings: Config, seed: int, device: str
+) -> tuple[Problem, dict[str, Any]]:
+    """The problem of a training, and facts for its record. Raises InputError if silhouettes are asked for without pictures."""
+    chosen, scenario = settings.baselines.spring_gaus, observations.scenario
+    if chosen.supervision == "masks" and seen is None:
+        rule = "supervision: masks needs --capture, --masks and --appearance"
+        raise InputError("baselines.spring_gaus.supervision", rule, "none", "Use supervision: points for captures without images.")
+    cloud = seen.splats.means if seen and chosen.supervision == "masks" else observations.nodes
+    anchors = choose_anchors(cloud, chosen.anchors, CELLS, np.random.default_rng(seed))
+    hands = observations.controller_points[: scenario.train_end]
+    graph = AnchorGraph.of(anchors, hands[0], chosen.neighbours, chosen.link_reach, chosen.link_count)
+    up = 1.0 if scenario.up == "+z" else -1.0
+    start = SpringGausModel.start(
+        graph,
+        chosen,
+        frame_time=1 / scenario.frame_rate,
+        up_sign=up,
+        gravity=settings.simulation.gravity,
+        ground=scenario.ground,
+    )
+    facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
+    objective: Objective
+    if seen and chosen.supervision == "masks":
+        objective, found = _silhouettes(seen, start, chosen, seed, device)
+        facts |= found
+    else:
+        objective = _points(observations, start, settings, device)
+    return Problem(start, hands, objective, chosen, device), facts
+
+
+def _silhouettes(
+    seen: Seen, start: SpringGausModel, settings: SpringGaus, seed: int, device: str
+) -> tuple[Silhouettes, dict[str, Any]]:
+    weights = vgg16_weights.find(settings.vgg16) if settings.features else "not asked for"
+    features = None if isinstance(weights, str) else Vgg16.load(weights, device)
+    follower = Follower(Binding.of(seen.splats.means, start.anchors, start.bound_anchors), device)
+    loss = SilhouetteLoss(settings, features)
+    objective = Silhouettes(Gaussians.of(seen.splats, device), follower, seen.views, seen.masks, loss, seen.backend, seed)
+    return objective, {"vgg16": weights if isinstance(weights, str) else "computed", "splats": len(seen.splats.means)}
+
+
+def _points(observations: Observations, start: SpringGausModel, settings: Config, device: str) -> Points:
+    nodes = torch.tensor(observations.nodes, device=device)
+    follower = Follower(Binding.of(observations.nodes, start.anchors, start.bound_anchors), device)
+    return Points(nodes, torch.tensor(start.anchors, device=device), follower, FrameLoss.of(observations, settings.losses, device))

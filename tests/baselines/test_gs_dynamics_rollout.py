@@ -1,0 +1,229 @@
+"""GS-Dynamics: training recovers a known network, continues after a kill and ends by name; rollouts hold, step and stay rigid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from neuspring.artifacts import Observations, Scenario
+from neuspring.baselines.gs_dynamics import train
+from neuspring.baselines.gs_dynamics.graph import connect
+from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
+from neuspring.baselines.gs_dynamics.network import initial_weights, weight_count
+from neuspring.baselines.gs_dynamics.predict import predict
+from neuspring.baselines.gs_dynamics.propagate import carry, turns
+from neuspring.baselines.gs_dynamics.rules import Rules, resolve
+from neuspring.baselines.gs_dynamics.tracks import upright
+from neuspring.config_gs_dynamics import GsDynamics
+from neuspring.errors import InputError
+
+PLAIN = GsDynamics(
+    width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0, smoothing_passes=0,
+    coverage=0.0, length_weight=0.0, future=1, checkpoint_every=1, learning_rate=3e-3,
+)  # fmt: skip
+RULES = resolve(PLAIN, "sloth")[0]
+
+
+def cloud(count: int, seed: int) -> np.ndarray:
+    """Points [N, 3] in a cube of 10 cm."""
+    return np.random.default_rng(seed).uniform(0, 0.1, (count, 3)).astype(np.float32)
+
+
+def capture(points: np.ndarray, tools: np.ndarray, train_end: int | None = None) -> Observations:
+    """Of points [T, N, 3] that are always seen and two nodes more."""
+    frames, seen = len(points), np.ones(points.shape[:2], dtype=bool)
+    end = frames if train_end is None else train_end
+    scenario = Scenario(name="made", source="toy", category="sloth", frame_count=frames, train_end=end, frame_rate=30.0, up="+z")
+    return Observations(
+        scenario=scenario, object_points=points, object_visibility=seen, object_motion_valid=seen, controller_points=tools,
+        surface_points=cloud(1, 8), interior_points=cloud(1, 9), tracks=np.zeros((frames, 0, 3)),
+    )  # fmt: skip
+
+
+def hands(frames: int, motion: float = 0.012) -> np.ndarray:
+    """Three tools [T, 3, 3] on a winding way, `motion` m per frame."""
+    angle = 0.6 * np.arange(frames)
+    steps = motion * np.stack([np.cos(angle), np.sin(angle), 0.5 * np.sin(0.7 * angle)], axis=1)
+    steps *= motion / np.linalg.norm(steps, axis=1, keepdims=True)
+    return (cloud(3, 1)[None] + np.cumsum(steps, axis=0)[:, None] - steps[0]).astype(np.float32)
+
+
+def pushes(amount: float, rules: Rules = RULES) -> GsDynamicsModel:
+    """A network that moves all by `amount` m along x in every step."""
+    weights = np.zeros(weight_count(rules), dtype=np.float32)
+    weights[-3] = amount
+    return GsDynamicsModel(weights=weights, rules=rules)
+
+
+def one_step(model: GsDynamicsModel, points: np.ndarray, tools: np.ndarray, frame: int) -> torch.Tensor:
+    """Displacements after `frame`, all points being particles."""
+    frames = [max(frame - 2, 0), max(frame - 1, 0), frame]
+    past, held = torch.tensor(points[frames]), torch.tensor(tools)
+    graph = connect(past[-1:], torch.ones(1, points.shape[1], dtype=torch.bool), held[frame][None], model.rules)
+    return model.dynamics("cpu")(graph, torch.cat([past, held[frames]], dim=1), held[frame + 1] - held[frame])
+
+
+@torch.no_grad()
+def taught(frames: int, count: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """What a network of known random weights makes of a cloud: points [T, N, 3] and tools [T, C, 3], m.
+
+    Its head is set so that the first displacements are 5 mm, and 0 on average.
+    """
+    weights, head = 1.7 * initial_weights(RULES, 11), slice(-3 - 3 * RULES.width, -3)
+    weights[-3:] = 0
+    tools, points = hands(frames), np.repeat(cloud(count, 0)[None], frames, axis=0)
+    first = one_step(GsDynamicsModel(weights=weights.numpy(), rules=RULES), points, tools, 0)
+    scale = 0.005 / (first - first.mean(dim=0)).norm(dim=1).mean()
+    weights[head], weights[-3:] = weights[head] * scale, -first.mean(dim=0) * scale
+    teacher = GsDynamicsModel(weights=weights.numpy(), rules=RULES)
+    for frame in range(frames - 1):
+        points[frame + 1] = points[frame] + one_step(teacher, points, tools, frame).numpy()
+    return points, tools
+
+
+@torch.no_grad()
+def relative_error(model: GsDynamicsModel, points: np.ndarray, tools: np.ndarray) -> float:
+    """Mean error of all single steps, relative to how much displacements differ from their mean."""
+    wanted = np.diff(points, axis=0)
+    found = np.stack([one_step(model, points, tools, frame).numpy() for frame in range(len(wanted))])
+    size = np.linalg.norm(wanted - wanted.mean(axis=(0, 1)), axis=2).mean()
+    return float(np.linalg.norm(found - wanted, axis=2).mean() / size)
+
+
+def test_what_a_known_network_made_is_fitted_back():
+    points, tools = taught(16)
+    sizes = np.linalg.norm(np.diff(points, axis=0), axis=2)
+    assert 0.005 < sizes.mean() < 0.03 and points.std(axis=1).min() > 0.01
+    trained = train.run(capture(points, tools), replace(PLAIN, epochs=15, updates_per_epoch=40), 0, "cpu")
+    assert not trained.failure and trained.facts["windows"] == 15
+    assert relative_error(trained.model, points, tools) < 0.15
+
+
+def test_one_window_is_learned_by_heart():
+    # Ten times as large as captures: inputs are in metres, and learning is slow where all of them are near 0.
+    points, tools = 10 * cloud(20, 0)[None].repeat(2, axis=0), 10 * hands(2)
+    points[1] += 0.1 * np.sin(2.5 * points[0])
+    trained = train.run(capture(points, tools), replace(PLAIN, radius=0.8, epochs=4, updates_per_epoch=75, batch=1), 0, "cpu")
+    assert trained.facts["windows"] == 1
+    assert relative_error(trained.model, points, tools) < 0.1
+
+
+def test_a_killed_training_continues_to_the_same_model(tmp_path):
+    points, tools = cloud(25, 0)[None] + hands(8)[:, :1] - hands(8)[:1, :1], hands(8)
+    noisy = replace(PLAIN, noise=0.002, yaw=True, length_weight=0.1, future=2)
+    seen, partial = capture(points, tools), tmp_path / "partial.npz"
+    whole = train.run(seen, noisy, 3, "cpu")
+    again = train.run(seen, noisy, 3, "cpu")
+    np.testing.assert_array_equal(again.model.weights, whole.model.weights)
+    assert (train.run(seen, noisy, 4, "cpu").model.weights != whole.model.weights).any()
+    train.run(seen, replace(noisy, epochs=2), 3, "cpu", partial, "key")
+    continued = train.run(seen, noisy, 3, "cpu", partial, "key")
+    assert continued.attempts == 2 and continued.history.equals(whole.history)
+    assert list(whole.history) == ["step", "loss", "position_loss", "length_loss"]
+    np.testing.assert_array_equal(continued.model.weights, whole.model.weights)
+
+
+def test_nothing_after_the_training_frames_is_learned_and_only_frame_0_is_rolled_out():
+    points, tools = cloud(25, 0)[None] + hands(9)[:, :1] - hands(9)[:1, :1], hands(9)
+    seen = capture(points, tools, train_end=6)
+    later = np.arange(9)[:, None, None] >= 6
+    spoiled = replace(
+        seen,
+        object_points=np.where(later, points + 5, points),
+        controller_points=np.where(later, tools - 3, tools),
+        object_visibility=seen.object_visibility & ~later[..., 0],
+    )
+    models = [train.run(each, PLAIN, 0, "cpu").model for each in (seen, spoiled)]
+    np.testing.assert_array_equal(models[0].weights, models[1].weights)
+    blind = replace(seen, object_points=points * (np.arange(9) == 0)[:, None, None])
+    found = [predict(models[0], each, "cpu").trajectory.positions for each in (seen, blind)]
+    np.testing.assert_array_equal(*found)
+    assert found[0].shape == (9, 27, 3) and np.ptp(found[0], axis=0).max() > 1e-4
+    np.testing.assert_array_equal(found[0][0], seen.nodes)
+
+
+def test_training_that_cannot_go_on_says_so_and_keeps_what_it_had():
+    points, tools = cloud(25, 0)[None].repeat(4, axis=0), hands(4)
+    still = train.run(capture(points, hands(4, 0.001)), PLAIN, 0, "cpu")
+    assert still.failure == "training did not start: no window of a tool that moves 0.01 m in 4 training frames"
+    start = initial_weights(RULES, 0).numpy()
+    np.testing.assert_array_equal(still.model.weights, start)
+    assert len(still.history) == 0 and "loss" in still.history
+    wild = train.run(capture(points, tools), replace(PLAIN, learning_rate=1e30), 0, "cpu")
+    assert wild.failure == "training ended early: the loss is not finite (epoch 0, update 1)"
+    np.testing.assert_array_equal(wild.model.weights, start)
+
+
+def test_a_model_survives_its_file(tmp_path):
+    model = pushes(0.005)
+    model.save(tmp_path / "model.npz")
+    found = GsDynamicsModel.load(tmp_path / "model.npz")
+    assert found.rules == model.rules
+    np.testing.assert_array_equal(found.weights, model.weights)
+    with pytest.raises(InputError, match=r"gs_dynamics.weights: \d+ weights are required; received 7"):
+        GsDynamicsModel(weights=np.zeros(7), rules=RULES)
+
+
+def test_points_wait_while_the_tools_move_less_than_a_step():
+    # 4 mm per frame: steps in frames 3, 6 and 9.
+    tools = cloud(3, 1)[None] + 0.004 * np.arange(12)[:, None, None] * np.array([0, 1.0, 0])
+    seen = capture(cloud(25, 0)[None].repeat(12, axis=0), tools.astype(np.float32))
+    found = predict(pushes(0.006), seen, "cpu")
+    along = (found.trajectory.positions - seen.nodes)[:, :, 0]
+    assert found.facts["executed_steps"] == 3 and found.facts["tools"] == 3 and found.facts["particles"] == 27
+    np.testing.assert_allclose(along.T - np.minimum(np.arange(12), 9) * 0.002, 0, atol=1e-7)
+    assert np.abs((found.trajectory.positions - seen.nodes)[:, :, 1:]).max() < 1e-7
+    held = predict(pushes(0.006, replace(RULES, interpolate=False)), seen, "cpu").trajectory.positions
+    np.testing.assert_allclose((held - seen.nodes)[:, :, 0].T - np.arange(12) // 3 * 0.006, 0, atol=1e-7)
+
+
+def test_points_that_leave_the_scene_end_the_rollout_by_name():
+    seen = capture(cloud(25, 0)[None].repeat(8, axis=0), hands(8, 0.006))
+    trajectory = predict(pushes(600.0), seen, "cpu").trajectory
+    assert trajectory.diverged_frame == 4 and trajectory.positions.shape == (4, 27, 3)
+    assert trajectory.reason == "node 0 left the scene in frame 4" and trajectory.frame_count == 8
+    lost = predict(pushes(3e38, replace(RULES, propagation="nearest")), seen, "cpu").trajectory
+    assert lost.diverged_frame == 2 and len(lost.positions) == 2
+
+
+def test_upside_down_the_same_happens():
+    points, tools = cloud(25, 0)[None].repeat(6, axis=0), hands(6)
+    seen = capture(points, tools)
+    turned = {
+        name: upright(getattr(seen, name), "-z")
+        for name in ("object_points", "controller_points", "surface_points", "interior_points")
+    }
+    under = replace(seen, **turned, scenario=replace(seen.scenario, up="-z"))
+    models = [train.run(each, PLAIN, 0, "cpu").model for each in (seen, under)]
+    np.testing.assert_array_equal(models[0].weights, models[1].weights)
+    above, below = (predict(models[0], each, "cpu").trajectory.positions for each in (seen, under))
+    np.testing.assert_array_equal(upright(below, "-z"), above)
+
+
+@pytest.mark.parametrize("rules", [RULES, replace(RULES, propagation="nearest", nearest=4)])
+def test_structure_points_follow_a_rigid_motion_of_particles_exactly(rules):
+    turn, shift = Rotation.from_rotvec([0.4, -0.8, 0.3]).as_matrix(), np.array([0.02, 0.0, -0.01])
+    particles, points = cloud(20, 0) + 0.5, cloud(200, 5) + 0.5
+    before, after = torch.tensor(particles), torch.tensor((particles @ turn.T + shift).astype(np.float32))
+    graph = connect(before[None], torch.ones(1, 20, dtype=torch.bool), torch.zeros(1, 1, 3), rules)
+    moved = carry(torch.tensor(points), before, turns(graph, before, after), after - before, rules)
+    np.testing.assert_allclose(moved.numpy(), points @ turn.T + shift, rtol=0, atol=2e-6)
+
+
+def test_particles_on_a_line_turn_by_the_least_angle_and_lone_ones_do_not():
+    line = torch.tensor([[0.02 * i, 0, 0] for i in range(5)] + [[3.0, 0, 0]])
+    bent = torch.tensor([[0, 0.02 * i, 0] for i in range(5)] + [[3.0, 1, 0]])
+    graph = connect(line[None], torch.ones(1, 6, dtype=torch.bool), torch.zeros(1, 1, 3), RULES)
+    found = turns(graph, line, bent)
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    torch.testing.assert_close(found[:5], quarter.expand(5, -1, -1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found[5], torch.eye(3))
+
+
+def test_particles_of_a_sheet_are_never_mirrored():
+    flat = torch.tensor(cloud(30, 0)) * torch.tensor([1.0, 1, 0])
+    turn = torch.tensor(Rotation.from_rotvec([2.0, 1.0, 0.0]).as_matrix(), dtype=torch.float32)
+    graph = connect(flat[None], torch.ones(1, 30, dtype=torch.bool), torch.zeros(1, 1, 3), RULES)
+    torch.testing.assert_close(turns(graph, flat, flat @ turn.T), turn.expand(30, -1, -1), rtol=0, atol=1e-5)

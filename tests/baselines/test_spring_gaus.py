@@ -1,0 +1,227 @@
+"""Spring-Gaus: its forces in closed form, the kernel against the reference, binding, training that cannot end silently."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring.baselines.spring_gaus import reference
+from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
+from neuspring.baselines.spring_gaus.model import SpringGausModel, soft_vector
+from neuspring.baselines.spring_gaus.predict import contraction, roll_out
+from neuspring.baselines.spring_gaus.solver import AnchorParameters, AnchorPhysics, AnchorSolver
+from neuspring.baselines.spring_gaus.train import Problem, run
+from neuspring.config_spring_gaus import SpringGaus
+from neuspring.errors import InputError
+
+FRAME = 1 / 30
+SMALL = SpringGaus(anchors=72, neighbours=12, full_neighbours=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)
+
+
+def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
+    """A jittered lattice of 72 points [N, 3], m."""
+    lattice = np.stack(np.meshgrid(np.arange(8), np.arange(3), np.arange(3), indexing="ij"), axis=-1).reshape(-1, 3)
+    jitter = np.random.default_rng(seed).uniform(-0.002, 0.002, lattice.shape)
+    return lattice * 0.02 + jitter + [0, 0, height]
+
+
+def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGaus = SMALL, **changed) -> SpringGausModel:
+    graph = AnchorGraph.of(anchors, controllers, settings.neighbours, settings.link_reach, settings.link_count)
+    world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
+    return SpringGausModel.start(graph, settings, **world)
+
+
+def test_the_soft_vector_at_its_start():
+    eta = soft_vector(torch.zeros(1), 20, 16)
+    assert eta[:16].tolist() == [1.0] * 16
+    assert eta[16:].tolist() == pytest.approx([1, 0.811, 0.586, 0.318], abs=5e-4)
+    # It falls with rank, and never leaves [0, 1].
+    steep = soft_vector(torch.tensor([5.0]), 20, 16)
+    assert (steep.diff() <= 0).all() and steep.min() >= 0 and steep.max() <= 1
+
+
+def test_nothing_moves_at_rest_without_gravity():
+    anchors = bar()
+    model = model_of(anchors, anchors[:3] + 0.005, gravity=0.0)
+    still = np.repeat((anchors[:3] + 0.005)[None], 5, axis=0)
+    moved, reason = roll_out(model, still, "cpu")
+    assert not reason
+    # Elongations below the slack exert nothing: what is left is rounding of the links' lengths.
+    assert float((moved - moved[0]).abs().max()) < 1e-6
+
+
+def test_a_dropped_object_comes_to_rest_on_the_ground():
+    anchors = bar(height=0.02)
+    far = np.full((1, 3), 9.0)
+    model = model_of(anchors, far, replace(SMALL, stiffness=200.0))
+    moved, reason = roll_out(model, np.repeat(far[None], 40, axis=0), "cpu")
+    assert not reason and torch.isfinite(moved).all() and float(moved.abs().max()) < 1
+    assert float(moved[:, :, 2].min()) == 0.0
+    assert float((moved[-1] - moved[-2]).abs().max()) < 1e-3
+
+
+def test_upside_down_the_same_happens_below():
+    anchors, far = bar(height=0.02), np.full((1, 3), 9.0)
+    hands = np.repeat(far[None], 10, axis=0)
+    up, _ = roll_out(model_of(anchors, far), hands, "cpu")
+    mirror = np.array([1.0, 1.0, -1.0])
+    down, _ = roll_out(model_of(anchors * mirror, far, up_sign=-1.0), hands, "cpu")
+    torch.testing.assert_close(down * torch.tensor(mirror, dtype=torch.float32), up)
+
+
+def test_springs_are_directed():
+    """An anchor that is nobody's neighbour feels others and does not move them."""
+    near = bar()[:24]
+    lone = near.mean(axis=0, keepdims=True) + np.array([0, 0, 1.0])
+    graph = AnchorGraph.of(np.concatenate([near, lone]), np.full((1, 3), 9.0), 4, 0.04, 50)
+    assert (graph.neighbours != 24).all()
+    physics = AnchorPhysics(FRAME, gravity=0.0, ground=False)
+    x = torch.tensor(graph.anchors, dtype=torch.float64)
+    x[24, 2] += 0.01
+    hand = torch.full((1, 3), 9.0, dtype=torch.float64)
+    after, _ = AnchorSolver(graph, physics, 20, dtype=torch.float64).frame(parameters(25, 4), x, torch.zeros_like(x), hand, hand)
+    assert float((after[24] - x[24]).norm()) > 1e-4
+    assert float((after[:24] - x[:24]).abs().max()) < 1e-6
+
+
+def parameters(anchors: int, ranks: int, dtype: torch.dtype = torch.float64) -> AnchorParameters:
+    soft = torch.linspace(1, 0.3, ranks, dtype=dtype)
+    scalars = (torch.tensor(value, dtype=dtype) for value in (0.02, 0.5))
+    return AnchorParameters(torch.full((anchors,), 100.0, dtype=dtype), soft, *scalars)
+
+
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 3e-5)])
+def test_a_frame_and_its_gradient_are_those_of_the_reference(dtype, close):
+    anchors = bar(height=0.0)
+    controllers = anchors[:3] + 0.01
+    graph = AnchorGraph.of(anchors, controllers, 8, 0.04, 5)
+    physics = AnchorPhysics(FRAME, link_stiffness=300.0)
+    solver, draw = AnchorSolver(graph, physics, 20, dtype=dtype), torch.Generator().manual_seed(0)
+    noise = torch.randn(2, len(anchors), 3, generator=draw, dtype=torch.float64).to(dtype)
+    x, v = torch.tensor(graph.anchors, dtype=dtype) + 0.002 * noise[0], 0.1 * noise[1]
+    found = parameters(len(anchors), 8, dtype)
+    leaves = [x, v, found.stiffness, found.soft, found.damping, found.friction]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    begin = torch.tensor(controllers, dtype=dtype)
+    end = begin + 0.003
+
+    def slowly():
+        at, speed = x, v
+        for k in range(20):
+            f = (k + 1) / 20
+            at, speed = reference.substep(graph, physics, found, at, speed, begin * (1 - f) + end * f, FRAME / 20)
+        return at, speed
+
+    results = []
+    for at, speed in (slowly(), solver.frame(found, x, v, begin, end)):
+        loss = 100 * at.square().sum() + (speed * torch.arange(3)).sum()
+        results.append([at.detach(), speed.detach(), *torch.autograd.grad(loss, leaves)])
+    assert (results[0][0][:, 2] == 0).any(), "the ground is part of it"
+    for wanted, received in zip(*results, strict=True):
+        torch.testing.assert_close(received, wanted, rtol=0, atol=close * float(wanted.abs().max()))
+
+
+def test_a_gradient_after_another_frame_is_still_its_own():
+    anchors = bar()
+    model = model_of(anchors, anchors[:3] + 0.005, replace(SMALL, link_stiffness=300.0))
+    solver = AnchorSolver(model.graph, model.physics, 30, dtype=torch.float64)
+    x = torch.tensor(model.anchors, dtype=torch.float64, requires_grad=True)
+    hand, found = torch.tensor(anchors[:3] + 0.005), parameters(72, 12)
+
+    def gradient(between: bool) -> torch.Tensor:
+        after, speed = solver.frame(found, x, torch.zeros_like(x), hand, hand)
+        if between:
+            solver.frame(found, x + 0.01, speed, hand, hand)
+        return torch.autograd.grad(after.square().sum(), x)[0]
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=0, atol=0)
+
+
+def test_binding_by_absolute_positions_shrinks_what_follows_and_says_so():
+    anchors = bar()
+    binding = Binding.of(anchors + 0.004, anchors, 16)
+    np.testing.assert_allclose(binding.weights.sum(axis=1), 1, rtol=1e-6)
+    bound = (anchors[binding.indices] * binding.weights[..., None]).sum(axis=1)
+    facts = contraction(anchors + 0.004, bound)
+    assert facts["frame0_size_ratio"] < 0.95 and facts["frame0_shift"] > 0.004
+    assert contraction(anchors, anchors) == {"frame0_shift": 0.0, "frame0_size_ratio": 1.0}
+
+
+def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
+    points = np.random.default_rng(0).uniform(0, 0.05, (4000, 3))
+    few = choose_anchors(points, 50, (0.01, 0.001), np.random.default_rng(1))
+    assert len(few) == 50 and len(np.unique(np.floor(few / 0.01), axis=0)) == 50
+    many = choose_anchors(points, 500, (0.01, 0.001), np.random.default_rng(1))
+    assert len(np.unique(many, axis=0)) == 500
+    # There are no more cells than points.
+    assert len(choose_anchors(points[:10], 50, (0.01, 0.001), np.random.default_rng(1))) <= 10
+
+
+def test_too_few_anchors_are_refused():
+    with pytest.raises(InputError, match=r"more anchors than neighbours \(20\) are required; received 3"):
+        AnchorGraph.of(bar()[:3], np.zeros((1, 3)), 20, 0.04, 50)
+
+
+def swing(frames: int) -> np.ndarray:
+    """Three controllers [T, 3, 3], m, at the bar's end, that move up and down."""
+    height = 0.02 * np.sin(0.2 * np.arange(frames))
+    return (bar()[:3] + 0.001)[None] + height[:, None, None] * [0, 0, 1]
+
+
+def test_what_the_model_made_itself_is_fitted_back():
+    hands = swing(12)
+    start = model_of(bar(), hands[0])
+    truth = replace(start, kappa=np.full(72, 3.1), theta=np.full(1, np.exp(1.3)))
+    seen, _ = roll_out(truth, hands, "cpu")
+
+    def objective(iteration, frame, anchors):
+        return 1e4 * (anchors - seen[frame]).square().sum(dim=1).mean()
+
+    settings = replace(SMALL, iterations=40, stiffness_rate=0.005, damping_rate=0.002, velocity_rate=1e-5)
+    trained = run(Problem(start, hands.astype(np.float32), objective, settings))
+    before, after = ((roll_out(model, hands, "cpu")[0] - seen).norm(dim=2).mean() for model in (start, trained.model))
+    assert not trained.failure
+    assert after < 0.15 * before
+
+
+def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(capsys):
+    hands = swing(6)
+    start = model_of(bar(), hands[0])
+
+    def objective(iteration, frame, anchors):
+        return anchors.square().sum()
+
+    settings = replace(SMALL, iterations=2, substeps=10, substeps_added=150, max_substeps=160)
+    trained = run(Problem(replace(start, substeps=10), hands.astype(np.float32), objective, settings))
+    assert not trained.failure and trained.model.substeps == 160
+    assert "160 substeps from here on" in capsys.readouterr().out
+    stiff = replace(start, kappa=np.full(72, 7.0), substeps=10)
+    failed = run(Problem(stiff, hands.astype(np.float32), objective, settings))
+    assert failed.failure.startswith("training ended early: the anchors left the scene (iteration 0, frame 1, 160 substeps)")
+    np.testing.assert_array_equal(failed.model.kappa, stiff.kappa)
+
+
+def test_a_killed_training_continues_to_the_same_model(tmp_path):
+    hands = swing(6)
+    start = model_of(bar(), hands[0])
+    partial = tmp_path / "partial.npz"
+
+    def objective(iteration, frame, anchors):
+        if iteration == stop:
+            raise KeyboardInterrupt
+        return anchors.square().sum()
+
+    settings = replace(SMALL, iterations=4, checkpoint_every=1, substeps=50, substeps_raised=(1,))
+    stop = 4
+    whole = run(Problem(start, hands.astype(np.float32), objective, settings))
+    stop = 2
+    with pytest.raises(KeyboardInterrupt):
+        run(Problem(start, hands.astype(np.float32), objective, settings), partial, "key")
+    stop = 4
+    continued = run(Problem(start, hands.astype(np.float32), objective, settings), partial, "key")
+    assert continued.attempts == 2 and continued.model.substeps == 100
+    for name in ("kappa", "soft", "theta", "rho", "velocity"):
+        np.testing.assert_array_equal(getattr(continued.model, name), getattr(whole.model, name))
+    assert continued.history.equals(whole.history)

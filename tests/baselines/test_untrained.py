@@ -1,0 +1,54 @@
+"""The two reference points: frame 0 held, and the object skinned to the controllers."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neuspring import metrics
+from neuspring.artifacts import Trajectory
+from neuspring.baselines.untrained import controller_lbs, static
+from tests import small
+
+
+def test_static_holds_frame_0():
+    seen = small.observations()
+    found = static(seen).trajectory
+    assert found.positions.shape == (seen.scenario.frame_count, len(seen.nodes), 3)
+    assert (found.positions == seen.nodes).all()
+
+
+def test_controllers_that_move_as_a_body_carry_the_object_along():
+    seen = small.observations()
+    frames = seen.scenario.frame_count
+    turns = Rotation.from_euler("xyz", np.linspace(0, [0.3, -0.2, 0.5], frames))
+    shifts = np.linspace(0, [0.1, 0.2, -0.1], frames)
+    # The hand of this scene is flat; three more controllers make it a body.
+    flat = seen.controller_points[0]
+    hand = np.concatenate([flat, flat[:3] + np.array([0.01, 0.02, 0.03])])
+    moved = np.stack([turn.apply(hand) + shift for turn, shift in zip(turns, shifts, strict=True)])
+    found = controller_lbs(replace(seen, controller_points=moved), "cpu").trajectory.positions
+    wanted = np.stack([turn.apply(seen.nodes) + shift for turn, shift in zip(turns, shifts, strict=True)])
+    np.testing.assert_allclose(found, wanted, atol=2e-4)
+
+
+def test_neither_sees_more_than_frame_0_of_the_object():
+    seen = small.observations()
+    spoiled = replace(seen, object_points=np.concatenate([seen.object_points[:1], seen.object_points[1:] + 1.0]))
+    for method in (static, lambda observations: controller_lbs(observations, "cpu")):
+        np.testing.assert_array_equal(method(seen).trajectory.positions, method(spoiled).trajectory.positions)
+
+
+def test_what_ended_early_is_held_at_its_last_frame():
+    seen = small.observations()
+    frames = seen.scenario.frame_count
+    known = seen.nodes + np.arange(3)[:, None, None] * np.array([0.01, 0, 0])
+    ended = Trajectory(positions=known, frame_count=frames, diverged_frame=3, reason="test")
+    whole = metrics.held(ended, seen)
+    assert whole.diverged_frame is None and len(whole.positions) == frames
+    np.testing.assert_array_equal(whole.positions[:3], ended.positions)
+    assert (whole.positions[3:] == ended.positions[2]).all()
+    # Without any frame, the rest state is what is left.
+    nothing = Trajectory(positions=known[:0], frame_count=frames, diverged_frame=0, reason="test")
+    for lost in (None, nothing):
+        assert (metrics.held(lost, seen).positions == seen.nodes).all()
