@@ -6,7 +6,8 @@ Each reads artefacts, computes, writes artefacts, pictures and a record, like th
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from neuspring import config, figures_images, image_metrics
-from neuspring.artifacts import Observations, Trajectory
+from neuspring.artifacts import Observations, SplatCentres, Trajectory
 from neuspring.config import Config
 from neuspring.config_images import Images
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
@@ -30,19 +31,22 @@ from neuspring.lpips_weights import configured
 from neuspring.perception.lift import clean_masks, lifting_cameras
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior, masks_of_cameras
 from neuspring.physics.solver import resolve_device
-from neuspring.pictures import BLACK, COVERED, WHITE, Scored, moved, picture, save_picture, turned, view_of
+from neuspring.pictures import BLACK, COVERED, WHITE, Scored, moved, picture, placed, save_picture, turned, view_of
 from neuspring.progress import Progress
 from neuspring.records import StageRecord, Stopwatch, digest_file
+from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import REFERENCE_WIDTH
 from neuspring.splats.losses import Shot
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterise import choose_backend
-from neuspring.splats.train import first_splats, restricted, train
+from neuspring.splats.train import NEAREST, first_splats, restricted, train
 from neuspring.video import Video
 
 VIDEOS = ("video", "turntable")
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
+ALPHA, ALPHA_POINTS, GREY = 0.03, 10_000, 0.5
+"""Of `start: alpha`: m, how many points, their shade, as in the public adaptation of Spring-Gaus."""
 OWN_SETTINGS = ("backend", "appearance")
 """Keys of `images` that training uses, beside the quirk `corner_pixels`."""
 
@@ -71,7 +75,8 @@ def learn(
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
     seen = _seen_points(capture, loaded, settings, seed, width, lifted_record, observations_path)
     _require_outside(capture, np.concatenate([seen.cloud, seen.prior]))
-    points, colours = seen.first()
+    chosen_start = images.appearance.start
+    points, colours = seen.first(chosen_start, seed)
     plain = config.plain(settings)
     read = {"capture": folder / CAPTURE, **{f"masks{k}": path for k, path in enumerate(masks)}}
     read |= {"lift": lifted_record} if lifted_record else {}
@@ -99,6 +104,7 @@ def learn(
     facts: dict[str, Any] = {
         "splats": len(trained.splats.means),
         "first_splats": trained.first,
+        "start": "seen: no shape prior" if chosen_start == "shape_prior" and not seen.has_prior else chosen_start,
         "iterations": images.appearance.iterations,
         "loss": trained.history["loss"][-1],
         "backend": backend,
@@ -125,7 +131,8 @@ def render(
 ) -> None:
     """Splats moved as a trajectory says -> frames.parquet (metrics per frame and camera), images.png, videos, render.json.
 
-    A stage that failed before is passed on; a trajectory that diverged is drawn as far as it goes.
+    A stage that failed before is passed on; a trajectory that diverged is shown as far as it goes; its last frame is held and
+    scored on, for averages over all runs.
     """
     clock, device, images = Stopwatch(), resolve_device(device), settings.images
     before = {"appearance": StageRecord.load(appearance_record), "rollout": StageRecord.load(rollout_record)}
@@ -151,30 +158,31 @@ def render(
     trajectory = Trajectory.load(rollout.file("trajectory", rollout_record)) if "trajectory" in rollout.files else None
     if trajectory is None or not len(trajectory.positions):
         return failed(rollout.reason)
+    drawn = len(trajectory.positions)
     try:
-        splats = restricted(Splats.load(learned.file("splats", appearance_record)), images.opacity)
+        splats, posed = _posed(appearance_record, rollout_record, trajectory, images, device)
     except NumericalFailure as failure:
         return failed(str(failure))
     rows: list[dict[str, Any]] = []
-    strip = figures_images.Strip(scenario, len(trajectory.positions))
+    strip = figures_images.Strip(scenario, drawn)
     film, first = figures_images.Film(scenario), next(iter(scored.views))
     files = {role: output.with_name(f"{role}.mp4") for role in (VIDEOS if images.video else ())}
-    progress = Progress("render", len(trajectory.positions))
+    progress = Progress("render", scenario.frame_count)
     with contextlib.ExitStack() as stack:
         videos = {role: stack.enter_context(Video(path, scenario.frame_rate)) for role, path in files.items()}
-        for frame, gaussians in enumerate(moved(splats, trajectory.positions, images, device)):
+        for frame, gaussians in enumerate(_held(posed, scenario.frame_count)):
             for name in scored.views:
                 if not capture.has(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
                 found = _scores(pair, metric, images.released_quirks.unit_lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in found.items()]
-                if name == first:
+                if name == first and frame < drawn:
                     strip.add(frame, pair)
                     if videos:
                         videos["video"].add(film.compared(frame, pair))
-            if videos:
-                angle = 360 * frame / len(trajectory.positions)
+            if videos and frame < drawn:
+                angle = 360 * frame / drawn
                 videos["turntable"].add(film.turned(frame, turned(gaussians, scored.views[first], scored.backend, angle)))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
@@ -189,7 +197,7 @@ def render(
         "quirks": sorted(name for name, on in config.plain(images.released_quirks).items() if on),
         "unseen_surface": learned.facts["unseen_surface"],
         # Nothing but black on both sides: such frames have no finite PSNR.
-        "empty_frames": int(np.isinf(table["value"]).sum()),
+        "empty_frames": int(np.isinf(table.loc[table["frame"] < drawn, "value"]).sum()),
     }
     clock.stage("render", rollout.status, files, reason=rollout.reason, facts=facts, **common).save(output)
 
@@ -212,20 +220,46 @@ def draw(
     device, images, capture = resolve_device(device), settings.images, Capture.load(folder)
     if camera not in capture.cameras:
         raise InputError("--camera", f"must be a camera of {folder / CAPTURE}: {', '.join(capture.cameras)}", camera)
-    learned, rollout = StageRecord.load(appearance_record), StageRecord.load(rollout_record)
-    positions = Trajectory.load(rollout.file("trajectory", rollout_record)).positions
-    wanted = range(len(positions)) if frames is None else frames
-    beyond = [frame for frame in wanted if not 0 <= frame < len(positions)]
-    if beyond or not len(positions):
-        raise InputError("--frames", f"the trajectory has the frames 0 to {len(positions) - 1}", beyond)
-    splats = restricted(Splats.load(learned.file("splats", appearance_record)), images.opacity)
+    rollout = StageRecord.load(rollout_record)
+    trajectory = Trajectory.load(rollout.file("trajectory", rollout_record))
+    count = len(trajectory.positions)
+    wanted = range(count) if frames is None else frames
+    beyond = [frame for frame in wanted if not 0 <= frame < count]
+    if beyond or not count:
+        raise InputError("--frames", f"the trajectory has the frames 0 to {count - 1}", beyond)
+    _, posed = _posed(appearance_record, rollout_record, trajectory, images, device)
     view, backend = view_of(capture.cameras[camera], images, device), choose_backend(images.backend, device)
     made = []
-    for frame, gaussians in enumerate(moved(splats, positions, images, device)):
+    for frame, gaussians in enumerate(posed):
         if frame in wanted:
             made.append(output / f"{frame:05d}.png")
             save_picture(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
     return made
+
+
+def _posed(
+    appearance_record: Path, rollout_record: Path, trajectory: Trajectory, images: Images, device: str
+) -> tuple[Splats, Iterator[Gaussians]]:
+    """Splats of frame 0, and in every frame: where the method's own model puts them, else skinned to the trajectory.
+
+    Raises NumericalFailure where no splat is opaque enough to be moved.
+    """
+    splats = Splats.load(StageRecord.load(appearance_record).file("splats", appearance_record))
+    rollout = StageRecord.load(rollout_record)
+    if "centres" not in rollout.files:
+        splats = restricted(splats, images.opacity)
+        return splats, moved(splats, trajectory.positions, images, device)
+    return splats, placed(splats, SplatCentres.load(rollout.file("centres", rollout_record)).positions, device)
+
+
+def _held(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:
+    """`count` frames: the last one again and again where there are fewer."""
+    last = None
+    for last in itertools.islice(frames, count):
+        count -= 1
+        yield last
+    if last is not None:
+        yield from itertools.repeat(last, count)
 
 
 def _scores(pair: figures_images.Pair, lpips: Lpips | str, unit_lpips: bool) -> dict[str, float]:
@@ -272,11 +306,22 @@ class _Seen:
     uniform: bool
     """Whether the prior's points are uniform over its surface, so that their share is one of area."""
 
-    def first(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points [R, 3] m and RGB [R, 3]: what was seen, and where nothing was the prior, in the colours of what is nearest."""
+    def first(self, start: Literal["seen", "shape_prior", "alpha"], seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where splats begin, [R, 3] m, and their RGB [R, 3]. Raises InputError for `alpha` where what is seen is flat."""
+        if start == "alpha":
+            points = points_within(self.cloud, ALPHA, ALPHA_POINTS, seed)
+            return points, np.full_like(points, GREY)
         distance, nearest = self._to_cloud
+        if start == "shape_prior" and self.has_prior:
+            return self.prior, self.colours[nearest]
+        # What was seen, and where nothing was the prior, in the colours of what is nearest.
         new = distance > self.reach
         return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colours, self.colours[nearest[new]]])
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether there are points enough of a prior for splats to begin with."""
+        return len(self.prior) > NEAREST
 
     @property
     def hidden(self) -> float | None:

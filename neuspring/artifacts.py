@@ -425,3 +425,11 @@ class Trajectory(Artifact):
         expected = self.frame_count if self.diverged_frame is None else self.diverged_frame
         if frames != expected:
             raise InputError("trajectory.positions", f"{expected} frames are expected", frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatCentres(Artifact):
+    """Where a method's own model puts its splats; their other properties are those of frame 0."""
+
+    kind: ClassVar[str] = "splat_centres"
+    positions: np.ndarray = array("F,G,3", np.float32, "m", "centre of each splat at the end of each frame")

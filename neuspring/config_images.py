@@ -21,6 +21,11 @@ class Appearance:
     """Optimiser steps, one view each, views drawn without replacement."""
     isotropic: bool = True
     """One scale per splat; false: one per axis."""
+    fixed_radius: Positive | None = None
+    """Standard deviation of every splat, m, which is not trained; null: trained, from the distance to the nearest others."""
+    start: Literal["seen", "shape_prior", "alpha"] = "seen"
+    """First splats. seen: points that were seen, and the shape prior's where nothing was. shape_prior: the prior's surface alone;
+    without a prior, as seen, which the run's notes say. alpha: grey, at random within the alpha shape of the seen points."""
     degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Of the harmonics at the end."""
     degree_every: Count = 1000
@@ -74,6 +79,10 @@ class Appearance:
     """Steps between resets of all opacities to at most 0.01."""
     most_splats: Count = 300_000
     """No more are made."""
+
+    def __post_init__(self) -> None:
+        if self.fixed_radius is not None and not self.isotropic:
+            raise ValueError("fixed_radius: splats of one radius are isotropic, received isotropic: false")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -42,6 +42,16 @@ def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) ->
     skin = Skin(positions[0], device=device, frozen=images.frozen_skinning, released_degeneracy=quirk)
     for means, quaternions in skin.carry(positions, start.means, start.quaternions):
         yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
+
+
+def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussians]:
+    """The splats, unturned, with given centres [F, G, 3], m, in every frame."""
+    start = Gaussians.of(splats, device)
+    if centres.shape[1] != len(splats.means):
+        rule = f"one centre for each of {len(splats.means)} splats is required"
+        raise InputError("splat centres", rule, centres.shape[1], "Splats and rollout must be of the same method and seed.")
+    for means in torch.tensor(centres, device=device):
+        yield replace(start, means=means)
 
 
 @torch.no_grad()

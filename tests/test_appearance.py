@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neuspring import appearance, metrics
-from neuspring.artifacts import Trajectory
+from neuspring.artifacts import SplatCentres, Trajectory
 from neuspring.config import Config
 from neuspring.config_images import Appearance, ImageQuirks, Images, LpipsWeights
 from neuspring.data.capture import HANDS, Capture
@@ -150,10 +150,15 @@ def test_one_camera_that_misses_frames_and_z_down(tmp_path):
         made.render(made.roll(STEP, "two"), settings(released_quirks=ImageQuirks(second_camera_intrinsics=True)))
 
 
-def test_a_diverged_rollout_is_drawn_as_far_as_it_goes(scene):
+def test_a_diverged_rollout_is_shown_as_far_as_it_goes_and_held_for_averages_over_all_runs(scene):
     record, table = scene.render(scene.roll(STEP, "diverged", frames=4), settings())
     assert (record.status, record.reason) == ("failed", "rollout: test")
-    assert table["frame"].max() == 3
+    with av.open(scene.folder / "diverged" / "video.mp4") as video:
+        assert sum(1 for _ in video.decode(video=0)) == 4
+    _, whole = scene.render(scene.roll(STEP, "whole"), settings())
+    assert mean(table, "iou", 3) == mean(whole, "iou", 3)
+    # The picture of frame 3 against what is seen in frame 5.
+    assert mean(table, "iou", FRAMES - 1) < mean(whole, "iou", FRAMES - 1)
     # Reconstruction is frames 1 to 3, the future 4 and 5.
     scores = metrics.score_images(table, scene.observations.scenario, 4, "m", 0)
     assert set(scores["task"]) == {"reconstruction"}
@@ -191,6 +196,25 @@ def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_p
     assert np.isfinite(scores["value"]).all()
     assert scores.loc[("reconstruction", "psnr"), "frames"] == 2
     assert scores.loc[("reconstruction", "ssim"), "frames"] == 3
+
+
+def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
+    rollout = scene.roll(0 * STEP, "own")
+    splats = Splats.load(scene.appearance.with_name("splats.ply"))
+    path = rollout.with_name("centres.npz")
+    SplatCentres(positions=splats.means + np.arange(FRAMES)[:, None, None] * STEP).save(path)
+    before = StageRecord.load(rollout)
+    files = {"trajectory": rollout.with_name("trajectory.npz"), "centres": path}
+    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    record, drawn = scene.render(rollout, settings())
+    # The nodes stand still, the splats do not; all of them are drawn, also faint ones.
+    assert record.facts["splats"] == len(splats.means)
+    assert mean(drawn, "iou", FRAMES - 1) > 0.85
+    SplatCentres(positions=splats.means[None, 1:]).save(path)
+    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    with pytest.raises(InputError, match="one centre for each of"):
+        scene.render(rollout, settings())
+    before.save(rollout)
 
 
 def test_pictures_of_any_camera_and_frame(scene, tmp_path):

@@ -71,7 +71,8 @@ def densify(
     if int(coarse.sum()) > room:
         mean = statistics.pull / statistics.seen.clamp_min(1)
         coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean, room).indices, True) & coarse
-    split = coarse & (size > settings.split_size * extent)
+    # What is split gets smaller, so splats of a fixed radius are cloned.
+    split = coarse & (size > settings.split_size * extent) & (settings.fixed_radius is None)
     clone = coarse & ~split
     added = {name: tensor[clone] for name, tensor in splats.items()}
     if split.any():
@@ -91,6 +92,6 @@ def densify(
 def _superfluous(splats: Mapping[str, torch.Tensor], settings: Appearance, extent: float, after_reset: bool) -> torch.Tensor:
     """Faint splats [N], after a reset also huge ones."""
     faint = torch.sigmoid(splats["opacity_logits"]) < settings.prune_opacity
-    if not after_reset:
+    if not after_reset or settings.fixed_radius:
         return faint
     return faint | (torch.exp(splats["log_scales"]).amax(1) > settings.prune_size * extent)

@@ -54,14 +54,16 @@ def first_splats(points: np.ndarray, colours: np.ndarray, settings: Appearance, 
         points, colours = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
     if len(points) <= NEAREST:
         raise InputError("appearance, points of frame 0", f"more than {NEAREST} points are needed to begin with", len(points))
-    near = cKDTree(points).query(points, k=NEAREST + 1)[0][:, 1:].mean(axis=1)
+    near = np.maximum(cKDTree(points).query(points, k=NEAREST + 1)[0][:, 1:].mean(axis=1), SMALLEST)
+    if settings.fixed_radius is not None:
+        near = np.full(len(points), settings.fixed_radius)
     count, coefficients = len(points), (settings.degree + 1) ** 2
     shades = np.zeros((count, coefficients, 3))
     shades[:, 0] = (colours - 0.5) / harmonics.C0
     return Splats(
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        log_scales=np.tile(np.log(np.maximum(near, SMALLEST))[:, None], (1, 1 if settings.isotropic else 3)),
+        log_scales=np.tile(np.log(near)[:, None], (1, 1 if settings.isotropic else 3)),
         opacity_logits=np.full(count, math.log(settings.opacity / (1 - settings.opacity))),
         harmonics=shades,
     )
@@ -137,7 +139,7 @@ class _Optimiser:
         rates = {
             "means": settings.position_rate * extent,
             "quaternions": settings.rotation_rate,
-            "log_scales": settings.scale_rate,
+            "log_scales": 0.0 if settings.fixed_radius else settings.scale_rate,
             "opacity_logits": settings.opacity_rate,
             "base": settings.colour_rate,
             "bands": settings.colour_rate / 20,

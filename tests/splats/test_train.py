@@ -12,6 +12,7 @@ from neuspring.data.synthetic.make import looking
 from neuspring.errors import InputError, NumericalFailure
 from neuspring.image_metrics import psnr
 from neuspring.splats import harmonics
+from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
@@ -201,6 +202,34 @@ def test_the_first_splats_follow_the_points():
     assert fewer.log_scales.mean() > every.log_scales.mean()
     with pytest.raises(InputError, match="more than 3 points"):
         first_splats(points[:2], colours[:2], Appearance(), 0.002)
+
+
+def test_a_fixed_radius_stays_whatever_is_trained():
+    shots = [shot_of(known_splats(), view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    chosen = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004, densify_from=10, densify_every=10, densify_until=60)
+    chosen = dataclasses.replace(chosen, densify_gradient=1e-6, split_size=1e-4)
+    start = first_splats(known_splats().means, np.full((200, 3), 0.5), chosen, 0.01)
+    found = train(start, shots, chosen, 0, "warp")
+    assert len(found.splats.means) > 200, "what is too coarse is cloned, however large"
+    np.testing.assert_allclose(np.exp(found.splats.log_scales), 0.004, rtol=1e-6)
+    with pytest.raises(ValueError, match="splats of one radius are isotropic"):
+        Appearance(fixed_radius=0.003, isotropic=False)
+
+
+def test_points_within_an_alpha_shape_fill_the_body_and_no_gap():
+    rng = np.random.default_rng(0)
+    # Two boxes with a gap that is wider than alpha.
+    boxes = [rng.uniform([offset, 0, 0], [offset + 0.05, 0.05, 0.05], (400, 3)) for offset in (0.0, 0.15)]
+    cloud = np.concatenate(boxes)
+    points = points_within(cloud, 0.03, 2000, 0)
+    inside = [((points >= box.min(axis=0)) & (points <= box.max(axis=0))).all(axis=1) for box in boxes]
+    assert (inside[0] | inside[1]).all()
+    assert abs(inside[0].mean() - 0.5) < 0.05
+    np.testing.assert_allclose(points[inside[0]].mean(axis=0), 0.025, atol=0.002)
+    np.testing.assert_array_equal(points, points_within(cloud, 0.03, 2000, 0))
+    for bad in (cloud * [1, 1, 0], 100 * cloud, cloud[:3]):
+        with pytest.raises(InputError, match=r"must enclose a volume at alpha = 0\.03 m"):
+            points_within(bad, 0.03, 10, 0)
 
 
 def test_the_extent_is_that_of_the_cameras():
