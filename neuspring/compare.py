@@ -19,7 +19,8 @@ from neuspring.config import Tracking
 from neuspring.errors import InputError
 from neuspring.files import write_text
 from neuspring.metrics import TASKS, UNITS
-from neuspring.tables import SHOWN, markdown, paired_differences
+from neuspring.tables import paired_differences
+from neuspring.tables_layout import SHOWN, markdown
 from neuspring.tracking_query import LoggedRun, logged_runs
 
 DIRTY = "-dirty"

@@ -74,6 +74,8 @@ class Explanation:
     """What the table says."""
     runs: Sequence[Behind]
     left_out: Sequence[Behind]
+    not_applying: Sequence[str] = ()
+    """Scenarios to which the method does not apply, so that it has no runs there."""
 
     @property
     def problems(self) -> list[str]:
@@ -96,9 +98,9 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
     """
     made, table = _find_table(cell, folder)
     label, task, metric = _find_cell(cell, made, table)
-    found = of_study(made.study, collect(results, made.scenarios, made.methods, made.seeds))
+    found = of_study(made.study, collect(results, made.scenarios, made.methods, made.seeds, made.left_out))
     wanted = (found.scores["task"] == task) & (found.scores["metric"] == metric)
-    own = Collected(found.scores[wanted], found.runs)
+    own = Collected(found.scores[wanted], found.runs, left_out=found.left_out)
     rows = _records(_only(cells(made.study, own), label, task, metric))
     if not rows:
         remedy = f"Make the table again: snakemake {made.name}."
@@ -122,6 +124,7 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
         in_table=None if before.isna().all() else float(before.iloc[0]),
         runs=runs,
         left_out=left,
+        not_applying=tuple(found.left_out.get(method, ())),
     )
 
 
@@ -252,9 +255,12 @@ def departures(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Stage -> settings, as flat names of those that differ from the defaults; what has no default is always named."""
     defaults = config.plain(config.Config())
     pictures = defaults["images"] | {"lift": defaults["perception"]["lift"]}
+    models = {None: defaults, **defaults["baselines"]}
     found: dict[str, Any] = {}
     for stage, values in settings.items():
-        _compare(values, pictures if stage in PICTURE_STAGES else defaults, stage, found)
+        # What trains a baseline's model has the settings of its section side by side.
+        of_model = models.get(values.get("model"), defaults)
+        _compare(values, pictures if stage in PICTURE_STAGES else of_model, stage, found)
     return {name: value for name, value in sorted(found.items()) if not name.endswith(".seed")}
 
 
@@ -274,5 +280,8 @@ def rerun(results: Path, scenario: str, method: str, seed: int, record: Mapping[
     words += ["--configfile", *configfiles] if configfiles else []
     words += ["--config", f"results={results}", f"only=scenario={scenario} method={method} seed={seed}"]
     if record:
-        words += [f"device={str(record['device']).partition(':')[0]}", "--forcerun", *record["settings"], "score"]
+        # A baseline's model has a rule of its own for its rollout.
+        model = record["variant"].get("model")
+        rules = ["predict" if model and stage == "rollout" else stage for stage in record["settings"]]
+        words += [f"device={str(record['device']).partition(':')[0]}", "--forcerun", *rules, "score"]
     return shlex.join(words)

@@ -13,7 +13,8 @@ import numpy as np
 from neuspring.explain import Behind, Explanation
 from neuspring.paper import MEASURES, Measure
 from neuspring.records import canonical
-from neuspring.tables import markdown
+from neuspring.tables_held import left_out_lines
+from neuspring.tables_layout import markdown
 from neuspring.tables_render import number, our_change, paper_change
 
 SHORT = 12
@@ -25,7 +26,9 @@ def text(found: Explanation) -> str:
     measure = MEASURES[found.row["metric"]]
     lines = [f"{found.cell} (method {found.row['method']})", "", *_value(found, measure), ""]
     lines += _runs(found.runs)
-    if not found.runs and not found.left_out:
+    if found.not_applying:
+        lines += ["", *left_out_lines({found.row["method"]: found.not_applying})]
+    elif not found.runs and not found.left_out:
         lines.append(f"{found.row['method']} was not among the methods of the benchmark.")
     if found.left_out:
         lines += ["", f"Left out: {len(found.left_out)}", ""]

@@ -32,7 +32,11 @@ LOG_FROM = 3.0
 SERIES = {
     "search": (("cost", "candidates"), ("best_cost", "best so far")),
     "fit": (("loss", "frames trained on"), ("tail_loss", "held-back frames")),
+    "train": (("loss", "training loss"),),
 }
+"""Stage -> metrics of its history that are drawn, and their labels."""
+AXES = {"search": ("rollout", "training cost"), "fit": ("epoch", "loss [m$^2$]"), "train": ("step", "loss")}
+"""Stage -> labels of its axes. Losses of baselines are of several kinds: epochs or iterations, squared distances or silhouettes."""
 
 
 def run_figures(
@@ -102,12 +106,12 @@ def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     figure, axes = plt.subplots(1, len(histories), figsize=(3.6 * len(histories) + 1, 3.2), layout="constrained", squeeze=False)
     for axis, (stage, history) in zip(axes[0], histories.items(), strict=True):
         search = stage == "search"
-        for metric, label in SERIES["search" if search else "fit"]:
+        for metric, label in SERIES[stage]:
             rows = history[history["metric"] == metric]
             if len(rows):
                 single = "." if metric == "cost" or len(rows) == 1 else ""
                 axis.plot(rows["step"], rows["value"], ls="" if metric == "cost" else "-", marker=single, ms=4, label=label)
-        axis.set(title=stage, xlabel="rollout" if search else "epoch", ylabel="training cost" if search else "loss [m$^2$]")
+        axis.set(title=stage, xlabel=AXES[stage][0], ylabel=AXES[stage][1])
         _scale(axis, history, search)
         if axis.lines:
             axis.legend(frameon=False, fontsize=8)

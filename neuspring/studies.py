@@ -15,7 +15,7 @@ from neuspring.config_types import STRICT, Name
 from neuspring.errors import InputError
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
-TAKEN = ("summary", "scores", "runs", "averages", "differences", "transfers", "perception", "pictures")
+TAKEN = ("summary", "scores", "runs", "averages", "differences", "held", "transfers", "perception", "pictures")
 """Files that other commands write into the folder of tables."""
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -25,24 +25,11 @@ from neuspring.figures_ratios import ratios_figure
 from neuspring.files import write_atomically, write_text
 from neuspring.metrics import COLUMNS, averages
 from neuspring.records import RECORD_FORMAT, StageRecord, read_json
+from neuspring.tables_held import NOTHING, LeftOut, applying, both_averages, held_text, kept_line, left_out_lines, removed_lines
+from neuspring.tables_layout import HEADINGS, IMAGE_HEADINGS, SHOWN, TRANSFER_HEADINGS, Headings
+from neuspring.tables_layout import markdown as markdown
 
 RESAMPLES = 10_000
-MM = 1e3
-HEADINGS = {
-    ("reconstruction", "chamfer"): "Recon. CD",
-    ("reconstruction", "track_error"): "Recon. TE",
-    ("future", "chamfer"): "Future CD",
-    ("future", "track_error"): "Future TE",
-}
-IMAGE_HEADINGS = {
-    (task, metric): f"{short} {label}"
-    for task, short in (("reconstruction", "Recon."), ("future", "Future"))
-    for metric, label in (("psnr", "PSNR"), ("ssim", "SSIM"), ("lpips", "LPIPS"), ("iou", "IoU"))
-}
-TRANSFER_HEADINGS = {("transfer", "chamfer"): "Transfer CD", ("transfer", "track_error"): "Transfer TE"}
-Headings = Mapping[tuple[str, str], str]
-SHOWN = {"chamfer": (MM, 2), "track_error": (MM, 2), "psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (1.0, 4), "iou": (1.0, 3)}
-"""Metric -> factor and digits in tables."""
 NOT_COMPUTED = "not computed"
 RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
 LISTED = 12
@@ -57,25 +44,40 @@ class Collected:
 
     scores: pd.DataFrame
     runs: pd.DataFrame
+    held: pd.DataFrame = field(default_factory=lambda: _stacked([]))
+    """Scores of failed runs whose prediction stays at its last finite frame; runs of older records have none."""
+    left_out: LeftOut = field(default_factory=dict)
+    """Method -> the scenarios to which it does not apply, so that it has no runs there."""
 
 
-def collect(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
-    """Read the records of every (scenario, method, seed); a run without a record is missing, one with a damaged record failed."""
-    tables, rows = [], []
+def collect(
+    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], left_out: LeftOut = NOTHING
+) -> Collected:
+    """Read the records of every (scenario, method, seed); a run without a record is missing, one with a damaged record failed.
+
+    Where `left_out` says that a method does not apply to a scenario, there is no run at all.
+    """
+    scenarios, methods = tuple(scenarios), tuple(methods)
+    absent = applying(left_out, scenarios, methods)
+    tables, rows, held = [], [], []
     for identity, path in _records(results, scenarios, methods, seeds, "run.json"):
+        if identity["scenario"] in absent.get(identity["method"], ()):
+            continue
         if not path.is_file():
             rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished"})
             continue
         try:
-            facts, scores = _run(path)
+            facts, scores, kept = _run(path)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             facts = {"status": "failed", "reason": f"{DAMAGED}{' '.join(str(error).split()) or type(error).__name__}"}
         else:
             tables.append(scores)
+            held.append(kept)
         rows.append(identity | facts)
     columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
     runs = pd.DataFrame(rows, columns=list(columns))
-    return Collected(_stacked(tables), runs.fillna(dict.fromkeys(("notes", "source", "run_key"), "")))
+    runs = runs.fillna(dict.fromkeys(("notes", "source", "run_key"), ""))
+    return Collected(_stacked(tables), runs, _stacked(held), absent)
 
 
 def read_scores(path: Path) -> Collected:
@@ -103,15 +105,21 @@ def read_scores(path: Path) -> Collected:
     return Collected(scores, runs.assign(source=path.name, averaged=1, **nothing))
 
 
-def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """What a table needs of a run.json, and its scores. Raises OSError, ValueError, KeyError, TypeError for a damaged one."""
+def _run(path: Path) -> tuple[dict[str, Any], pd.DataFrame, pd.DataFrame]:
+    """What a table needs of a run.json, its scores, and those of a failed run's held prediction.
+
+    Raises OSError, ValueError, KeyError, TypeError for a damaged one.
+    """
     record = read_json(path, RECORD_FORMAT)
     facts = {name: record[name] for name in ("status", "reason", "source", "run_key")} | {"notes": "; ".join(record["notes"])}
     facts |= {f"seconds_{name}": value for name, value in record["timings"].items()}
     facts |= {f"memory_mb_{name}": value for name, value in record.get("peak_memory_mb", {}).items()}
     facts |= {"averaged": record.get("params", {}).get("rollout.result.averaged", 1), "images": json.dumps(record.get("images"))}
     facts["settings"] = json.dumps({name: _digest(values) for name, values in record.get("settings", {}).items()})
-    return facts, pd.read_parquet(path.parent / record["scores_file"])[list(COLUMNS)]
+    held = record.get("held_file") if record["status"] == "failed" else None
+    files = (record["scores_file"], held)
+    scores, kept = (pd.read_parquet(path.parent / name)[list(COLUMNS)] if name else _stacked([]) for name in files)
+    return facts, scores, kept
 
 
 def _digest(settings: Any) -> str:
@@ -173,7 +181,8 @@ def _stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
 def comparable(collected: Collected) -> pd.DataFrame:
     """Scores of the (scenario, seed) pairs that every method finished, so that averages compare like with like.
 
-    A method that finished no run at all (yet) takes no part.
+    A method that finished no run at all (yet) takes no part. `tables_held.removed_lines` says whose failures remove pairs, and
+    which methods do not apply to some scenarios.
     """
     good = collected.runs[collected.runs["status"] == "ok"]
     methods = good["method"].nunique()
@@ -247,6 +256,8 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     spread = ", ± standard deviation over seeds" if several else ""
     lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
+    if removed := removed_lines(collected.runs, collected.left_out):
+        lines += [" ".join([kept_line(scores, collected.runs), *removed]), ""]
     if warning := mixed_settings(collected.runs):
         lines += [f"**{warning}**", ""]
     lines += _method_table(methods, averages(scores) if len(scores) else pd.DataFrame(), counts, several)
@@ -265,6 +276,7 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     bad = collected.runs[collected.runs["status"] != "ok"]
     if len(bad):
         lines += ["", "Not in the averages:", "", *_not_counted(bad)]
+    lines += [line for text in left_out_lines(collected.left_out) for line in ("", text)]
     lines += _averaged_notes(collected.runs)
     noted = collected.runs[collected.runs["notes"] != ""]
     if len(noted):
@@ -492,18 +504,9 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> list[str]:
-    """Lines of a table whose columns are as wide as their widest cell."""
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-
-    def line(cells: list[str]) -> str:
-        return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
-
-    return [line(header), "|" + "|".join("-" * (width + 2) for width in widths) + "|", *map(line, rows)]
-
-
 def write(collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None) -> str:
-    """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, transfers.csv and summary.md; returns the summary.
+    """Write scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv, transfers.csv and summary.md; returns
+    the summary.
 
     Where a method can be compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md
     shows them.
@@ -513,7 +516,9 @@ def write(collected: Collected, baseline: str, folder: Path, transfers: Collecte
     averaged = averages(usable) if len(usable) else pd.DataFrame()
     differences = paired_differences(usable, baseline) if len(usable) else pd.DataFrame()
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
-    for name, table in {"scores": scores, "runs": collected.runs, "averages": averaged, "differences": differences}.items():
+    failures = both_averages(scores, collected.runs, collected.held)
+    written = {"scores": scores, "runs": collected.runs, "averages": averaged, "differences": differences, "held": failures}
+    for name, table in written.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     write_atomically(folder / "scores.parquet", lambda temporary: scores.to_parquet(temporary, index=False))
     summary = summary_text(collected, baseline, differences)
@@ -523,7 +528,8 @@ def write(collected: Collected, baseline: str, folder: Path, transfers: Collecte
     transferred = transfer_text(transfers, baseline) if transfers else ""
     transfer_scores = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
     write_text(folder / "transfers.csv", transfer_scores.to_csv(index=False))
-    text = f"# Scores\n\n{summary}{write_ratios(usable, differences, folder)}{transferred}{write_clusters(collected, folder)}"
+    text = f"# Scores\n\n{summary}{write_ratios(usable, differences, folder)}{held_text(failures)}{transferred}"
+    text += write_clusters(collected, folder)
     text += f"\n## Per scenario (errors in mm, seeds averaged)\n\n{details}\n## Time and memory (medians)\n\n{timings}"
     write_text(folder / "summary.md", text)
-    return summary
+    return summary + held_text(failures)

@@ -63,11 +63,18 @@ Estimates = dict[tuple[str, str, str], Estimate]
 def of_study(study: Study, collected: Collected) -> Collected:
     """The scores, in the paper's units, and the runs of a study's methods."""
     methods = list(study.rows.values())
-    scores = collected.scores[collected.scores["method"].isin(methods) & collected.scores["metric"].isin(list(MEASURES))]
-    factors = scores["metric"].map({name: measure.factor for name, measure in MEASURES.items()}).astype(float)
-    return Collected(
-        scores.assign(value=scores["value"].astype(float) * factors), collected.runs[collected.runs["method"].isin(methods)]
+    scores, held = (
+        table[table["method"].isin(methods) & table["metric"].isin(list(MEASURES))] for table in (collected.scores, collected.held)
     )
+    runs = collected.runs[collected.runs["method"].isin(methods)]
+    left_out = {name: where for name, where in collected.left_out.items() if name in methods}
+    return Collected(_scaled(scores), runs, _scaled(held), left_out)
+
+
+def _scaled(scores: pd.DataFrame) -> pd.DataFrame:
+    """In the paper's units."""
+    factors = scores["metric"].map({name: measure.factor for name, measure in MEASURES.items()}).astype(float)
+    return scores.assign(value=scores["value"].astype(float) * factors)
 
 
 def counted(own: Collected) -> pd.DataFrame:
@@ -92,7 +99,8 @@ def accounted(study: Study, own: Collected) -> pd.DataFrame:
         lacking = [m for m in begun if status.get((run.scenario, run.seed, m)) != "ok"]
         why = f"{run.status!s}: {run.reason!s}"
         if run.status == "ok":
-            names = ", ".join(f"{labels[m]} ({status.get((run.scenario, run.seed, m), 'missing')})" for m in lacking)
+            absent = {m: "does not apply" if run.scenario in own.left_out.get(m, ()) else "missing" for m in lacking}
+            names = ", ".join(f"{labels[m]} ({status.get((run.scenario, run.seed, m), absent[m])})" for m in lacking)
             why = f"not comparable, since without this scenario and seed: {names}" if lacking else ""
         identity = {"label": labels[str(run.method)], "scenario": run.scenario, "method": run.method, "seed": run.seed}
         rows.append(identity | {"status": run.status, "counted": not why, "why": why, "source": run.source, "run_key": run.run_key})

@@ -1,9 +1,9 @@
 """The tables of a study beside the paper's: CSV, Markdown and LaTeX from run records.
 
 Per study, in one folder: <study>.md and .tex (to read), .csv (a row per cell), _runs.csv (which runs count, and why not the
-others), _scenarios.csv, _categories.csv, .json (what the table was made of, for `neuspring explain`); where the released
-PhysTwin's method is a row, and its scenarios are among the runs, also _released_phystwin.csv and .md; for the number of regions
-_curve.png.
+others), _failures.csv (averages without and with failed runs), _scenarios.csv, _categories.csv, .json (what the table was made
+of, for `neuspring explain`); where the released PhysTwin's method is a row, and its scenarios are among the runs, also
+_released_phystwin.csv and .md; for the number of regions _curve.png.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +28,14 @@ from neuspring.records import RECORD_FORMAT, read_json
 from neuspring.studies import Study
 from neuspring.tables import Collected, collect
 from neuspring.tables_cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
+from neuspring.tables_held import NOTHING, LeftOut, both_averages, left_out_lines, removed_lines, unknown_lines
 from neuspring.tables_render import (
     PREAMBLE,
     Grid,
     as_latex,
     as_markdown,
     change_grid,
+    held_grid,
     interval_grid,
     main_grid,
     number,
@@ -68,6 +70,8 @@ class Made:
     methods: tuple[Name, ...]
     """Those of the study that the benchmark has."""
     seeds: tuple[int, ...]
+    left_out: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
+    """Method to the scenarios to which it does not apply."""
 
     def save(self, folder: Path) -> None:
         """Write <name>.json."""
@@ -88,11 +92,15 @@ def write_study(
     seeds: Sequence[int],
     known_methods: Iterable[str],
     folder: Path,
+    left_out: LeftOut = NOTHING,
 ) -> str:
-    """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run"."""
+    """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run".
+
+    `left_out`: method to the scenarios to which it does not apply.
+    """
     known = set(known_methods)
     methods = [method for method in study.rows.values() if method in known]
-    return write_collected(name, study, collect(results, scenarios, methods, seeds), folder)
+    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder)
 
 
 def write_collected(name: str, study: Study, collected: Collected, folder: Path) -> str:
@@ -104,15 +112,19 @@ def write_collected(name: str, study: Study, collected: Collected, folder: Path)
     for suffix, rows in written.items():
         write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
     names = {column: tuple(dict.fromkeys(own.runs[column].tolist())) for column in ("scenario", "method", "seed")}
-    Made(name=name, study=study, scenarios=names["scenario"], methods=names["method"], seeds=names["seed"]).save(folder)
-    grids = _captioned(study, own, scores, table)
+    absent = {method: tuple(where) for method, where in own.left_out.items()}
+    methods = tuple(dict.fromkeys([*names["method"], *absent]))
+    Made(name=name, study=study, scenarios=names["scenario"], methods=methods, seeds=names["seed"], left_out=absent).save(folder)
+    means = both_averages(own.scores, own.runs, own.held)
+    write_text(folder / f"{name}_failures.csv", means.to_csv(index=False))
+    grids = _captioned(study, own, scores, table, means)
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
     write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
     warning = tables.mixed_settings(own.runs)
     parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
     parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
-    parts.append(_left_out(runs, study, name))
+    parts.append(_left_out(runs, study, name, own))
     if len(categories):
         note = "Ours, in the average that the paper takes."
         parts.append(as_markdown(values_grid("Per category", note, ("Category", "Method"), categories, ["category", "label"])))
@@ -141,7 +153,7 @@ def by_scenario(study: Study, own: Collected, runs: pd.DataFrame) -> pd.DataFram
 
 def by_category(study: Study, scores: pd.DataFrame) -> pd.DataFrame:
     """A row per category, row label, task and metric: `value` in the average that the paper takes, and both averages."""
-    labels = {method: label for label, method in study.rows.items()}
+    labels = _labels(study)
     columns = ["category", "label", "method", "task", "metric", "value", "equal", "frames", "seed_std", "scenarios"]
     if not len(scores):
         return pd.DataFrame(columns=[*columns, "unit"])
@@ -172,16 +184,28 @@ def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(unit=table["metric"].map({name: m.unit for name, m in MEASURES.items()})).loc[order].reset_index(drop=True)
 
 
-def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame) -> list[Grid]:
+def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame, means: pd.DataFrame) -> list[Grid]:
     """The blocks of the table that have lines; the note of the first says what every reader must know."""
     pairs, kept = (len(table[["scenario", "seed"]].drop_duplicates()) for table in (own.runs, scores))
     which = f"Averages take the {kept} of {pairs} pairs of scenario and seed that every method with a finished run has finished."
     main, change = main_grid(study, table), change_grid(study, table)
-    notes = [main.note, VERDICTS if study.reference else "", which if kept else "Nothing has finished.", _pictures(own)]
+    labels = _labels(study)
+    removed = " ".join(removed_lines(own.runs, own.left_out, labels))
+    finished = (own.runs["status"] == "ok").any()
+    nothing = "No pair of scenario and seed was finished by every method." if finished else "Nothing has finished."
+    notes = [main.note, VERDICTS if study.reference else "", which if kept else nothing, removed, _pictures(own)]
     notes += [paper.CLUSTER_CLAIM] if cluster_methods(study.rows.values()) else []
     main = dataclasses.replace(main, note=" ".join(note for note in notes if note))
     change = dataclasses.replace(change, note=f"{change.note} {DIRECTIONS}")
-    return [grid for grid in (main, interval_grid(table), change, other_grid(table)) if grid.lines]
+    failures = held_grid(study, means)
+    unknown = unknown_lines(means, labels)
+    failures = dataclasses.replace(failures, note=" ".join([failures.note, *unknown]))
+    return [grid for grid in (main, failures, interval_grid(table), change, other_grid(table)) if grid.lines]
+
+
+def _labels(study: Study) -> dict[str, str]:
+    """Method to label."""
+    return {method: label for label, method in study.rows.items()}
 
 
 def _pictures(own: Collected) -> str:
@@ -204,9 +228,9 @@ def _curve(study: Study, scores: pd.DataFrame, path: Path) -> str:
     return f"![Chamfer distance against the number of regions K]({path.name})\n"
 
 
-def _left_out(runs: pd.DataFrame, study: Study, name: str) -> str:
+def _left_out(runs: pd.DataFrame, study: Study, name: str, own: Collected) -> str:
     """The runs that averages do not take: failures one by one, others by their reason; and the rows without a method."""
-    begun = set(runs["label"])
+    begun = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
     lines = [
         f"- {label}: {method} is not among the methods of this benchmark"
         for label, method in study.rows.items()
@@ -218,6 +242,7 @@ def _left_out(runs: pd.DataFrame, study: Study, name: str) -> str:
         shown = names if status == "failed" else names[:NAMED]
         more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
         lines.append(f"- {label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
+    lines += [f"- {text}" for text in left_out_lines(own.left_out, _labels(study))]
     if not lines:
         return ""
     return "\n".join(["## Not in the averages\n", f"Every run: {name}_runs.csv.\n", *lines]) + "\n"

@@ -9,7 +9,7 @@ import pandas as pd
 
 from neuspring.files import write_text
 from neuspring.records import StageRecord
-from neuspring.tables import markdown
+from neuspring.tables_layout import markdown
 
 COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),

@@ -14,12 +14,15 @@ import pandas as pd
 from neuspring import paper
 from neuspring.paper import MEASURES, Measure
 from neuspring.studies import Study
-from neuspring.tables import markdown
+from neuspring.tables_held import DASHES, WHY
+from neuspring.tables_layout import markdown
 
 Mark = Literal["", "best", "second"]
 SHORT = {"reconstruction": "Recon.", "future": "Future"}
 LONG = {"reconstruction": "Reconstruction & Resimulation", "future": "Future Prediction"}
 DASH = "–"
+FAILED_MARK = "*"
+"""Beside the number of runs of a method of which some failed."""
 TEX = {
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
     **{character: f"\\{character}" for character in "{}%_&#$"},
@@ -82,6 +85,8 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
         f"{_units(columns)} Ours: mean over scenarios, seeds averaged within each, ± standard deviation over seeds"
         f"{_conventions(columns)}."
     )
+    if cells["failed"].any():
+        note += f" {FAILED_MARK} Some runs failed; the table of failures has both averages, without and with them."
     return Grid(title="", note=note, stub=("Method", "Runs", ""), columns=columns, lines=lines)
 
 
@@ -126,6 +131,30 @@ def other_grid(cells: pd.DataFrame) -> Grid:
     table = cells[cells["ours"].notna()].assign(value=cells["other_average"])
     note = "Ours in the other average: CD and TE weighted by frames, pictures with equal weights of scenarios."
     return values_grid("The other average", note, ("Method",), table, ["label"])
+
+
+def held_grid(study: Study, means: pd.DataFrame) -> Grid:
+    """The rows whose method failed somewhere: both averages (`tables_held.both_averages`), in the average that the paper takes."""
+    table = means[means["succeeded"] < means["attempted"]].dropna(subset="metric")
+    columns, lines = _columns(table), list[Line]()
+    columns = [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure) in columns]
+    for label, method in study.rows.items():
+        part = means[means["method"] == method]
+        known = {(row.task, row.metric): row for row in part.itertuples()}
+        if not len(part) or part.iloc[0]["succeeded"] == part.iloc[0]["attempted"]:
+            continue
+        count = f"{part.iloc[0]['succeeded']}/{part.iloc[0]['attempted']}"
+        for stub, name in (((label, count, "its successes"), "own"), (("", "", "all, failures held"), "all")):
+            here = [(known.get((task, measure.name)), measure) for task, measure in columns]
+            lines.append((stub, [Text(_held_number(row, name, measure)) for row, measure in here]))
+    note = f"Rows marked {FAILED_MARK} above. {WHY} {DASHES}"
+    return Grid(title="Failures", note=note, stub=("Method", "Succeeded", "Mean over"), columns=columns, lines=lines)
+
+
+def _held_number(row: Any, name: str, measure: Measure) -> str:
+    if row is None:
+        return DASH
+    return number(float(getattr(row, name if measure.average == "equal" else f"{name}_frames")), measure)
 
 
 def values_grid(title: str, note: str, stub: tuple[str, ...], table: pd.DataFrame, keys: list[str]) -> Grid:
@@ -175,7 +204,8 @@ def _rows(cells: pd.DataFrame) -> Iterable[tuple[str, dict[tuple[str, str], Any]
 def _runs(cell: Any) -> str:
     total = cell.ok + cell.failed + cell.missing
     wrong = ", ".join(f"{count} {name}" for name, count in (("failed", cell.failed), ("missing", cell.missing)) if count)
-    return f"{cell.ok}/{total}" + (f" ({wrong})" if wrong else "") if total else DASH
+    mark = f" {FAILED_MARK}" if cell.failed else ""
+    return f"{cell.ok}/{total}" + (f" ({wrong})" if wrong else "") + mark if total else DASH
 
 
 def _units(columns: list[tuple[str, Measure]]) -> str:

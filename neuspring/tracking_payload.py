@@ -174,9 +174,11 @@ def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
         parts = Path(os.path.relpath(folder.resolve(), results.resolve())).parts
         if len(parts) == 3 and ".." not in parts:
             scenario, row, seed = parts
-            # A search's row is its folder without `search-`; splats are shared by all methods.
-            row = {"search": row.removeprefix("search-"), "appearance": ""}.get(stage, row)
-            jobs[stage] = results / JOBS / stage / scenario / row / f"{seed}.json"
+            # A search's row is its folder without `search-`.
+            row = row.removeprefix("search-") if stage == "search" else row
+            # A baseline's model has a rule of its own for its rollout.
+            rule = "predict" if stage == "rollout" and "model" in record.variant else stage
+            jobs[stage] = results / JOBS / rule / scenario / row / f"{seed}.json"
     return jobs
 
 

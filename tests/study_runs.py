@@ -32,12 +32,18 @@ def write_run(
     reason: str = "",
     images: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
+    held: Scores | None = None,
 ) -> Path:
-    """A finished (or failed) run as `stages.score` leaves it; returns the path of run.json."""
+    """A finished (or failed) run as `stages.score` leaves it; returns the path of run.json.
+
+    `held`: of a failed run, the scores of a prediction that stays at its last finite frame.
+    """
     folder = results / scenario / method / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    rows = [(scenario, category, method, seed, *key, value, UNITS[key[1]], frames) for key, value in scores.items()]
-    pd.DataFrame(rows, columns=list(COLUMNS)).to_parquet(folder / "scores.parquet")
+    for name, values in {"scores": scores, "held": held}.items():
+        rows = [(scenario, category, method, seed, *key, value, UNITS[key[1]], frames) for key, value in (values or {}).items()]
+        if values is not None:
+            pd.DataFrame(rows, columns=list(COLUMNS)).to_parquet(folder / f"{name}.parquet")
     (folder / "twin.npz").write_bytes(f"{scenario} {method} {seed}".encode())
     observations = results / scenario / "observations.npz"
     observations.write_bytes(scenario.encode())
@@ -70,6 +76,7 @@ def write_run(
         "timings": {},
         "params": {},
         "scores_file": "scores.parquet",
+        "held_file": None if held is None else "held.parquet",
         "artifacts": {"records": ["fit.json"]},
     }
     (folder / "run.json").write_text(json.dumps(run))

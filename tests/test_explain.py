@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring import explain_text, paper, stages, tables_paper
+from neuspring import config, explain_text, paper, stages, tables_paper
 from neuspring.artifacts import Trajectory
 from neuspring.errors import InputError
-from neuspring.explain import check_files, departures, explain
+from neuspring.explain import check_files, departures, explain, rerun
 from neuspring.records import StageRecord, digest_file
 from neuspring.studies import read_studies
 from tests import small
@@ -213,6 +213,19 @@ def test_settings_are_compared_with_the_defaults_of_their_section():
         "render.margin": 123,
         "render.released_quirks.any_alpha": True,
     }
+
+
+def test_settings_of_a_baseline_are_compared_with_those_of_its_model():
+    defaults = config.plain(config.Config())["baselines"]["spring_gaus"]
+    settings = {"train": {"model": "spring_gaus", **defaults, "anchors": 7, "seed": 1}, "rollout": {"model": "spring_gaus"}}
+    assert {name: value for name, value in departures(settings).items() if not name.endswith(".model")} == {"train.anchors": 7}
+
+
+def test_the_command_names_the_rules_of_a_baseline():
+    record = {"device": "cuda:0", "variant": {"model": "gs_dynamics"}, "settings": {"train": {}, "rollout": {}, "render": {}}}
+    assert rerun(Path("results"), "a", "gs", 0, record).endswith("--forcerun train predict render score")
+    twin = record | {"variant": {"search": "uniform"}, "settings": {"search": {}, "rollout": {}}}
+    assert rerun(Path("results"), "a", "m", 0, twin).endswith("--forcerun search rollout score")
 
 
 def test_the_key_is_that_of_a_real_run(tmp_path):

@@ -275,6 +275,15 @@ def test_losses_draw_what_the_history_has(metrics):
     plt.close(figure)
 
 
+def test_the_loss_of_a_baseline_has_no_unit_that_it_may_not_have():
+    history = pd.DataFrame({"step": [0, 1, 0, 1], "metric": ["loss", "loss", "mask", "mask"], "value": [1.0, 0.5, 9.0, 9.0]})
+    figure = figures._losses({"train": history}, "m")
+    (axis,) = figure.axes
+    assert (axis.get_title(), axis.get_xlabel(), axis.get_ylabel()) == ("train", "step", "loss")
+    assert [list(line.get_ydata()) for line in axis.lines] == [[1.0, 0.5]]
+    plt.close(figure)
+
+
 def chamfer(values: dict[tuple[str, str, int], float], **options) -> tables.Collected:
     """Future Chamfer distances in metres, and reconstruction ones half as large."""
     found = collected(values, **options)

@@ -269,7 +269,9 @@ def written(tmp_path_factory):
 
 def test_every_failure_is_counted_and_named(written):
     _, out, text = written
-    assert "| 15/16 (1 failed) | ours" in text
+    assert "| 15/16 (1 failed) * | ours" in text
+    assert "| NeuSpring | 15/16 " in text.partition("## Failures")[2]
+    assert "NeuSpring: 1 of 1 failed runs have no scores of a held prediction" in text
     assert f"- NeuSpring, {RELEASED[0]} / seed 1: failed: rollout: node 3 left | the scene" in text
     assert f"- PhysTwin, {RELEASED[1]} / seed 0: failed: damaged record: " in text
     assert "Averages take the 14 of 16 pairs of scenario and seed" in text

@@ -20,6 +20,7 @@ from neuspring import tracking, tracking_query, tracking_store
 from neuspring.config import Tracking
 from neuspring.errors import InputError
 from neuspring.job_records import Attempt, JobRecord
+from neuspring.tracking_payload import RunRecord, _system_metrics
 from tests import loggers
 from tests.stores import STEPS, write_run
 
@@ -118,7 +119,7 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilisation": 50.0}
     first = Attempt(started="2026-11-21T09:00:00+00:00", outcome="transient", peak_memory_mb=9999.0)
     write_job(results, "search/rope/uniform/0", first, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", **used))
-    for name in ("fit/rope/owner/0", "appearance/rope/0", "score/rope/ours/0", "render/rope/ours/0"):
+    for name in ("fit/rope/owner/0", "appearance/rope/appearance/0", "score/rope/ours/0", "render/rope/ours/0"):
         write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=64.0))
     artifacts = {"records": records}
     assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
@@ -136,6 +137,23 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     (results / "jobs" / "fit" / "rope" / "owner" / "0.json").write_text("{")
     with pytest.raises(InputError, match=r"0\.json"):
         tracking.log_run(write_run(results, artifacts=artifacts, run_key="ab" * 32), results, SETTINGS)
+
+
+def test_the_jobs_of_a_baseline_are_found_by_the_rules_that_made_them(results: Path) -> None:
+    records = ["train.json", "rollout.json", "../../appearance-ours/0/appearance.json"]
+    for name in records:
+        path = results / "rope" / "ours" / "0" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    for memory, name in enumerate(("train/rope/ours/0", "predict/rope/ours/0", "appearance/rope/appearance-ours/0"), 1):
+        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=float(memory)))
+    record = RunRecord.load(write_run(results, artifacts={"records": records}, variant={"model": "spring_gaus"}))
+    points = _system_metrics(record, results / "rope" / "ours" / "0" / "run.json", results)
+    assert {point.name: point.value for point in points if point.name.endswith("memory_mb")} == {
+        "system/train.peak_memory_mb": 1.0,
+        "system/rollout.peak_memory_mb": 2.0,
+        "system/appearance.peak_memory_mb": 3.0,
+    }
 
 
 def test_batches_stay_within_the_limits_of_the_api(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,7 @@ class Curves:
 
 
 def section(material: Material) -> Section:
-    """Error, search and fit curves of the drawn methods."""
+    """Error, search, fit and training curves of the drawn methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
         return Section(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
@@ -53,6 +53,11 @@ def section(material: Material) -> Section:
         ),
         (_search, "Search: best cost", "Over candidate rollouts; thin: other seeds. Methods that share a search have one curve."),
         (_fit, "Fit: loss", "In m², over epochs; thin: other seeds. Losses of methods with other horizons differ in height."),
+        (
+            _train,
+            "Training of baselines: loss",
+            "Over epochs or iterations; thin: other seeds. Every model has a loss of its own: heights tell nothing across models.",
+        ),
     ):
         found = {scenario: collect(material, scenario) for scenario in scenarios}
         found = {scenario: curves for scenario, curves in found.items() if curves.by_name}
@@ -116,10 +121,18 @@ def _search(material: Material, scenario: str) -> Curves:
 
 
 def _fit(material: Material, scenario: str) -> Curves:
+    return _losses(material, scenario, "fit")
+
+
+def _train(material: Material, scenario: str) -> Curves:
+    return _losses(material, scenario, "train")
+
+
+def _losses(material: Material, scenario: str, stage: str) -> Curves:
     found: dict[str, dict[int, pd.Series]] = {}
     for method in material.choice.shown:
         for run in _own(material, scenario, method):
-            values = _history(material, run, "fit", "loss")
+            values = _history(material, run, stage, "loss")
             if values is not None:
                 found.setdefault(method, {})[run.seed] = values
     return Curves(by_name=found)

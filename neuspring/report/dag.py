@@ -30,6 +30,10 @@ class Step:
     """Not drawn where nothing of it is there."""
     checked: bool = False
     """Its record says whether it failed."""
+    without: tuple[str, ...] = ()
+    """What it follows where no step of `after` is drawn."""
+    of_model: bool | None = None
+    """Of records that two steps write: only those of baselines' models, or only those of twins."""
 
 
 STEPS = {
@@ -40,14 +44,24 @@ STEPS = {
     "observe": Step(place=(0, 1), pattern="{scenario}/observations.npz", after=("lift",)),
     "search": Step(place=(1, 1), pattern="{scenario}/search-*/*/search.json", after=("observe",), checked=True),
     "fit": Step(place=(2, 1), pattern="{scenario}/*/*/fit.json", after=("search",), checked=True),
-    "rollout": Step(place=(3, 1), pattern="{scenario}/*/*/rollout.json", after=("fit",), checked=True),
-    "score": Step(place=(4, 1), pattern="{scenario}/*/*/run.json", after=("rollout", "render"), checked=True),
+    "rollout": Step(place=(3, 1), pattern="{scenario}/*/*/rollout.json", after=("fit",), checked=True, of_model=False),
+    "train": Step(place=(2, 3), pattern="{scenario}/*/*/train.json", after=("observe", "appearance"), optional=True, checked=True),
+    "predict": Step(
+        place=(3, 3),
+        pattern="{scenario}/*/*/rollout.json",
+        after=("train",),
+        without=("observe",),
+        optional=True,
+        checked=True,
+        of_model=True,
+    ),
+    "score": Step(place=(4, 1), pattern="{scenario}/*/*/run.json", after=("rollout", "render", "predict"), checked=True),
     "tables": Step(place=(5, 1), pattern="{tables}/summary.md", after=("score",)),
     "appearance": Step(
-        place=(2, 2), pattern="{scenario}/appearance/*/appearance.json", after=("observe",), optional=True, checked=True
+        place=(2, 2), pattern="{scenario}/appearance*/*/appearance.json", after=("observe",), optional=True, checked=True
     ),
     "render": Step(
-        place=(3, 2), pattern="{scenario}/*/*/render.json", after=("appearance", "rollout"), optional=True, checked=True
+        place=(3, 2), pattern="{scenario}/*/*/render.json", after=("appearance", "rollout", "predict"), optional=True, checked=True
     ),
     "transfer": Step(place=(4, 0), pattern="{scenario}/*/*/transfer.json", after=("fit",), optional=True, checked=True),
     "log_run": Step(place=(5, 2), pattern="{scenario}/*/*/mlflow.txt", after=("score",), optional=True),
@@ -93,9 +107,12 @@ def _statuses(material: Material, step: Step) -> Counter[str]:
             status = "ok"
             if step.checked:
                 try:
-                    status = str(json.loads(path.read_text(encoding="utf-8"))["status"])
+                    record = json.loads(path.read_text(encoding="utf-8"))
+                    status, of_model = str(record["status"]), "model" in record.get("settings", {})
                 except UNREADABLE as error:
                     material.lost(path, error)
+                    continue
+                if step.of_model not in (None, of_model):
                     continue
             tones["failed" if status == "failed" else "ok"] += 1
     return tones
@@ -143,7 +160,7 @@ def drawing(found: Mapping[str, Count]) -> Markup:
     }
     width = 2 * MARGIN + columns * WIDTH + (columns - 1) * GAP_X
     height = 2 * MARGIN + len(rows) * HEIGHT + (len(rows) - 1) * GAP_Y
-    edges = [(before, name) for name in found for before in STEPS[name].after if before in found]
+    edges = [(before, name) for name in found for before in _before(name, found)]
     lines = [_edge(corners[before], corners[name]) for before, name in edges]
     boxes = [_box(name, *corners[name], count) for name, count in found.items()]
     words = "; ".join(f"{name}: {count.finished} done, {count.failed + count.jobs_failed} failed" for name, count in found.items())
@@ -153,6 +170,12 @@ def drawing(found: Mapping[str, Count]) -> Markup:
         '<path d="M0 0 8 4 0 8z" fill="currentColor"/></marker></defs>'
     )
     return head + arrow + Markup("").join([*lines, *boxes]) + Markup("</svg>")
+
+
+def _before(name: str, found: Mapping[str, Count]) -> list[str]:
+    """The steps in `found` that a step follows."""
+    step = STEPS[name]
+    return [before for before in step.after if before in found] or [before for before in step.without if before in found]
 
 
 def _edge(start: tuple[int, int], end: tuple[int, int]) -> Markup:

@@ -101,6 +101,7 @@ def _numerical(broken: pd.DataFrame) -> Table:
 def _matrix(runs: pd.DataFrame) -> Fold:
     """Which runs there are: scenarios by methods, seeds counted."""
     counts = runs.groupby(["scenario", "method", "status"]).size().to_dict()
+    begun = set(zip(runs["scenario"], runs["method"], strict=True))
     scenarios, methods = (list(dict.fromkeys(runs[name])) for name in ("scenario", "method"))
     seeds, rows = runs["seed"].nunique(), []
     for scenario in scenarios:
@@ -108,6 +109,9 @@ def _matrix(runs: pd.DataFrame) -> Fold:
         for method in methods:
             ok, failed = (counts.get((scenario, method, status), 0) for status in ("ok", "failed"))
             wrong = f" ✗ {failed}" if failed else ""
+            if (scenario, method) not in begun:
+                row.append(Cell(text="", value=-1))
+                continue
             text = (f"✓ {ok}" if ok == seeds else f"{ok} of {seeds}" if ok else "" if failed else "–") + wrong
             tone = "bad" if failed else "good" if ok == seeds else "warn" if ok else "mute"
             row.append(Cell(text=text.strip(), tone=tone, value=ok))  # type: ignore[arg-type]
@@ -118,7 +122,7 @@ def _matrix(runs: pd.DataFrame) -> Fold:
         header=["Scenario", *map(str, methods)],
         rows=rows,
         sortable=True,
-        note=f"✓ all {several(seeds, 'seed')} finished; ✗ failed; – missing.",
+        note=f"✓ all {several(seeds, 'seed')} finished; ✗ failed; – missing; empty: does not apply.",
     )
     done = int((runs["status"] == "ok").sum())
     return Fold(summary=f"Runs: {done} of {len(runs)} finished, {missing} missing", blocks=[table], open=len(scenarios) <= 30)

@@ -23,6 +23,7 @@ from neuspring.report.media import Media, embedded_png
 from neuspring.report.sources import Choice, Damaged, Material, on_disk, read_jobs, read_runs, read_transfers
 from neuspring.report.words import hours, listed, several
 from neuspring.studies import Study
+from neuspring.tables_held import LeftOut
 
 TEMPLATES = Path(__file__).parent / "templates"
 MEGABYTE = 1_000_000
@@ -43,6 +44,8 @@ class Options:
     """The method that others are compared with; None: the settings', else the first."""
     transfers: Sequence[str] = ()
     """Scenarios whose twins were rolled out on other recordings."""
+    left_out: LeftOut = field(default_factory=dict)
+    """Method -> scenarios to which it does not apply, and where it has no runs."""
     shown: Sequence[str] = ()
     """Methods whose curves and pictures are shown; empty: the baseline and the first rows of the studies, six in all."""
     settings: Config | None = None
@@ -90,7 +93,7 @@ def gather(results: Path, output: Path, options: Options) -> Material:
     damaged: list[Damaged] = []
     jobs = read_jobs(results, damaged)
     choice = _choice(results, options, on_disk(results, jobs))
-    collected = tables.collect(results, choice.scenarios, choice.methods, choice.seeds)
+    collected = tables.collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
     return Material(
         results=results,
         output=output,
@@ -125,7 +128,15 @@ def _choice(results: Path, options: Options, found: tuple[list[str], list[str], 
     shown = tuple(name for name in methods if name in shown)
     transfers = tuple(options.transfers) or tuple(sorted({path.parts[-4] for path in results.glob("*/*/*/transfer.json")}))
     kept = tuple(name for name in transfers if name in scenarios)
-    return Choice(scenarios=scenarios, methods=methods, seeds=seeds, baseline=baseline, transfers=kept, shown=shown)
+    return Choice(
+        scenarios=scenarios,
+        methods=methods,
+        seeds=seeds,
+        baseline=baseline,
+        transfers=kept,
+        shown=shown,
+        left_out=options.left_out,
+    )
 
 
 def _sections(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from neuspring.report.blocks import Block, Fold, Grid, Section, Text
 from neuspring.report.media import Media, Wanted
@@ -52,9 +53,8 @@ def wanted(material: Material) -> list[Wanted]:
             for rank, film in enumerate(FILMS):
                 path = run.file("images", film)
                 found += [Wanted(path=path, rank=(rank, order, place))] if path is not None else []
-            learned = run.file("images", APPEARANCE)
-            if learned is not None and order == 0:
-                found.append(Wanted(path=learned, rank=(len(KINDS), order, place), width=1000))
+        for order, learned in enumerate(_splats(material.first_runs(scenario))):
+            found.append(Wanted(path=learned, rank=(len(KINDS), order, place), width=1000))
     return found
 
 
@@ -88,13 +88,23 @@ def _scenario(runs: dict[str, Run], media: Media) -> list[Block]:
             blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=made, least=kind.least)], open=not blocks))
         if kind.stem == "images":
             blocks += _filmed(runs, media)
-    for run in list(runs.values())[:1]:
-        learned = run.file("images", APPEARANCE)
-        if learned is not None:
-            alt = f"Splats of {run.scenario} in frame 0"
-            picture = media.picture(learned, "Observed and drawn in frame 0", alt, wide=True)
-            blocks.append(Fold(summary="Splats of frame 0", blocks=[picture]))
-    return blocks
+    splats = _splats(runs)
+    drawn: list[Block] = []
+    for path, methods in splats.items():
+        of = f", {', '.join(methods)}" if len(splats) > 1 else ""
+        alt = f"Splats of {runs[methods[0]].scenario} in frame 0{of}"
+        drawn.append(media.picture(path, f"Observed and drawn in frame 0{of}", alt, wide=True))
+    return [*blocks, Fold(summary="Splats of frame 0", blocks=drawn)] if drawn else blocks
+
+
+def _splats(runs: dict[str, Run]) -> dict[Path, list[str]]:
+    """Picture of splats -> the methods that are drawn with them: most share them, some have their own."""
+    found: dict[Path, list[str]] = {}
+    for method, run in runs.items():
+        path = run.file("images", APPEARANCE)
+        if path is not None:
+            found.setdefault(path.resolve(), []).append(method)
+    return found
 
 
 def _filmed(runs: dict[str, Run], media: Media) -> list[Block]:

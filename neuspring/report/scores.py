@@ -11,11 +11,13 @@ import pandas as pd
 from neuspring import tables
 from neuspring.metrics import averages
 from neuspring.paper import MEASURES
+from neuspring.report import held
 from neuspring.report.blocks import Block, Cell, Chip, Fold, Items, Section, Table, Text
 from neuspring.report.sources import Material
 from neuspring.report.words import DASH, listed, number, several, signed
-from neuspring.tables import HEADINGS, IMAGE_HEADINGS, SHOWN, TRANSFER_HEADINGS, Collected, comparable
+from neuspring.tables import Collected, comparable
 from neuspring.tables_cells import LEAST_SCENARIOS
+from neuspring.tables_layout import HEADINGS, IMAGE_HEADINGS, SHOWN, TRANSFER_HEADINGS
 
 Headings = Mapping[tuple[str, str], str]
 MOST_NOTES = 100
@@ -27,10 +29,14 @@ def section(material: Material, differences: pd.DataFrame) -> Section:
     collected, baseline = material.collected, material.choice.baseline
     usable = comparable(collected) if len(collected.scores) else collected.scores
     if not len(usable):
+        finished = (collected.runs["status"] == "ok").any() if len(collected.runs) else False
         text = "No run has finished, so there is nothing to average."
-        return Section(key="scores", title="Scores", blocks=[Text(text=text, tone="mute")])
-    blocks: list[Block] = [Text(text=_coverage(collected, usable))]
+        text = "No pair of scenario and seed was finished by every method, so nothing can be compared." if finished else text
+        told = [Text(text=text, tone="mute"), *([Text(text=why)] if (why := held.coverage(collected)) else [])]
+        return Section(key="scores", title="Scores", blocks=[*told, *held.averages(collected)])
+    blocks: list[Block] = [Text(text=f"{_coverage(collected, usable)} {held.coverage(collected)}".rstrip())]
     blocks += _averages("Errors, mm", usable, collected, HEADINGS)
+    blocks += held.averages(collected)
     images = {key: text for key, text in IMAGE_HEADINGS.items() if key in _present(usable)}
     if images:
         blocks += _averages("Pictures: PSNR in dB, SSIM, LPIPS, IoU", usable, collected, images)

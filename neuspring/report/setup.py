@@ -27,6 +27,11 @@ PACKAGES = (
 CHOSEN = ("scenarios", "methods", "seeds", "results", "tables")
 """Keys that say what the benchmark is, not how it runs."""
 DIRTY = "-dirty"
+COMMON = {
+    **{"model": "Model", "search": "Search", "clusters": "Regions", "fit": "Fit", "carry_over": "Carry over"},
+    "average_seeds": "Averages seeds",
+}
+"""Switches of methods, and their headings; the model only where a method has one."""
 SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")
 """Of the configuration, as the records of search and fit keep them."""
 
@@ -83,7 +88,7 @@ def _settings(material: Material) -> list[Block]:
     if not used:
         return []
     changed = {key: values for key, values in used.items() if any(value != defaults.get(key) for value in values.values())}
-    text = "Read from the run records, since no configuration was given: what search and fit were run with."
+    text = "Read from the run records, since no configuration was given: what search, fit and training were run with."
     return [Text(text=text, tone="mute"), _changes("Settings that differ from the defaults", changed, defaults)]
 
 
@@ -96,13 +101,16 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _used(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
-    """Setting -> method -> value, from the records of search and fit."""
+    """Setting -> method -> value, from the records of search, fit and baselines' training."""
     found: dict[str, dict[str, Any]] = defaultdict(dict)
     for run in runs:
         for stage in (run.record.settings.get(name, {}) for name in ("search", "fit")):
             known = {name: stage[name] for name in SECTIONS if isinstance(stage.get(name), Mapping)}
             for key, value in flat(known).items():
                 found[key].setdefault(run.method, value)
+        own = {name: value for name, value in run.record.settings.get("train", {}).items() if name not in ("model", "seed")}
+        for key, value in flat(own, f"baselines.{run.record.model}.").items():
+            found[key].setdefault(run.method, value)
     return dict(found)
 
 
@@ -136,13 +144,13 @@ def _variants(runs: Iterable[Run]) -> Table | None:
         found.setdefault(run.method, run.record.variant)
     if not found:
         return None
-    common = ("search", "clusters", "fit", "carry_over", "average_seeds")
+    common = {name: text for name, text in COMMON.items() if name != "model" or any("model" in own for own in found.values())}
     rows = []
     for method, variant in found.items():
         own = ", ".join(f"{key}: {_plain(value)}" for key, value in variant.items() if key not in common)
         cells = [Cell(text=_word(variant.get(name))) for name in common]
         rows.append([Cell(text=method), *cells, Cell(text=own, wrap=True)])
-    header = ["Method", "Search", "Regions", "Fit", "Carry over", "Averages seeds", "Settings of its own"]
+    header = ["Method", *common.values(), "Settings of its own"]
     return Table(caption="Methods", header=header, rows=rows)
 
 

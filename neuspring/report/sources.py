@@ -20,11 +20,12 @@ from neuspring.metrics import COLUMNS
 from neuspring.records import RECORD_FORMAT, read_json
 from neuspring.studies import Study
 from neuspring.tables import DAMAGED, Collected
+from neuspring.tables_held import LeftOut, applying
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """What a damaged record, table or picture raises."""
-METHOD_RECORDS = ("run.json", "rollout.json", "fit.json")
-METHOD_RULES = ("fit", "rollout", "render", "score")
+METHOD_RECORDS = ("run.json", "rollout.json", "fit.json", "train.json")
+METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
 """Rules whose jobs are named <rule>/<scenario>/<method>/<seed>."""
 
 
@@ -39,11 +40,14 @@ class Choice:
     transfers: tuple[str, ...] = ()
     shown: tuple[str, ...] = ()
     """Methods that are drawn."""
+    left_out: LeftOut = field(default_factory=dict)
+    """Method -> the scenarios to which it does not apply."""
 
     @property
     def size(self) -> int:
         """Runs that there should be."""
-        return len(self.scenarios) * len(self.methods) * len(self.seeds)
+        pairs = len(self.scenarios) * len(self.methods)
+        return (pairs - sum(map(len, applying(self.left_out, self.scenarios, self.methods).values()))) * len(self.seeds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +74,11 @@ class Record:
     artifacts: dict[str, list[str]]
     histories: dict[str, str]
     peak_memory_mb: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def model(self) -> str:
+        """The baseline's model; empty for twins."""
+        return str(self.variant.get("model") or "")
 
 
 @dataclass(frozen=True, kw_only=True)

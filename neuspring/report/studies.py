@@ -12,6 +12,7 @@ import pandas as pd
 
 from neuspring import paper, tables_cells
 from neuspring.paper import MEASURES, Measure
+from neuspring.report import held
 from neuspring.report.blocks import Block, Cell, Chip, Fold, Section, Table, Text, Tone, Verdict
 from neuspring.report.sources import Material
 from neuspring.report.words import number, several, signed
@@ -96,7 +97,7 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     """The tables of the studies; those that nothing was run of are folded."""
     blocks: list[Block] = []
     for name, study in material.studies.items():
-        inner = _tables(study, cells[name])
+        inner = [*_tables(study, cells[name]), *held.of_table(study, material.collected)]
         begun = bool(cells[name]["ours"].notna().any()) if len(cells[name]) else False
         blocks.append(
             Fold(summary=f"{name}: {study.title}" + ("" if begun else " (not run)"), blocks=inner, open=begun, key=f"study-{name}")

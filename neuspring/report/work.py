@@ -16,8 +16,8 @@ from neuspring.report.timeline import timeline
 from neuspring.report.words import DASH, duration, hours, memory
 
 ORDER = (
-    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "transfer"),
-    *("appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
+    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "train", "predict"),
+    *("transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
 )
 """Rules in the order of the workflow."""
 
@@ -73,7 +73,7 @@ def by_rule(jobs: Iterable[JobRecord]) -> list[Spent]:
 
 
 def by_method(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """Jobs of one method each; searches, which methods share, by their row."""
+    """Jobs of one method each; searches and splats, which methods share, by their row."""
     groups = _grouped(jobs, _owner)
     groups.pop("", None)
     return [spent(name, groups[name]) for name in sorted(groups)]
@@ -90,7 +90,16 @@ def _owner(job: JobRecord) -> str:
     parts = job.name.split("/")
     if len(parts) != 4:
         return ""
-    return f"search {parts[2]}" if job.rule == "search" else parts[2] if job.rule in (*METHOD_RULES, "transfer") else ""
+    if job.rule == "search":
+        return f"search {parts[2]}"
+    if job.rule == "appearance":
+        return f"splats {_splats(parts[2])}"
+    return parts[2] if job.rule in (*METHOD_RULES, "transfer") else ""
+
+
+def _splats(folder: str) -> str:
+    """Whose splats lie in a folder: `shared`, or those of a method."""
+    return folder.removeprefix("appearance").removeprefix("-") or "shared"
 
 
 def gpu_hours(material: Material) -> tuple[float | None, str]:
@@ -103,7 +112,7 @@ def gpu_hours(material: Material) -> tuple[float | None, str]:
 
 
 def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
-    """Stage, method, seconds, device and MiB of every stage; shared ones once, for the first method that names them."""
+    """Rule, method, seconds, device and MiB of every stage; shared ones once, for `shared` or the method whose splats they are."""
     seen, rows = set(), []
     for run in runs:
         named = {(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])}
@@ -116,7 +125,10 @@ def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
             # Scoring is done on the CPU, whatever the device.
             device = "cpu" if stage == "score" else run.record.device
             peak = run.record.peak_memory_mb.get(stage, np.nan)
-            rows.append((stage, run.method, seconds, device, peak))
+            folder = place.parent.parent.name
+            owner = "shared" if stage == "search" else _splats(folder) if stage == "appearance" else run.method
+            rule = "predict" if stage == "rollout" and run.record.model else stage
+            rows.append((rule, owner, seconds, device, peak))
     return rows
 
 
@@ -141,7 +153,7 @@ def _from_jobs(jobs: Sequence[JobRecord]) -> list[Block]:
     blocks: list[Block] = [_costs("By step", "Step", by_rule(jobs), total=True)]
     methods = by_method(jobs)
     if methods:
-        blocks.append(_costs("By method (searches apart, since methods share them)", "Method", methods, total=False))
+        blocks.append(_costs("By method (searches and splats apart, since methods share them)", "Method", methods, total=False))
     return [*blocks, *timeline(jobs, sorted({job.rule for job in jobs}, key=lambda rule: (place(rule), rule)))]
 
 
@@ -208,8 +220,7 @@ def _hours(seconds: float) -> Cell:
 def _from_runs(runs: Sequence[Run]) -> Table:
     groups: dict[tuple[str, str], list[tuple[float, str, float]]] = defaultdict(list)
     for stage, method, seconds, device, peak in _stages(runs):
-        shared = "shared" if stage in ("search", "appearance") else method
-        groups[stage, shared].append((seconds, device, peak))
+        groups[stage, method].append((seconds, device, peak))
     rows = []
     for (stage, method), found in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
         times = [one for one, _, _ in found]
