@@ -26,6 +26,9 @@ from neuspring.config import (
     read_text,
     read_yaml,
 )
+from neuspring.config_gs_dynamics import GsDynamics
+from neuspring.config_images import Appearance
+from neuspring.config_spring_gaus import SpringGaus
 from neuspring.data import capture, phystwin_raw
 from neuspring.errors import InputError
 from neuspring.lpips_weights import configured
@@ -108,6 +111,17 @@ def search_of(config: Config, row: SearchRow, name: str) -> Search:
     return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
 
 
+def model_of(config: Config, method: Method, name: str) -> SpringGaus | GsDynamics:
+    """The settings of a trained baseline: its section, with the method's own on top. Raises InputError for unknown keys."""
+    section = config.baselines.spring_gaus if method.model == "spring_gaus" else config.baselines.gs_dynamics
+    return parse(type(section), _overlaid(section, method.settings), f"method {name}, settings")
+
+
+def appearance_of(config: Config, method: Method, name: str) -> Appearance:
+    """How a method's splats are trained: as all, with the method's own settings on top. Raises InputError for unknown keys."""
+    return parse(Appearance, _overlaid(config.images.appearance, method.appearance or {}), f"method {name}, appearance")
+
+
 def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
     values = plain(settings)
     merge(values, own)
@@ -134,6 +148,12 @@ class Benchmark:
     """Chosen method -> the method in whose folder its fit lies."""
     transfers: dict[str, tuple[str, ...]]
     """Chosen scenario -> those that its twins are transferred to."""
+    pictured: frozenset[str]
+    """Methods of the whole configuration that are trained on pictures, so that scenarios without any are left out."""
+    splats: dict[str, Method]
+    """Methods whose own splats are made: of all rows of the table with the same settings, the first."""
+    splats_of_method: dict[str, str]
+    """Chosen method with splats of its own -> the method in whose name they are made."""
     studies: dict[str, Study]
     """All rows of the study table; `config.studies` names those that are made without being asked for."""
 
@@ -151,7 +171,7 @@ class Benchmark:
         _require_known("studies", whole.studies, studies, whole.study_table)
         config = chosen_part(whole, scenarios)
         searches = read_searches(root / config.search_table)
-        wanted = tuple(dict.fromkeys(methods[n].search for n in config.methods))
+        wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
         _require_known("methods' search", wanted, searches, config.search_table)
         _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
         pairs = config.transfers or {}
@@ -164,6 +184,7 @@ class Benchmark:
             of = "this configuration's scenarios"
             _require_known("tune.scenarios", whole.tune.scenarios, dict.fromkeys(whole.scenarios + targets), of)
         owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
+        looks = {name: owner for name, owner in _splat_owners(config, methods).items() if name in config.methods}
         chosen = cls(
             config,
             whole,
@@ -174,6 +195,9 @@ class Benchmark:
             {n: methods[n] for n in owners.values()},
             owners,
             transfers,
+            frozenset(name for name in whole.methods if _trained_on_pictures(whole, methods[name], name)),
+            {n: methods[n] for n in looks.values()},
+            looks,
             studies,
         )
         for name in [*chosen.scenarios, *chosen.methods]:
@@ -181,13 +205,24 @@ class Benchmark:
                 rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in chosen.methods.items():
-            wanted_low, wanted_high = search_of(config, searches[method.search], method.search).ranges.stiffness
-            low, high = fit_of(config, method, name).stiffness_range
-            if method.fit and not low <= wanted_low < wanted_high <= high:
-                rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
-                raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+            chosen._check_settings(name, method)
         chosen._require_data()
+        chosen._require_applying()
         return chosen
+
+    def _check_settings(self, name: str, method: Method) -> None:
+        """Settings of a method's own, before any job starts."""
+        if method.model:
+            if method.trained:
+                model_of(self.config, method, name)
+            appearance_of(self.config, method, name)
+        if not (method.search and method.fit):
+            return
+        wanted_low, wanted_high = search_of(self.config, self.searches[method.search], method.search).ranges.stiffness
+        low, high = fit_of(self.config, method, name).stiffness_range
+        if not low <= wanted_low < wanted_high <= high:
+            rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
+            raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     @property
     def tuned(self) -> tuple[str, ...]:
@@ -204,16 +239,37 @@ class Benchmark:
         """The chosen methods that stand in a study's rows."""
         return tuple(dict.fromkeys(name for name in self.studies[study].rows.values() if name in self.methods))
 
+    def _row(self, name: str) -> ScenarioRow:
+        """Of a scenario, whether it is chosen or not."""
+        return self.scenarios.get(name) or self.whole_scenarios[name]
+
     def data_path(self, name: str) -> Path | None:
         """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""
-        row = self.scenarios[name]
+        row = self._row(name)
         return None if row.source in MADE else Path(self.config.data_root or ".") / row.path
 
     def has_images(self, name: str) -> bool:
         """Whether a scenario's predictions are drawn and scored."""
-        source, path = self.scenarios[name].source, self.data_path(name)
+        source, path = self._row(name).source, self.data_path(name)
         beside = source == "phystwin" and path is not None and phystwin_raw.has_images(path)
         return self.config.images.enabled and (source in FILMED or beside)
+
+    def applies(self, method: str, scenario: str) -> bool:
+        """Whether a method can be run on a scenario: what is trained on silhouettes needs images."""
+        return method not in self.pictured or self.has_images(scenario)
+
+    @property
+    def whole_left_out(self) -> dict[str, tuple[str, ...]]:
+        """Of the whole configuration: method -> the scenarios to which it does not apply; methods that apply to all are no keys."""
+        without = tuple(name for name in self.whole_scenarios if self.pictured and not self.has_images(name))
+        return {name: without for name in self.whole.methods if name in self.pictured and without}
+
+    def _require_applying(self) -> None:
+        """Raise InputError if nothing of what was asked for can be run."""
+        if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
+            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images"
+            remedy = "Choose scenarios with images (and images.enabled), or a variant such as spring_gaus_points."
+            raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
 
     def capture_folder(self, name: str) -> Path:
         """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
@@ -259,6 +315,20 @@ def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]
     first: dict[tuple[Any, ...], str] = {}
     fitted = {name: method for name, method in methods.items() if method.fit}
     return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+
+
+def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
+    """Method with splats of its own -> the first row of the table with the same settings of theirs."""
+    first: dict[Any, str] = {}
+    own = {name: method for name, method in methods.items() if method.appearance is not None}
+    return {name: first.setdefault(appearance_of(config, method, name), name) for name, method in own.items()}
+
+
+def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
+    if method.model != "spring_gaus":
+        return False
+    chosen = model_of(config, method, name)
+    return isinstance(chosen, SpringGaus) and chosen.supervision == "masks"
 
 
 def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:

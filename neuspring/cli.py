@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuspring import __version__, cli_tools
-from neuspring.cli_options import Adder, json_mapping, read_settings
+from neuspring.cli_options import Adder, add_left_out, json_mapping, read_left_out, read_settings
 from neuspring.errors import InputError, NumericalFailure
 
 if TYPE_CHECKING:
@@ -147,6 +147,25 @@ def _rollout(a: argparse.Namespace) -> int:
     return 0
 
 
+def _train(a: argparse.Namespace) -> int:
+    from neuspring import stages_baselines
+
+    pictures = None
+    if a.capture:
+        if not (a.masks and a.appearance):
+            raise InputError("--capture", "silhouettes need --masks and --appearance too", a.capture)
+        pictures = stages_baselines.Pictures(a.capture.parent, a.masks, a.appearance)
+    stages_baselines.train(a.observations, a.model, read_settings(a.settings), a.seed, a.device, a.output, pictures)
+    return 0
+
+
+def _predict(a: argparse.Namespace) -> int:
+    from neuspring import stages_baselines
+
+    stages_baselines.predict(a.observations, a.model, a.train, a.appearance, a.device, a.output)
+    return 0
+
+
 def _transfer(a: argparse.Namespace) -> int:
     from neuspring import stages
 
@@ -157,7 +176,7 @@ def _transfer(a: argparse.Namespace) -> int:
 def _score(a: argparse.Namespace) -> int:
     from neuspring import stages
 
-    given = {name: getattr(a, name) for name in ("search", "fit", "rollout", "appearance", "render")}
+    given = {name: getattr(a, name) for name in ("search", "fit", "train", "rollout", "appearance", "render")}
     records = {name: path for name, path in given.items() if path}
     stages.score(a.observations, records, a.method, json_mapping("--variant", a.variant), a.seed, a.output)
     return 0
@@ -166,7 +185,7 @@ def _score(a: argparse.Namespace) -> int:
 def _tables(a: argparse.Namespace) -> int:
     from neuspring import gallery, tables
 
-    collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds)
+    collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds, read_left_out(a.left_out))
     transfers = tables.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
     print(tables.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
@@ -268,6 +287,17 @@ def _parser() -> argparse.ArgumentParser:
     carry = "correct the state at the last training frame by what was observed there, where training frames say that it helps"
     rollout.add_argument("--carry-over", action="store_true", help=carry)
 
+    train = add("train", _train, "observations -> trained model of a baseline", "observations", "settings", "compute", "output")
+    train.add_argument("--model", required=True, choices=("spring_gaus", "gs_dynamics"))
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--capture", type=Path, help="capture.json, where silhouettes are trained on")
+    train.add_argument("--masks", type=Path, nargs="+", help="masks.json of every camera, in the capture's order, with --capture")
+    predict = add("predict", _predict, "model of a baseline -> trajectory over all frames", "observations", "compute", "output")
+    predict.add_argument("--model", required=True, choices=("spring_gaus", "gs_dynamics", "static", "controller_lbs"))
+    predict.add_argument("--train", type=Path, help="train.json, of models that are trained")
+    for command in (train, predict):
+        command.add_argument("--appearance", type=Path, help="appearance.json of the splats that the model moves")
+
     transfer = add("transfer", _transfer, "twin -> scores on other recordings of the object", "settings", "compute", "output")
     transfer.add_argument("--twin", type=Path, required=True, help="search.json or fit.json that names the twin")
     transfer.add_argument("--targets", type=Path, nargs="+", required=True, help="observations.npz of the other recordings")
@@ -275,8 +305,9 @@ def _parser() -> argparse.ArgumentParser:
     transfer.add_argument("--seed", type=int, default=0)
 
     score = add("score", _score, "trajectory -> scores, plots and run.json", "observations", "output")
-    score.add_argument("--search", type=Path, required=True, help="search.json")
+    score.add_argument("--search", type=Path, help="search.json, if the method has that stage")
     score.add_argument("--fit", type=Path, help="fit.json, if the method has that stage")
+    score.add_argument("--train", type=Path, help="train.json, if the method has that stage")
     score.add_argument("--rollout", type=Path, required=True, help="rollout.json")
     score.add_argument("--appearance", type=Path, help="appearance.json, if the scenario has images")
     score.add_argument("--render", type=Path, help="render.json, if the scenario has images")
@@ -287,6 +318,7 @@ def _parser() -> argparse.ArgumentParser:
     table = add("tables", _tables, "run records -> tables", "results", "runs", "output")
     table.add_argument("--transfers", nargs="*", default=[], help="scenarios whose twins were rolled out on other recordings")
     table.add_argument("--baseline", help="method that others are compared with (default: the first)")
+    add_left_out(table)
 
     add("track-init", _track_init, "prepare the MLflow store, once before any run is logged", "results", "settings", "output")
     log = add("log", _log, "log one run.json to MLflow", "results", "settings", "output")

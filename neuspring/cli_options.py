@@ -36,6 +36,20 @@ def json_mapping(option: str, text: str) -> dict[str, object]:
     return values
 
 
+def read_left_out(text: str) -> dict[str, tuple[str, ...]]:
+    """Method -> scenarios to which it does not apply, from JSON text. Raises InputError."""
+    values = json_mapping("--left-out", text)
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in values.values()):
+        raise InputError("--left-out", "must map methods to lists of scenarios", text)
+    return {method: tuple(names) for method, names in values.items() if isinstance(names, list)}
+
+
+def add_left_out(parser: argparse.ArgumentParser) -> None:
+    """The option that `read_left_out` reads."""
+    about = "JSON: methods and the scenarios to which they do not apply, where they have no runs"
+    parser.add_argument("--left-out", metavar="JSON", default="{}", help=about)
+
+
 class Adder:
     """Adds commands with the options they share."""
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuspring.cli_options import Adder, read_settings
+from neuspring.cli_options import Adder, add_left_out, read_left_out, read_settings
 from neuspring.errors import InputError
 from neuspring.files import write_text
 
@@ -69,10 +70,12 @@ def _study(a: argparse.Namespace) -> int:
     known = studies.read_studies(a.table)
     if a.study not in known:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(known)}")
+    left_out = read_left_out(a.left_out)
     if a.scores:
-        text = tables_paper.write_collected(a.study, known[a.study], tables.read_scores(a.scores), a.output)
+        collected = replace(tables.read_scores(a.scores), left_out=left_out)
+        text = tables_paper.write_collected(a.study, known[a.study], collected, a.output)
     elif a.scenarios and a.methods and a.seeds:
-        text = tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output)
+        text = tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output, left_out)
     else:
         raise InputError("study", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
     print(text)
@@ -96,6 +99,7 @@ def _report(a: argparse.Namespace) -> int:
         seeds=a.seeds,
         baseline=a.baseline,
         transfers=a.transfers,
+        left_out=read_left_out(a.left_out),
         shown=a.shown,
         settings=None if a.settings == "{}" else read_settings(a.settings),
         studies=studies.read_studies(a.table),
@@ -171,6 +175,7 @@ def add_commands(add: Adder) -> None:
     study.add_argument("--methods", nargs="+")
     study.add_argument("--seeds", nargs="+", type=int)
     study.add_argument("--scores", type=Path, help="instead of run records: a scores.csv that tables wrote, on any machine")
+    add_left_out(study)
     study.add_argument("--study", required=True, help="row of the study table")
     study.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
 
@@ -184,6 +189,7 @@ def add_commands(add: Adder) -> None:
         page.add_argument(f"--{name}", nargs="+", default=(), help="those of the settings, else all on disk, by default")
     page.add_argument("--seeds", nargs="+", type=int, default=())
     page.add_argument("--transfers", nargs="*", default=(), help="scenarios whose twins were rolled out on other recordings")
+    add_left_out(page)
     page.add_argument("--baseline", help="method that others are compared with")
     page.add_argument("--shown", nargs="+", default=(), help="methods to draw (default: six at most)")
     page.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import AfterValidator, Field, StringConstraints, TypeAdapter, ValidationError
 
+from neuspring.config_baselines import Baselines, Model
 from neuspring.config_gpus import Gpus
 from neuspring.config_images import Images
 from neuspring.config_perception import Perception, Synthetic
@@ -34,6 +35,8 @@ MADE = ("toy", "synthetic")
 """Sources that need no data."""
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
+UNTRAINED = ("static", "controller_lbs")
+"""Models of baselines that have nothing to learn, and no settings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -415,6 +418,8 @@ class Config:
     """See [perception](#perception)."""
     images: Images = field(default_factory=Images)
     """See [images](#images)."""
+    baselines: Baselines = field(default_factory=Baselines)
+    """See [baselines](#baselines)."""
     tracking: Tracking = field(default_factory=Tracking)
     """See [tracking](#tracking)."""
     tune: Tune | None = None
@@ -445,20 +450,42 @@ class SearchRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """A row of the method table: which search it starts from, which first-order stage follows, how it predicts."""
+    """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
 
     __pydantic_config__ = STRICT
-    search: Name
-    """A row of the search table; methods that name the same row share the search."""
-    fit: Kind | None
-    """What the first-order stage trains: each spring by itself, or the neural spring field."""
     description: str
+    search: Name | None = None
+    """A row of the search table; methods that name the same row share the search."""
+    fit: Kind | None = None
+    """What the first-order stage trains: each spring by itself, or the neural spring field."""
+    model: Model | None = None
+    """A baseline without search and fit."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """Fit settings of this method alone (keys of `fit`, for example `horizon: 0`), on top of the configuration's."""
+    """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
+    section of `baselines`."""
+    appearance: dict[str, Any] | None = None
+    """Splats of this method's own: keys of `images.appearance`, on top of the configuration's; null: those of all methods."""
     carry_over: bool = False
     """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
     average_seeds: bool = False
     """Predict the mean of the trajectories of all seeds; costs as many fits as there are seeds."""
+
+    def __post_init__(self) -> None:
+        if (self.search is None) == (self.model is None):
+            raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
+        twins_only = {"fit": self.fit, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
+        given = [name for name, value in twins_only.items() if value]
+        if self.model and given:
+            raise ValueError(f"{', '.join(given)}: these belong to methods with a search, not to model {self.model}")
+        if self.appearance is not None and self.model != "spring_gaus":
+            raise ValueError(f"appearance: only spring_gaus draws with splats of its own, received model {self.model}")
+        if self.settings and self.model in UNTRAINED:
+            raise ValueError(f"settings: model {self.model} has none, received {sorted(self.settings)}")
+
+    @property
+    def trained(self) -> bool:
+        """Whether a baseline's model is trained before it predicts."""
+        return self.model is not None and self.model not in UNTRAINED
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,6 +67,14 @@ def task_frames(scenario: Scenario, task: str) -> range:
     return range(1, scenario.train_end) if task == "reconstruction" else range(scenario.train_end, scenario.frame_count)
 
 
+def held(trajectory: Trajectory | None, observations: Observations) -> Trajectory:
+    """A trajectory of all frames: the last one, at least frame 0, is held where the rollout ended early."""
+    frames = observations.scenario.frame_count
+    known = observations.nodes[None] if trajectory is None or not len(trajectory.positions) else trajectory.positions
+    still = np.repeat(known[-1:], frames - len(known), axis=0)
+    return Trajectory(positions=np.concatenate([known, still]), frame_count=frames)
+
+
 def score(trajectory: Trajectory, observations: Observations, method: str, seed: int) -> pd.DataFrame:
     """Tidy scores, one row per task and metric. Rows that cannot be computed are left out, never NaN:
 

@@ -13,6 +13,7 @@ from neuspring import benchmark as benchmarks
 from neuspring import gpus
 from neuspring.benchmark import Benchmark
 from neuspring.config_gpus import Gpus
+from neuspring.config_spring_gaus import SpringGaus
 from neuspring.config_tune import Tune
 from neuspring.data.cases import released_cases
 from neuspring.errors import InputError
@@ -24,7 +25,7 @@ TRAIN = 0.7
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
-ON_GPU = frozenset({"search", "fit", "rollout", "transfer", "appearance", "render", "tune"})
+ON_GPU = frozenset({"search", "fit", "rollout", "train", "predict", "transfer", "appearance", "render", "tune"})
 """Rules that take a GPU where there is one."""
 EITHER = frozenset({"segment", "track"})
 """Rules whose backend decides."""
@@ -130,9 +131,20 @@ class Needs:
         epochs = benchmarks.fit_of(self._benchmark.config, self._benchmark.fits[wildcards.method], wildcards.method).epochs
         return epochs * math.ceil(TRAIN * self.frames(wildcards.scenario))
 
+    def train(self, wildcards: Any) -> int:
+        """Spring-Gaus: iterations x training frames. GS-Dynamics: updates."""
+        method, name = self._benchmark.methods[wildcards.method], wildcards.method
+        chosen = benchmarks.model_of(self._benchmark.config, method, name)
+        if isinstance(chosen, SpringGaus):
+            return chosen.iterations * math.ceil(TRAIN * self.frames(wildcards.scenario))
+        return chosen.epochs * chosen.updates_per_epoch
+
     def appearance(self, wildcards: Any) -> int:
-        """Iterations."""
-        return self._benchmark.config.images.appearance.iterations
+        """Iterations, of the splats of all methods or of one method's own."""
+        owner = wildcards.looks.removeprefix("appearance-")
+        if owner not in self._benchmark.splats:
+            return self._benchmark.config.images.appearance.iterations
+        return benchmarks.appearance_of(self._benchmark.config, self._benchmark.splats[owner], owner).iterations
 
     def scenario(self, wildcards: Any) -> int:
         """Frames."""

@@ -18,13 +18,16 @@ import pandas as pd
 
 from neuspring import config, metrics, provenance
 from neuspring.artifacts import Observations, Trajectory, Twin
+from neuspring.checkpoint import checkpoint_key
 from neuspring.config import Config, Kind, ScenarioRow
 from neuspring.errors import InputError, NumericalFailure
-from neuspring.files import write_table, write_text
+from neuspring.files import write_history, write_table, write_text
 from neuspring.records import RECORD_FORMAT, StageRecord, Stopwatch, canonical, digest_file, now
 
-RESULT_ROLES = ("twin", "trajectory")
+RESULT_ROLES = ("twin", "model", "trajectory", "centres")
 """Files of a stage that are its result, as opposed to how it got there."""
+LEARNING = ("search", "fit", "train")
+"""Stages that learn, in order, where a run has them; the last of them made its model."""
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
@@ -85,7 +88,7 @@ def search(observations_path: Path, settings: Config, clusters: int, seed: int, 
     }
     # The budget is not part of the key: a search with a larger one begins with the same candidates.
     same = common["settings"] | {"search": {name: value for name, value in chosen["search"].items() if name != "rollouts"}}
-    key = _key(common["inputs"], same, device, "neuspring.search")
+    key = checkpoint_key(common["inputs"], same, device, "neuspring.search")
     trace = output.with_name("trace.parquet")
     try:
         result = run(problem, seed, record=trace, key=key)
@@ -95,7 +98,7 @@ def search(observations_path: Path, settings: Config, clusters: int, seed: int, 
     folder = output.parent
     result.twin.save(folder / "twin.npz")
     costs = result.trace["cost"]
-    write_table(_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}), folder / "history.parquet")
+    write_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}, folder / "history.parquet")
     files = {"twin": folder / "twin.npz", "trace": trace, "history": folder / "history.parquet"}
     facts = {
         **result.values,
@@ -134,7 +137,7 @@ def fit(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     sections = (settings.fit, settings.simulation, settings.losses, settings.released_quirks)
     problem = FitProblem(observations, coarse, *sections, device, kind, int(seed))
     same = {"observations": inputs["observations"], "twin": before.files["twin"][1]}
-    key = _key(same, common["settings"], device, "neuspring.fit")
+    key = checkpoint_key(same, common["settings"], device, "neuspring.fit")
     partial = output.with_name("fit.partial.npz")
     try:
         result = run(problem, partial=partial, key=key)
@@ -144,7 +147,7 @@ def fit(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     folder = output.parent
     result.twin.save(folder / "twin.npz")
     columns = {name: result.history[name] for name in ("loss", "tail_loss", "gradient_norm", "learning_rate")}
-    write_table(_history(result.history["epoch"], columns), folder / "history.parquet")
+    write_history(result.history["epoch"], columns, folder / "history.parquet")
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
@@ -253,7 +256,8 @@ def score(
 ) -> None:
     """Trajectory -> scores.parquet, plots, and run.json: the record of the whole run, which MLflow indexes.
 
-    `records` maps search, fit (if any), rollout and, for scenarios with images, appearance and render to their records.
+    `records` maps the method's stages (search and fit, or train, if any), rollout and, for scenarios with images, appearance and
+    render to their records. A run that failed also gets held.parquet: its scores with the last frame that there is held.
     """
     clock = Stopwatch()
     observations = Observations.load(observations_path)
@@ -268,11 +272,13 @@ def score(
         table = metrics.score(trajectory, observations, method, seed)
     drawn = _drawn(stages, records)
     if drawn is not None and trajectory is not None:
-        pictured = metrics.score_images(drawn, observations.scenario, len(trajectory.positions), method, seed)
-        table = pd.concat([part for part in (table, pictured) if len(part)] or [table], ignore_index=True)
+        table = _with_pictures(table, drawn, len(trajectory.positions), observations, method, seed)
     write_table(table, folder / "scores.parquet")
-    histories = {name: records[name].parent / "history.parquet" for name in ("search", "fit") if "history" in _files(stages, name)}
+    held_file = _write_held(stages, trajectory, drawn, observations, method, seed, folder) if last.status == "failed" else None
+    learned = [name for name in LEARNING if name in stages]
+    histories = {name: records[name].parent / "history.parquet" for name in learned if "history" in _files(stages, name)}
     twin_stage = "fit" if "fit" in stages else "search"
+    maker = stages[learned[-1] if learned else "rollout"]
     artefacts = {"records": list(records.values())}
     twin, searched = (_twin(stages, records, name) for name in (twin_stage, "search"))
     if twin is not None:
@@ -292,7 +298,8 @@ def score(
         artefacts["images"] += [
             stages["render"].file(role, records["render"]) for role in PICTURE_ROLES if role in _files(stages, "render")
         ]
-        artefacts["plots"].append(figures.image_scores_figure(drawn, observations.scenario, method, folder / "plots"))
+        shown = drawn[drawn["frame"] < len(trajectory.positions)] if trajectory is not None else drawn
+        artefacts["plots"].append(figures.image_scores_figure(shown, observations.scenario, method, folder / "plots"))
     content = {
         "scenario": observations.scenario.name,
         "method": method,
@@ -316,19 +323,45 @@ def score(
         "category": observations.scenario.category,
         "attempt": max(record.attempts for record in stages.values()),
         "commit": provenance.commit(),
-        "device": stages[twin_stage].device,
+        "device": maker.device,
         "started": min(record.started for record in stages.values()),
         "ended": now(),
         "params": _parameters(stages, variant),
         "timings": {name: record.seconds for name, record in stages.items()} | {"score": round(clock.seconds, 3)},
         "peak_memory_mb": {name: record.peak_memory_mb for name, record in stages.items()},
         "machine": last.machine,
-        "versions": stages[twin_stage].versions,
+        "versions": maker.versions,
         "scores_file": "scores.parquet",
+        "held_file": held_file,
         "histories": {name: _relative(path, folder) for name, path in histories.items()},
         "artifacts": {name: [_relative(path, folder) for path in paths] for name, paths in artefacts.items()},
     }
     write_text(output, json.dumps(run, indent=1, sort_keys=True, allow_nan=False) + "\n")
+
+
+def _with_pictures(
+    table: pd.DataFrame, drawn: pd.DataFrame, frames: int, observations: Observations, method: str, seed: int
+) -> pd.DataFrame:
+    """Scores, and those of the first `frames` pictures."""
+    pictured = metrics.score_images(drawn, observations.scenario, frames, method, seed)
+    return pd.concat([part for part in (table, pictured) if len(part)] or [table], ignore_index=True)
+
+
+def _write_held(
+    stages: Mapping[str, StageRecord],
+    trajectory: Trajectory | None,
+    drawn: pd.DataFrame | None,
+    observations: Observations,
+    method: str,
+    seed: int,
+    folder: Path,
+) -> str:
+    """held.parquet, and its name: scores with the last frame held, or frame 0 where there is none."""
+    whole = metrics.held(trajectory, observations)
+    table = metrics.score(whole, observations, method, seed)
+    if drawn is not None:
+        table = _with_pictures(table, drawn, len(whole.positions), observations, method, seed)
+    return write_table(table, folder / "held.parquet").name
 
 
 def _drawn(stages: Mapping[str, StageRecord], records: Mapping[str, Path]) -> pd.DataFrame | None:
@@ -355,6 +388,11 @@ def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
     if rendered and rendered.facts.get("empty_frames"):
         notes.append(f"render: {rendered.facts['empty_frames']} frames show nothing of the object and have no PSNR")
     for name, record in stages.items():
+        if str(record.facts.get("start", "")).startswith("seen:"):
+            notes.append(f"{name}: without a shape prior, splats begin where something was seen")
+        if record.facts.get("vgg16", "computed") not in ("computed", "not asked for"):
+            # Not why: that names places on this machine.
+            notes.append(f"{name}: without the loss of VGG16's features, whose weights are not there")
         if record.facts.get("rollbacks"):
             wanted = record.settings["fit"]["epochs"]
             count = len(record.facts["rollbacks"])
@@ -375,21 +413,6 @@ def _twin(stages: Mapping[str, StageRecord], records: Mapping[str, Path], name: 
 
 def _relative(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path, folder)).as_posix()
-
-
-def _key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, module: str) -> str:
-    """What a checkpoint must match to be continued from: inputs, settings, device kind and code."""
-    values = [dict(inputs), dict(settings), device.partition(":")[0], provenance.code_digest(module)]
-    return hashlib.sha256(canonical(values).encode()).hexdigest()
-
-
-def _history(steps: Any, columns: Mapping[str, pd.Series]) -> pd.DataFrame:
-    """Long form for MLflow: step, metric, value; missing values are left out."""
-    parts = [
-        pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": values.to_numpy(float)})
-        for name, values in columns.items()
-    ]
-    return pd.concat(parts).dropna().reset_index(drop=True)
 
 
 def _twin_facts(twin: Twin) -> dict[str, Any]:

@@ -9,7 +9,16 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from neuspring import config, config_gpus, config_images, config_perception, config_tune
+from neuspring import (
+    config,
+    config_baselines,
+    config_gpus,
+    config_gs_dynamics,
+    config_images,
+    config_perception,
+    config_spring_gaus,
+    config_tune,
+)
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Configuration
@@ -53,7 +62,8 @@ Everything is checked before the first job: unknown keys, wrong types (YAML read
 scenarios, methods and searches, missing data, a results folder that cannot be written. Values are never cast.
 
 - `scenarios.tsv`: one row per capture (toy scenes, motion capture, the 22 PhysTwin scenarios).
-- `methods.yaml`: one row per method: the search it starts from, the stage that follows, its own `fit` settings.
+- `methods.yaml`: one row per method: the search it starts from, the stage that follows, its own `fit` settings; or the model of a
+  baseline and its own settings of `baselines`.
 - `searches.yaml`: one row per search: into how many regions the topology is divided (`clusters`), its own `search` settings.
 - Threads, cores and executors are not configuration: they live on the command line and in `workflow/profiles/`.
 
@@ -88,6 +98,9 @@ KEYS = {
     "images.appearance": config_images.Appearance,
     "images.lpips": config_images.LpipsWeights,
     "images.released_quirks": config_images.ImageQuirks,
+    "baselines": config_baselines.Baselines,
+    "baselines.spring_gaus": config_spring_gaus.SpringGaus,
+    "baselines.gs_dynamics": config_gs_dynamics.GsDynamics,
     "tracking": config.Tracking,
     "tune": config_tune.Tune,
     "tune.space": config_tune.Dimension,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -256,6 +257,52 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     benchmark(tmp_path, search_table="soft.yaml", **narrow)
 
 
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{description: x}", "either search or model is required, received search None and model None"),
+        ("{model: static, search: uniform, description: x}", "either search or model is required"),
+        (
+            "{model: gs_dynamics, fit: field, carry_over: true, description: x}",
+            "fit, carry_over: these belong to methods",
+        ),
+        ("{model: gs_dynamics, appearance: {}, description: x}", "only spring_gaus draws with splats of its own"),
+        ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none, received \['epochs'\]"),
+        ("{model: spring_gauss, description: x}", "model: .*'spring_gaus'"),
+        ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
+        (
+            "{model: spring_gaus, settings: {full_neighbours: 30}, description: x}",
+            "method bad, settings: .*full_neighbours: at most",
+        ),
+        ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
+        ("{model: gs_dynamics, settings: {min_visible: 5000}, description: x}", "method bad, settings: .*min_visible: at most"),
+        ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
+    ],
+)
+def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
+    write(tmp_path / "bad.yaml", f"bad: {row}\n")
+    with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
+        benchmark(tmp_path, method_table="bad.yaml", methods=["bad"])
+
+
+def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
+    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_ignore_hands"]
+    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": names}
+    values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
+    made = Benchmark.of(values, ROOT)
+    assert made.pictured == {"spring_gaus", "spring_gaus_ignore_hands"}
+    assert made.applies("spring_gaus", "synthetic_single_lift_rope")
+    assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
+    assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
+    left_out = ("toy_rope_lift_smooth",)
+    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_ignore_hands": left_out}
+    # The same splats are made once; who trains on points draws with those of all methods.
+    assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_ignore_hands": "spring_gaus"}
+    assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
+    blind = Benchmark.of(values | {"images": {"enabled": False}}, ROOT)
+    assert blind.whole_left_out["spring_gaus"] == tuple(values["scenarios"])
+
+
 def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) -> None:
     rows = "".join(f"{name}\tmocap\tcable\tcable.csv\tfalse\ttrue\n" for name in ("one", "other"))
     write(tmp_path / "cables.tsv", HEADER + rows)
@@ -273,8 +320,9 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     values = config.read_yaml(root / "config" / "config.yaml")
     made = Benchmark.of(values | {"methods": list(methods)}, root)
     for name, method in made.methods.items():
-        tables.fit_of(made.config, method, name)
-        tables.search_of(made.config, made.searches[method.search], method.search)
+        if method.search:
+            tables.fit_of(made.config, method, name)
+            tables.search_of(made.config, made.searches[method.search], method.search)
     for name in methods:
         if name.startswith("clusters_"):
             assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))

@@ -14,7 +14,7 @@ from tests.data.phystwin_case import dump
 from tests.perception.filmed import film, write_raw
 from tests.perception.test_perceive import perceived
 
-from .project import copy_workflow, jobs, run
+from .project import copy_finished, copy_workflow, jobs, run
 
 PACKAGE = "synthetic_weird_package"
 PERCEPTION = {
@@ -104,6 +104,27 @@ def test_all_methods_share_one_appearance(finished):
     assert "appearance" not in jobs(run(finished, SYNTHETIC | {"images": quirk}, "--dry-run"))
     planned = jobs(run(finished, SYNTHETIC | {"results": "other", "images": {"enabled": False}}, "--dry-run"))
     assert "render" not in planned
+
+
+def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(finished, tmp_path):
+    project = copy_finished(finished, tmp_path / "project")
+    small = {"anchors": 100, "iterations": 1, "substeps": 100}
+    changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus", "spring_gaus_ignore_hands"], "tracking": {"enabled": False}}
+    planned = jobs(run(project, changes | {"baselines": {"spring_gaus": small}}, "--dry-run"))
+    # Both variants share their splats; those of all methods are there.
+    assert (planned["appearance"], planned["train"], planned["predict"], planned["render"]) == (1, 2, 2, 2)
+    changes["methods"] = ["search_only", "spring_gaus"]
+    result = run(project, changes | {"baselines": {"spring_gaus": small}})
+    assert result.returncode == 0, result.stdout + result.stderr
+    folder = project / "results" / PACKAGE
+    assert (folder / "appearance-spring_gaus" / "0" / "splats.ply").is_file()
+    record = json.loads((folder / "spring_gaus" / "0" / "run.json").read_text())
+    assert record["status"] == "ok"
+    assert record["variant"]["model"] == "spring_gaus"
+    assert "../../appearance-spring_gaus/0/appearance.json" in record["artifacts"]["records"]
+    scores = pd.read_parquet(folder / "spring_gaus" / "0" / "scores.parquet")
+    assert set(scores["metric"]) == {"chamfer", "track_error", "psnr", "ssim", "iou"}
+    assert (folder / "spring_gaus" / "0" / "centres.npz").is_file()
 
 
 def test_the_truth_lies_beside_the_capture_and_not_in_it(finished):

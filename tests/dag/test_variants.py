@@ -8,7 +8,7 @@ import pandas as pd
 
 from neuspring import config, tracking
 
-from .project import SCENE, run
+from .project import SCENE, jobs, run
 
 
 def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(place):
@@ -48,6 +48,42 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(plac
     assert more.returncode == 0, text
     assert "continuing the search after 11 rollouts" in text
     assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
+
+
+def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_apply(place):
+    changes = {
+        "methods": ["search_only", "static", "controller_lbs", "spring_gaus", "spring_gaus_points", "gs_dynamics"],
+        "baselines": {
+            "spring_gaus": {"anchors": 60, "neighbours": 8, "full_neighbours": 6, "iterations": 1},
+            "gs_dynamics": {"width": 8, "batch": 2, "epochs": 1, "updates_per_epoch": 2, "step": 0.002},
+        },
+        "studies": ["table1"],
+        "compare_with": "static",
+        "tracking": {"enabled": False},
+    }
+    result = run(place, changes)
+    text = result.stdout + result.stderr
+    assert result.returncode == 0, text
+    results = place / "results"
+    summary = (results / "tables" / "summary.md").read_text()
+    assert f"Left out: spring_gaus on {SCENE}: it needs images" in summary
+    runs = pd.read_csv(results / "tables" / "runs.csv")
+    assert set(runs["method"]) == set(changes["methods"]) - {"spring_gaus"}
+    assert set(runs["status"]) == {"ok"}
+    folder = results / SCENE / "gs_dynamics" / "0"
+    assert {"train.json", "model.npz", "history.parquet", "rollout.json", "trajectory.npz", "run.json"} <= set(names(folder))
+    assert "train.json" not in names(results / SCENE / "static" / "0")
+    assert "GS-Dynamics" in (results / "tables" / "studies" / "table1.md").read_text()
+    assert "spring_gaus_points" in (results / "tables" / "report.html").read_text()
+    # A model's own settings train it alone again.
+    changes["baselines"]["gs_dynamics"]["epochs"] = 2
+    again = jobs(run(place, changes, "--dry-run"))
+    assert {name: again[name] for name in ("train", "predict", "score")} == {"train": 1, "predict": 1, "score": 1}
+    assert "search" not in again
+
+
+def names(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir()]
 
 
 def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):

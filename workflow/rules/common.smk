@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from neuspring import benchmark as benchmarks
 from neuspring import config as settings
 from neuspring import gpus, job, needs, plan, tune_space
+from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
 from neuspring.job_records import (
@@ -99,6 +100,7 @@ POOL = checked_pool()
 GPU = int(DEVICE == "cuda" or (DEVICE == "auto" and (CLUSTER or bool(POOL))))
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 memory, search_work, fit_work = NEEDS.memory, NEEDS.search, NEEDS.fit
+train_work = NEEDS.train
 appearance_work, frame_work = NEEDS.appearance, NEEDS.scenario
 
 

@@ -1,15 +1,17 @@
-# Pictures: splats once per scenario and seed, shared by all methods; drawn and scored per method.
+# Pictures: splats once per scenario and seed, shared by all methods without splats of their own; drawn and scored per method.
 rule appearance:
     input:
         capture=capture_file,
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
         points=first_points,
     output:
-        f"{RESULTS}/{{scenario}}/appearance/{{seed}}/appearance.json",
+        f"{RESULTS}/{{scenario}}/{{looks}}/{{seed}}/appearance.json",
     log:
-        f"{RESULTS}/logs/appearance/{{scenario}}/{{seed}}.log",
+        f"{RESULTS}/logs/appearance/{{scenario}}/{{looks}}/{{seed}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/appearance/{{scenario}}/{{seed}}.tsv"
+        f"{RESULTS}/benchmarks/appearance/{{scenario}}/{{looks}}/{{seed}}.tsv"
+    wildcard_constraints:
+        looks=LOOKS,
     priority: GPU_FIRST
     retries: 2
     conda:
@@ -43,7 +45,7 @@ rule render:
         capture=capture_file,
         masks=lambda wildcards: camera_files(wildcards, "masks.json"),
         observations=rules.observe.output,
-        appearance=rules.appearance.output,
+        appearance=appearance_records,
         rollout=rules.rollout.output,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/render.json",

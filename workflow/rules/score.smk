@@ -1,8 +1,9 @@
 rule score:
     input:
         observations=rules.observe.output,
-        search=search_record,
+        search=search_records,
         fit=fit_records,
+        train=train_records,
         rollout=rules.rollout.output,
         appearance=appearance_records,
         render=render_records,
@@ -21,13 +22,13 @@ rule score:
         mem_mb=memory("score", 4000),
         runtime=minutes("score", 30, frame_work),
     params:
-        fit=fit_option,
+        stages=stage_options,
         pictures=picture_options,
         variant=variant,
         code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
     shell:
         scenario_job(
-            "score --observations {input.observations:q} --search {input.search:q} {params.fit:q}"
+            "score --observations {input.observations:q} {params.stages:q}"
             " --rollout {input.rollout:q} {params.pictures:q} --method {wildcards.method} --variant {params.variant:q} --seed {wildcards.seed}"
             " --output {output:q}"
         )

@@ -69,6 +69,8 @@ rule rollout:
         f"{RESULTS}/logs/rollout/{{scenario}}/{{method}}/{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/rollout/{{scenario}}/{{method}}/{{seed}}.tsv"
+    wildcard_constraints:
+        method=methods_with_search(),
     priority: GPU_FIRST
     retries: 2
     conda:

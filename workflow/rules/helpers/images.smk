@@ -9,12 +9,27 @@ def image_settings(*names):
 
 def appearance_settings(wildcards):
     """What trains splats; of processed data, which perception has not lifted, also how masks are lifted."""
-    chosen = json.loads(image_settings("backend", "appearance"))
+    chosen = json.loads(image_settings("backend"))
+    chosen["images"]["appearance"] = settings.plain(looks_of(wildcards.looks))
     quirks = settings.plain(CONFIG)["images"]["released_quirks"]
     chosen["images"]["released_quirks"] = {"corner_pixels": quirks["corner_pixels"]}
     if BENCHMARK.scenarios[wildcards.scenario].source not in settings.FILMED:
         chosen |= json.loads(perception_settings("lift"))
     return json.dumps(chosen, sort_keys=True)
+
+
+SHARED_LOOKS = "appearance"
+LOOKS = "|".join(
+    [SHARED_LOOKS, *(f"{SHARED_LOOKS}-{re.escape(name)}" for name in BENCHMARK.splats)]
+)
+
+
+def looks_of(folder):
+    """How the splats of a folder are trained: those of all methods, or a method's own."""
+    name = folder.removeprefix(f"{SHARED_LOOKS}-")
+    if name == SHARED_LOOKS:
+        return CONFIG.images.appearance
+    return benchmarks.appearance_of(CONFIG, BENCHMARK.splats[name], name)
 
 
 def first_points(wildcards):
@@ -40,9 +55,9 @@ def appearance_records(wildcards):
     """The record of the splats, for scenarios with images."""
     if not BENCHMARK.has_images(wildcards.scenario):
         return []
-    return [
-        f"{RESULTS}/{wildcards.scenario}/appearance/{wildcards.seed}/appearance.json"
-    ]
+    owner = BENCHMARK.splats_of_method.get(wildcards.method)
+    looks = f"{SHARED_LOOKS}-{owner}" if owner else SHARED_LOOKS
+    return [f"{RESULTS}/{wildcards.scenario}/{looks}/{wildcards.seed}/appearance.json"]
 
 
 def render_records(wildcards):

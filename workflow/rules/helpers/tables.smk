@@ -1,12 +1,12 @@
 # What the rules of tables, studies and the report ask: which runs they are made of.
 def run_records(methods=CONFIG.methods):
-    return expand(
-        "{results}/{scenario}/{method}/{seed}/run.json",
-        results=RESULTS,
-        scenario=CONFIG.scenarios,
-        method=methods,
-        seed=CONFIG.seeds,
-    )
+    return [
+        f"{RESULTS}/{scenario}/{method}/{seed}/run.json"
+        for scenario in CONFIG.scenarios
+        for method in methods
+        if BENCHMARK.applies(method, scenario)
+        for seed in CONFIG.seeds
+    ]
 
 
 def tracked_runs(methods=CONFIG.methods):
@@ -42,6 +42,12 @@ def transfer_option():
     return ["--transfers", *sources] if sources else []
 
 
+def left_out_option():
+    """Which methods do not apply to which scenarios, so that nothing is missing there."""
+    left_out = BENCHMARK.whole_left_out
+    return ["--left-out", json.dumps(left_out, sort_keys=True)] if left_out else []
+
+
 def benchmark_arguments(output):
     """The results folder, and which runs it is to hold in the end, whatever part of them is run now."""
     whole = BENCHMARK.whole
@@ -49,6 +55,7 @@ def benchmark_arguments(output):
         *("--results", RESULTS, "--output", output),
         *("--scenarios", *whole.scenarios),
         *("--methods", *whole.methods, "--seeds", *map(str, whole.seeds)),
+        *left_out_option(),
     ]
 
 
@@ -77,4 +84,5 @@ def report_arguments(output=REPORT):
         *("--table", str(ROOT / CONFIG.study_table), "--tables", CONFIG.tables),
         *("--baseline", BENCHMARK.compared_with),
         *transfer_option(),
+        *left_out_option(),
     ]

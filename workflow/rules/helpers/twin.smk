@@ -37,6 +37,13 @@ def settings_of_fit(name):
     return json.dumps(chosen, sort_keys=True)
 
 
+def search_records(wildcards):
+    """The search's record; a baseline's model has none."""
+    if BENCHMARK.methods[wildcards.method].model:
+        return []
+    return [search_record(wildcards)]
+
+
 def search_record(wildcards):
     method = (BENCHMARK.methods | BENCHMARK.fits)[wildcards.method]
     return f"{RESULTS}/{wildcards.scenario}/search-{method.search}/{wildcards.seed}/search.json"
@@ -71,10 +78,6 @@ def rollout_twins(wildcards):
     ]
 
 
-def fit_option(wildcards, input):
-    return ["--fit", str(input.fit)] if input.get("fit") else []
-
-
 def carry_option(wildcards):
     return "--carry-over" if BENCHMARK.methods[wildcards.method].carry_over else ""
 
@@ -88,6 +91,8 @@ def variant_of(name):
     """The switches of a method, for its record."""
     method = BENCHMARK.methods[name]
     row = settings.plain(method)
+    if method.model:
+        return json.dumps({"model": method.model, **row["settings"]}, sort_keys=True)
     return json.dumps(
         {
             "search": method.search,
@@ -113,7 +118,7 @@ def transfer_records():
     methods = [
         name
         for name, method in BENCHMARK.methods.items()
-        if not (method.carry_over or method.average_seeds)
+        if method.search and not (method.carry_over or method.average_seeds)
     ]
     return expand(
         "{results}/{scenario}/{method}/{seed}/transfer.json",
