@@ -42,6 +42,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench_frame
 	$(BIN)/python -m tests.benchmarks.bench_adjoint
 	$(BIN)/python -m tests.benchmarks.bench_splats
+	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
 	$(BIN)/python -m tests.benchmarks.bench_start
 	$(BIN)/python -m tests.benchmarks.bench_workflow
 

@@ -76,7 +76,6 @@ def learn(
     seen = _seen_points(capture, loaded, settings, seed, width, lifted_record, observations_path)
     _require_outside(capture, np.concatenate([seen.cloud, seen.prior]))
     chosen_start = images.appearance.start
-    points, colours = seen.first(chosen_start, seed)
     plain = config.plain(settings)
     read = {"capture": folder / CAPTURE, **{f"masks{k}": path for k, path in enumerate(masks)}}
     read |= {"lift": lifted_record} if lifted_record else {}
@@ -89,6 +88,7 @@ def learn(
         "device": device,
     }
     try:
+        points, colours = seen.first(chosen_start, seed)
         trained = train(first_splats(points, colours, images.appearance, width), shots, images.appearance, seed, backend)
     except NumericalFailure as failure:
         clock.stage("appearance", "failed", reason=str(failure), **common).save(output)
@@ -307,7 +307,7 @@ class _Seen:
     """Whether the prior's points are uniform over its surface, so that their share is one of area."""
 
     def first(self, start: Literal["seen", "shape_prior", "alpha"], seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where splats begin, [R, 3] m, and their RGB [R, 3]. Raises InputError for `alpha` where what is seen is flat."""
+        """Where splats begin, [R, 3] m, and their RGB [R, 3]. Raises NumericalFailure for a flat `alpha`."""
         if start == "alpha":
             points = points_within(self.cloud, ALPHA, ALPHA_POINTS, seed)
             return points, np.full_like(points, GREY)

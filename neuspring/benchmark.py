@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neuspring import vgg16_weights
 from neuspring.config import (
     FILMED,
     MADE,
@@ -213,8 +214,10 @@ class Benchmark:
     def _check_settings(self, name: str, method: Method) -> None:
         """Settings of a method's own, before any job starts."""
         if method.model:
-            if method.trained:
-                model_of(self.config, method, name)
+            chosen = model_of(self.config, method, name) if method.trained else None
+            if name in self.pictured and isinstance(chosen, SpringGaus):
+                # Named weights that are missing or wrong are an error before the first job.
+                vgg16_weights.find(chosen.vgg16)
             appearance_of(self.config, method, name)
         if not (method.search and method.fit):
             return

@@ -35,10 +35,11 @@ def write(results: Path, scenarios: Iterable[str], methods: Iterable[str], seed:
     for scenario in scenarios:
         place = Path(results) / scenario
         shown = [_figure(place / method / str(seed), scenario, method, seed, scores, folder) for method in methods]
-        learned = place / "appearance" / str(seed) / "appearance.png"
+        # Those of all methods, then those of methods with splats of their own.
+        learned = sorted(place.glob(f"appearance*/{seed}/appearance.png"))
         body = "<p>No pictures: no images, or no finished run.</p>"
         if any(shown):
-            splats = _image(learned, folder) if learned.is_file() else ""
+            splats = "".join(_image(path, folder) for path in learned)
             body = f'<details><summary>Splats of frame 0</summary>{splats}</details><div class="methods">{"".join(shown)}</div>'
         sections.append(f"<h2>{html.escape(scenario)}</h2>\n{body}\n")
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>NeuSpring: pictures</title>'

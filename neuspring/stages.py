@@ -393,6 +393,8 @@ def _notes(stages: Mapping[str, StageRecord]) -> list[str]:
         if record.facts.get("vgg16", "computed") not in ("computed", "not asked for"):
             # Not why: that names places on this machine.
             notes.append(f"{name}: without the loss of VGG16's features, whose weights are not there")
+        if record.facts.get("links") == 0:
+            notes.append(f"{name}: no anchor lies near a controller in frame 0, so the hands move nothing")
         if record.facts.get("rollbacks"):
             wanted = record.settings["fit"]["epochs"]
             count = len(record.facts["rollbacks"])

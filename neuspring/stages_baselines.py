@@ -17,13 +17,10 @@ from neuspring.artifacts import Observations, SplatCentres
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.checkpoint import checkpoint_key
 from neuspring.config import Config
-from neuspring.config_baselines import Model
-from neuspring.errors import InputError
+from neuspring.config_baselines import TRAINING, Model
+from neuspring.errors import InputError, NumericalFailure
 from neuspring.files import write_history
 from neuspring.records import StageRecord, Stopwatch, digest_file
-
-SECTIONS = {"spring_gaus": ("simulation", "losses", "images"), "gs_dynamics": ()}
-"""Beside its own, the sections of the configuration that a model's training reads."""
 
 
 @dataclass(frozen=True)
@@ -43,37 +40,31 @@ def train(
     """Training frames -> model.npz, history.parquet, train.json. Continues from a checkpoint that a killed job left.
 
     `settings` has the method's own in the model's section of `baselines`. Raises InputError where silhouettes are asked for
-    without pictures, and for models without training.
+    without pictures, and for models without training. What cannot be trained is a failure, recorded without a model.
     """
     from neuspring.physics.solver import resolve_device
 
-    if model not in SECTIONS:
-        raise InputError("--model", f"only {', '.join(SECTIONS)} are trained", model)
+    if model not in TRAINING:
+        raise InputError("--model", f"only {', '.join(TRAINING)} are trained", model)
     clock, device = Stopwatch(), resolve_device(device)
     observations = Observations.load(observations_path)
     inputs = {"observations": digest_file(observations_path)}
     if pictures:
         inputs |= {f"masks{k}": digest_file(path) for k, path in enumerate(pictures.masks)}
         inputs["appearance"] = digest_file(pictures.appearance_record)
-    plain = config.plain(settings)
-    chosen: dict[str, Any] = {"model": model, **plain["baselines"][model], "seed": seed}
-    common: dict[str, Any] = {"inputs": inputs, "settings": chosen, "device": device}
-    read = chosen | {name: plain[name] for name in SECTIONS[model]}
-    key = checkpoint_key(inputs, read, device, f"neuspring.baselines.{model}.train")
+    common: dict[str, Any] = {"inputs": inputs, "settings": _read(model, settings, seed), "device": device}
     partial = output.with_name("train.partial.npz")
-    result: Trained[Any]
-    if model == "gs_dynamics":
-        from neuspring.baselines.gs_dynamics import train as gs_dynamics
 
-        result = gs_dynamics.run(observations, settings.baselines.gs_dynamics, seed, device, partial, key)
-    else:
-        from neuspring.baselines.spring_gaus import setup
-        from neuspring.baselines.spring_gaus import train as spring_gaus
+    def failed(reason: str) -> None:
+        clock.stage("train", "failed", reason=reason, **common).save(output)
 
-        seen = pictures and setup.Seen.of(pictures.folder, pictures.masks, _splats_of(pictures.appearance_record), settings, device)
-        problem, facts = setup.problem(observations, seen or None, settings, seed, device)
-        result = spring_gaus.run(problem, partial, key)
-        result.facts.update(facts)
+    learned = StageRecord.load(pictures.appearance_record) if pictures else None
+    if learned and learned.status == "failed":
+        return failed(f"appearance: {learned.reason}")
+    try:
+        result = _trained(observations, model, settings, pictures, partial, common)
+    except NumericalFailure as failure:
+        return failed(str(failure))
     paths = {"model": output.with_name("model.npz"), "history": output.with_name("history.parquet")}
     result.model.save(paths["model"])
     columns = {str(name): result.history[name] for name in result.history if name != "step"}
@@ -88,7 +79,44 @@ def train(
         earlier_seconds=result.earlier_seconds,
         **common,
     ).save(output)
-    partial.unlink(missing_ok=True)
+    return partial.unlink(missing_ok=True)
+
+
+def _read(model: Model, settings: Config, seed: int) -> dict[str, Any]:
+    """All settings that a training reads."""
+    plain = config.plain(settings)
+    found: dict[str, Any] = {"model": model, **plain["baselines"][model], "seed": seed}
+    if model == "gs_dynamics":
+        return found
+    found["gravity"] = plain["simulation"]["gravity"]
+    if settings.baselines.spring_gaus.supervision == "points":
+        return found | {"losses": plain["losses"]}
+    return found | {"backend": plain["images"]["backend"], "corner_pixels": plain["images"]["released_quirks"]["corner_pixels"]}
+
+
+def _trained(
+    observations: Observations, model: Model, settings: Config, pictures: Pictures | None, partial: Path, common: dict[str, Any]
+) -> Trained[Any]:
+    """Raises NumericalFailure where there is nothing to train."""
+    device, seed = common["device"], common["settings"]["seed"]
+
+    def key(**more: Any) -> str:
+        return checkpoint_key(common["inputs"], common["settings"] | more, device, TRAINING[model])
+
+    if model == "gs_dynamics":
+        from neuspring.baselines.gs_dynamics import train as gs_dynamics
+
+        return gs_dynamics.run(observations, settings.baselines.gs_dynamics, seed, device, partial, key())
+    from neuspring.baselines.spring_gaus import setup
+    from neuspring.baselines.spring_gaus import train as spring_gaus
+
+    seen = None
+    if pictures:
+        seen = setup.Seen.of(pictures.folder, pictures.masks, _splats_of(pictures.appearance_record), settings, device)
+    problem, facts = setup.problem(observations, seen, settings, seed, device)
+    result: Trained[Any] = spring_gaus.run(problem, partial, key(vgg16=facts.get("vgg16") == "computed"))
+    result.facts.update(facts)
+    return result
 
 
 def predict(

@@ -32,9 +32,9 @@ snakemake --profile workflow/profiles/default --cores 2 --quiet rules \\
 ```
 
 The "default" column below is the program's: what holds where neither `config.yaml` nor an overlay sets a key. `config.yaml` sets
-`synthetic`, `perception`, `images.appearance`, `search.rollouts`, `search.start` and `fit.epochs` for its scenes, so overlays for
-other data set them anew. `--config` on the command line is for single values and lists of names at the top level; Snakemake hands
-numbers in lists over as text, which is refused, so `seeds` and nested keys are set in an overlay.
+`synthetic`, `perception`, `images.appearance`, `search.rollouts`, `search.start`, `fit.epochs` and `baselines` for its scenes, so
+overlays for other data set them anew. `--config` on the command line is for single values and lists of names at the top level;
+Snakemake hands numbers in lists over as text, which is refused, so `seeds` and nested keys are set in an overlay.
 
 | overlays, in this order | what they measure |
 |---|---|
@@ -52,6 +52,7 @@ numbers in lists over as text, which is refused, so `seeds` and nested keys are 
 | `true_observations.yaml` | the demo's scenes observed perfectly |
 | `raw.yaml` | your own RGBD video, or PhysTwin's raw layout, with the networks and settings of the released processing |
 | `heldout.yaml` | four scenes moved by another engine |
+| `baselines.yaml`, alone or behind `synthetic.yaml`, `mocap.yaml`, `toy.yaml` | every system of the paper's Table 1 |
 | `clusters.yaml`, alone or after `mocap.yaml` | 1 to 10 regions |
 | `benchmark.yaml` | the whole benchmark: the 22 released scenarios, every method and study of the paper, three seeds |
 | ..., `paper.yaml` | the same methods and studies on other data: behind `toy.yaml`, `synthetic.yaml` or `mocap.yaml` |

@@ -333,6 +333,8 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     [
         [],
         ["clusters"],
+        ["baselines"],
+        ["mocap", "baselines"],
         ["mocap"],
         ["mocap", "clusters"],
         ["mocap", "mocap_first_frame"],

@@ -118,7 +118,17 @@ LEVELS = [
     {"artifacts", "config", "progress", "kernels", "faults", "gpus"},
     {"records", "topology", "physics", "losses", "metrics", "provenance", "field", "motion", "points", "figures_views", "paper"},
     {"checkpoint", "weight_files"},
-    {"image_metrics", "lpips_weights", "video", "job_records", "studies", "watch", "tracking_store", "tables_layout"},
+    {
+        "image_metrics",
+        "lpips_weights",
+        "vgg16_weights",
+        "video",
+        "job_records",
+        "studies",
+        "watch",
+        "tracking_store",
+        "tables_layout",
+    },
     {
         "rollout",
         "data",

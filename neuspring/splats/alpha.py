@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
-from neuspring.errors import InputError
+from neuspring.errors import NumericalFailure
 
 LEAST_VOLUME = 1e-15
 """m^3: flatter tetrahedra have no circumscribed sphere worth naming."""
@@ -15,13 +15,13 @@ def points_within(cloud: np.ndarray, alpha: float, count: int, seed: int) -> np.
     """`count` points [count, 3], m, uniform in the tetrahedra of the cloud [P, 3] whose circumscribed spheres have a
     radius below `alpha`, m.
 
-    Raises InputError where there are none: a cloud that is flat, or sparser than alpha.
+    Raises NumericalFailure where there are none: a cloud that is flat, or sparser than alpha.
     """
-    rule = f"the points seen in frame 0 must enclose a volume at alpha = {alpha} m"
+    failure = NumericalFailure(f"appearance: the {len(cloud)} points seen in frame 0 enclose no volume at alpha = {alpha} m")
     try:
         corners = cloud[Delaunay(cloud).simplices]
     except (QhullError, ValueError) as error:
-        raise InputError("appearance, start: alpha", rule, f"{len(cloud)} points", "Use start: seen or shape_prior.") from error
+        raise failure from error
     edges = corners[:, 1:] - corners[:, :1]
     volumes = np.abs(np.linalg.det(edges)) / 6
     solid = volumes > LEAST_VOLUME
@@ -30,7 +30,7 @@ def points_within(cloud: np.ndarray, alpha: float, count: int, seed: int) -> np.
     centres = np.linalg.solve(edges, 0.5 * (edges**2).sum(axis=2)[..., None])[..., 0]
     inside = np.linalg.norm(centres, axis=1) < alpha
     if not inside.any():
-        raise InputError("appearance, start: alpha", rule, f"{len(cloud)} points", "Use start: seen or shape_prior.")
+        raise failure
     draw = np.random.default_rng(seed)
     chosen = draw.choice(int(inside.sum()), count, p=volumes[inside] / volumes[inside].sum())
     weights = draw.dirichlet(np.ones(4), count)

@@ -83,7 +83,7 @@ def densify(
         children["log_scales"] = children["log_scales"] - torch.log(size.new_tensor(SHRINK))
         added = {name: torch.cat([added[name], children[name]]) for name in added}
     gone = split | _superfluous(splats, settings, extent, after_reset)
-    if after_reset:
+    if after_reset and settings.fixed_radius is None:
         gone |= statistics.radius > settings.prune_radius / REFERENCE_WIDTH
     stay = ~_superfluous(added, settings, extent, after_reset)
     return ~gone, {name: tensor[stay] for name, tensor in added.items()}

@@ -146,11 +146,18 @@ def test_nothing_after_the_training_frames_is_learned_and_only_frame_0_is_rolled
 
 def test_training_that_cannot_go_on_says_so_and_keeps_what_it_had():
     points, tools = cloud(25, 0)[None].repeat(4, axis=0), hands(4)
-    still = train.run(capture(points, hands(4, 0.001)), PLAIN, 0, "cpu")
-    assert still.failure == "training did not start: no window of a tool that moves 0.01 m in 4 training frames"
+    # Hands that never move a step: nothing is to be learned, and the model's answer is to hold.
+    resting = capture(points, hands(4, 0.001))
+    still = train.run(resting, PLAIN, 0, "cpu")
+    assert not still.failure and len(still.history) == 0 and "loss" in still.history
+    assert np.ptp(predict(still.model, resting, "cpu").trajectory.positions, axis=0).max() == 0
+    # Hands that move after the training frames alone: it never learned what to do, and still it does nothing at random.
+    late = np.concatenate([hands(4, 0.001), hands(4) + np.array([0.05, 0, 0])])
+    moving = capture(cloud(25, 0)[None].repeat(8, axis=0), late, train_end=4)
+    unprepared = train.run(moving, PLAIN, 0, "cpu")
+    assert unprepared.failure == "training did not start: no window of a tool that moves 0.01 m in 4 training frames"
+    assert np.ptp(predict(unprepared.model, moving, "cpu").trajectory.positions, axis=0).max() < 1e-6
     start = initial_weights(RULES, 0).numpy()
-    np.testing.assert_array_equal(still.model.weights, start)
-    assert len(still.history) == 0 and "loss" in still.history
     wild = train.run(capture(points, tools), replace(PLAIN, learning_rate=1e30), 0, "cpu")
     assert wild.failure == "training ended early: the loss is not finite (epoch 0, update 1)"
     np.testing.assert_array_equal(wild.model.weights, start)
@@ -181,7 +188,7 @@ def test_points_wait_while_the_tools_move_less_than_a_step():
 
 def test_points_that_leave_the_scene_end_the_rollout_by_name():
     seen = capture(cloud(25, 0)[None].repeat(8, axis=0), hands(8, 0.006))
-    trajectory = predict(pushes(600.0), seen, "cpu").trajectory
+    trajectory = predict(pushes(6.0), seen, "cpu").trajectory
     assert trajectory.diverged_frame == 4 and trajectory.positions.shape == (4, 27, 3)
     assert trajectory.reason == "node 0 left the scene in frame 4" and trajectory.frame_count == 8
     lost = predict(pushes(3e38, replace(RULES, propagation="nearest")), seen, "cpu").trajectory

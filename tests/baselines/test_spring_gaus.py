@@ -11,9 +11,9 @@ from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_a
 from neuspring.baselines.spring_gaus.model import SpringGausModel, soft_vector
 from neuspring.baselines.spring_gaus.predict import contraction, roll_out
 from neuspring.baselines.spring_gaus.solver import AnchorParameters, AnchorPhysics, AnchorSolver
-from neuspring.baselines.spring_gaus.train import Problem, run
+from neuspring.baselines.spring_gaus.train import Problem, Training, run
 from neuspring.config_spring_gaus import SpringGaus
-from neuspring.errors import InputError
+from neuspring.errors import NumericalFailure
 
 FRAME = 1 / 30
 SMALL = SpringGaus(anchors=72, neighbours=12, full_neighbours=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)
@@ -160,7 +160,7 @@ def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
 
 
 def test_too_few_anchors_are_refused():
-    with pytest.raises(InputError, match=r"more anchors than neighbours \(20\) are required; received 3"):
+    with pytest.raises(NumericalFailure, match=r"more anchors than neighbours \(20\) are required, and there are 3"):
         AnchorGraph.of(bar()[:3], np.zeros((1, 3)), 20, 0.04, 50)
 
 
@@ -201,6 +201,42 @@ def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(
     failed = run(Problem(stiff, hands.astype(np.float32), objective, settings))
     assert failed.failure.startswith("training ended early: the anchors left the scene (iteration 0, frame 1, 160 substeps)")
     np.testing.assert_array_equal(failed.model.kappa, stiff.kappa)
+
+
+def test_damping_that_is_clamped_can_come_back():
+    hands = swing(3)
+    start = replace(model_of(bar(), hands[0]), theta=np.ones(1))
+    sign = [-1.0]
+
+    def objective(iteration, frame, anchors):
+        # First less damping is wanted, then more: what moves by itself is what damping slows.
+        return sign[0] * (anchors - torch.tensor(start.anchors)).square().sum()
+
+    settings = replace(SMALL, iterations=1, damping_rate=0.01)
+    training = Training(Problem(start, hands.astype(np.float32), objective, settings))
+    training.iteration(0)
+    first = training.values["theta"].item()
+    sign[0] = -sign[0]
+    for number in range(1, 12):
+        training.iteration(number)
+    found = [first, training.values["theta"].item()]
+    assert min(found) >= 1.0 and max(found) > 1.0
+
+
+def test_a_failure_keeps_the_parameters_of_the_last_complete_iteration():
+    hands = swing(6)
+
+    def objective(iteration, frame, anchors):
+        return anchors.square().sum() * (float("nan") if (iteration, frame) == (1, 3) else 1.0)
+
+    settings = replace(SMALL, iterations=3, max_substeps=150)
+    start = model_of(bar(), hands[0])
+    failed = run(Problem(start, hands.astype(np.float32), objective, settings))
+    whole = run(Problem(start, hands.astype(np.float32), objective, replace(settings, iterations=1)))
+    assert failed.failure == "training ended early: the loss or its gradient is not finite (iteration 1, frame 3, 150 substeps)"
+    assert len(failed.history) == 1
+    for name in ("kappa", "theta", "velocity"):
+        np.testing.assert_array_equal(getattr(failed.model, name), getattr(whole.model, name))
 
 
 def test_a_killed_training_continues_to_the_same_model(tmp_path):

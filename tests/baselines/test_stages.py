@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring import config, stages, stages_baselines, tables
+from neuspring import config, config_baselines, stages, stages_baselines, tables
 from neuspring.artifacts import Observations, SplatCentres, Trajectory
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.config_baselines import Baselines
@@ -15,7 +15,7 @@ from neuspring.config_gs_dynamics import GsDynamics
 from neuspring.config_images import Appearance, Images
 from neuspring.config_spring_gaus import SpringGaus
 from neuspring.errors import InputError
-from neuspring.records import StageRecord
+from neuspring.records import StageRecord, Stopwatch
 from tests import small
 from tests.perception.filmed import FRAMES, film
 from tests.test_appearance import Scene
@@ -41,7 +41,7 @@ def run_all(seen, model: str, chosen: config.Config):
     """Train, predict and score; returns the path of run.json."""
     folder = seen.parent / model / "0"
     trained = None
-    if model in stages_baselines.SECTIONS:
+    if model in config_baselines.TRAINING:
         trained = folder / "train.json"
         stages_baselines.train(seen, model, chosen, 0, "cpu", trained)
     stages_baselines.predict(seen, model, trained, None, "cpu", folder / "rollout.json")
@@ -55,7 +55,7 @@ def test_every_model_passes_through_every_stage(seen, model):
     run = run_all(seen, model, settings())
     record = json.loads(run.read_text())
     assert (record["status"], record["held_file"]) == ("ok", None)
-    trained = model in stages_baselines.SECTIONS
+    trained = model in config_baselines.TRAINING
     assert ("train" in record["timings"], "train" in record["histories"]) == (trained, trained)
     scores = pd.read_parquet(run.with_name("scores.parquet"))
     assert set(scores["task"]) == {"reconstruction", "future"}
@@ -94,6 +94,28 @@ def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen)
     static = pd.read_parquet(seen.parent / "static" / "0" / still["scores_file"])
     # It diverges in the first frame, so frame 0 is held.
     np.testing.assert_allclose(held["value"], static["value"])
+
+
+def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path):
+    learned = tmp_path / "appearance.json"
+    Stopwatch().stage("appearance", "failed", reason="appearance: step 3 removed the last splat").save(learned)
+    pictures = stages_baselines.Pictures(tmp_path, [], learned)
+    out = seen.with_name("train.json")
+    stages_baselines.train(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", out, pictures)
+    found = StageRecord.load(out)
+    assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
+    lonely = settings(spring_gaus=replace(POINTS, neighbours=500))
+    run = run_all(seen, "spring_gaus", lonely)
+    record = json.loads(run.read_text())
+    assert record["status"] == "failed" and "more anchors than neighbours (500) are required" in record["reason"]
+    assert set(pd.read_parquet(run.with_name(record["held_file"]))["task"]) == {"reconstruction", "future"}
+
+
+def test_all_that_training_reads_is_in_its_record(seen):
+    out = seen.with_name("train.json")
+    stages_baselines.train(seen, "spring_gaus", settings(), 0, "cpu", out)
+    found = StageRecord.load(out).settings
+    assert found["gravity"] == 9.8 and found["losses"]["track"] == 1.0 and found["anchors"] == 60
 
 
 def test_what_is_missing_is_named(seen):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring import vgg16_weights
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.baselines.spring_gaus.vgg16 import Vgg16
 from neuspring.config_spring_gaus import SpringGaus

@@ -228,7 +228,7 @@ def test_points_within_an_alpha_shape_fill_the_body_and_no_gap():
     np.testing.assert_allclose(points[inside[0]].mean(axis=0), 0.025, atol=0.002)
     np.testing.assert_array_equal(points, points_within(cloud, 0.03, 2000, 0))
     for bad in (cloud * [1, 1, 0], 100 * cloud, cloud[:3]):
-        with pytest.raises(InputError, match=r"must enclose a volume at alpha = 0\.03 m"):
+        with pytest.raises(NumericalFailure, match=r"enclose no volume at alpha = 0\.03 m"):
             points_within(bad, 0.03, 10, 0)
 
 

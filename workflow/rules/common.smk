@@ -13,8 +13,15 @@ from types import SimpleNamespace
 
 from neuspring import benchmark as benchmarks
 from neuspring import config as settings
-from neuspring import gpus, job, needs, plan, tune_space
-from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring import (
+    config_baselines,
+    gpus,
+    job,
+    needs,
+    plan,
+    tune_space,
+    vgg16_weights,
+)
 from neuspring.data import phystwin, phystwin_raw
 from neuspring.errors import InputError
 from neuspring.job_records import (

@@ -13,9 +13,8 @@ from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.network import Dynamics
 from neuspring.baselines.gs_dynamics.propagate import carry, turns
 from neuspring.baselines.gs_dynamics.tracks import tools_of, upright
-from neuspring.baselines.gs_dynamics.windows import moved
-from neuspring.baselines.results import Prediction
-from neuspring.rollout import FAR
+from neuspring.baselines.gs_dynamics.windows import executed
+from neuspring.baselines.results import LIMIT, Prediction
 
 
 @dataclass
@@ -59,12 +58,10 @@ def roll_out(model: GsDynamicsModel, nodes: np.ndarray, tools: np.ndarray, devic
     start, hands = torch.tensor(nodes, device=device), torch.tensor(tools, device=device)
     steps = Steps([0], [start])
     history, last = start.expand(rules.history, -1, -1), [0] * rules.history
-    for frame in range(1, len(tools)):
-        if moved(tools, last[-1], frame) < rules.step:
-            continue
+    for frame in executed(tools, rules.step):
         after = step(dynamics, history, hands[[*last, frame]], steps)
         # NaN compares false, so this catches it together with infinity and absurd distances.
-        near = (after.abs() < FAR).all(dim=1)
+        near = (after.abs() < LIMIT).all(dim=1)
         if not bool(near.all()):
             node = int((~near).nonzero()[0])
             steps.reason, steps.diverged_frame = f"node {node} left the scene in frame {frame}", frame

@@ -21,7 +21,7 @@ from neuspring.baselines.gs_dynamics.network import Dynamics, initial_weights
 from neuspring.baselines.gs_dynamics.objective import draw, unroll
 from neuspring.baselines.gs_dynamics.rules import preset_name, resolve
 from neuspring.baselines.gs_dynamics.tracks import Tracks
-from neuspring.baselines.gs_dynamics.windows import Windows
+from neuspring.baselines.gs_dynamics.windows import Windows, executed
 from neuspring.baselines.results import Trained
 from neuspring.checkpoint import Checkpoint
 from neuspring.config_gs_dynamics import GsDynamics
@@ -98,6 +98,11 @@ class Training:
         """To the latest weights whose loss was finite."""
         self.weights.copy_(self.usable)
 
+    @torch.no_grad()
+    def hold(self) -> None:
+        """Predict no motion: the last layer, whose weights come last, is zero."""
+        self.weights[-3 * (self.rules.width + 1) :] = 0.0
+
     def facts(self, category: str) -> dict[str, Any]:
         """What was made of the capture."""
         return {
@@ -124,8 +129,11 @@ def run(
         print(f"continuing after epoch {len(history) - 1}")
     epochs = settings.epochs
     if not len(training.windows):
-        frames = observations.scenario.train_end
-        failure = f"training did not start: no window of a tool that moves {settings.step} m in {frames} training frames"
+        # What moves nothing yet must not move the object at random later.
+        training.hold()
+        if executed(observations.controller_points, settings.step):
+            frames = observations.scenario.train_end
+            failure = f"training did not start: no window of a tool that moves {settings.step} m in {frames} training frames"
         epochs = 0
     progress = Progress("train", epochs)
     for number in range(len(history), epochs):

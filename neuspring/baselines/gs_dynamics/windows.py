@@ -16,6 +16,15 @@ def moved(tools: np.ndarray, before: int, after: int) -> float:
     return float(np.linalg.norm(tools[after] - tools[before], axis=1).max())
 
 
+def executed(tools: np.ndarray, step: float) -> list[int]:
+    """Frames in which a rollout makes a step: those at which tools [T, C, 3] have moved `step`, m, since the one before."""
+    frames = [0]
+    for frame in range(1, len(tools)):
+        if moved(tools, frames[-1], frame) >= step:
+            frames.append(frame)
+    return frames[1:]
+
+
 def past(tools: np.ndarray, frame: int, step: float, count: int) -> list[int]:
     """`count` frames up to `frame`, oldest first, each at least a step before the next; filled up with the oldest."""
     chosen = [frame]

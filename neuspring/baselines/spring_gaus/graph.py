@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.errors import InputError
+from neuspring.errors import NumericalFailure
 
 SHORTEST_LINK = 1e-4
 """Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
@@ -36,16 +36,15 @@ class AnchorGraph:
     def of(cls, anchors: np.ndarray, controllers: np.ndarray, neighbours: int, reach: float, link_count: int) -> AnchorGraph:
         """Of anchors [N, 3] and controllers [C, 3] at frame 0, m.
 
-        Each controller is linked to its at most `link_count` nearest anchors within `reach`, m. Raises InputError if there are too
-        few anchors, or two at one place.
+        Each controller is linked to its at most `link_count` nearest anchors within `reach`, m. Raises NumericalFailure if there
+        are too few anchors, or two at one place.
         """
         if len(anchors) <= neighbours:
-            rule = f"more anchors than neighbours ({neighbours}) are required"
-            raise InputError("baselines.spring_gaus.neighbours", rule, len(anchors), "Ask for fewer neighbours.")
+            raise NumericalFailure(f"more anchors than neighbours ({neighbours}) are required, and there are {len(anchors)}")
         tree = cKDTree(anchors)
         distance, index = tree.query(anchors, k=neighbours + 1)
         if distance[:, 1].min() <= 0:
-            raise InputError("Spring-Gaus anchors", "no two anchors may lie at one place", int(distance[:, 1].argmin()))
+            raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
         # The nearest is the anchor itself: distances of others are positive.
         distance, index = distance[:, 1:], index[:, 1:]
         away, near = tree.query(controllers, k=min(link_count, len(anchors)), distance_upper_bound=reach)

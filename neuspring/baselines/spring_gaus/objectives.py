@@ -37,8 +37,8 @@ class Silhouettes:
     splats: Gaussians
     follower: Follower
     views: Mapping[str, View]
-    masks: Mapping[tuple[str, int], tuple[torch.Tensor, torch.Tensor]]
-    """(camera, frame) -> bool [H, W]: the object, and what counts."""
+    masks: Mapping[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
+    """(camera, frame) -> bool [H, W]: the object, and what counts (None: everything)."""
     loss: SilhouetteLoss
     backend: Backend
     seed: int
@@ -49,10 +49,10 @@ class Silhouettes:
         if not cameras:
             return None
         # Stateless, so that a continued training draws the same cameras.
-        drawn = np.random.default_rng([self.seed, iteration, frame]).integers(len(cameras))
-        name = cameras[int(drawn)]
+        name = cameras[int(np.random.default_rng([self.seed, iteration, frame]).integers(len(cameras)))]
         mask, counts = self.masks[name, frame]
-        return self.loss(self.cover(anchors, self.views[name]) * counts, (mask & counts).float())
+        drawn, wanted = self.cover(anchors, self.views[name]), mask.float()
+        return self.loss(drawn, wanted) if counts is None else self.loss(drawn * counts, wanted * counts)
 
     def cover(self, anchors: torch.Tensor, view: View) -> torch.Tensor:
         """Coverage [H, W] of the splats in a view: what they show in white on black."""

@@ -6,12 +6,11 @@ import numpy as np
 import torch
 
 from neuspring.artifacts import Observations, Trajectory
-from neuspring.baselines.results import Prediction
+from neuspring.baselines.results import LIMIT, Prediction
 from neuspring.baselines.spring_gaus.graph import Binding
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.objectives import Follower
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
-from neuspring.rollout import FAR
 
 
 @torch.no_grad()
@@ -26,7 +25,7 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
         # As in training: v0 is added on entering a frame and taken away on leaving it.
         x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
         v = v - start
-        near = (x.abs() < FAR).all(dim=1)
+        near = (x.abs() < LIMIT).all(dim=1)
         if not bool(near.all()):
             return torch.stack(kept), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
         kept.append(x)
@@ -38,7 +37,7 @@ def predict(model: SpringGausModel, observations: Observations, centres: np.ndar
     anchors, reason = roll_out(model, observations.controller_points, device)
     nodes = torch.tensor(observations.nodes, device=device)
     follow = Follower(Binding.of(observations.nodes, model.anchors, model.bound_anchors), device)
-    positions = torch.stack([nodes + follow(frame - anchors[0]) for frame in anchors]).cpu().numpy()
+    positions = np.stack([(nodes + follow(frame - anchors[0])).cpu().numpy() for frame in anchors])
     frames = len(observations.controller_points)
     diverged = len(anchors) if reason else None
     trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
@@ -46,7 +45,8 @@ def predict(model: SpringGausModel, observations: Observations, centres: np.ndar
     if centres is None:
         return Prediction(trajectory, facts)
     follow = Follower(Binding.of(centres, model.anchors, model.bound_anchors), device)
-    moved = torch.stack([follow(frame) for frame in anchors]).cpu().numpy()
+    # Frame by frame: hundreds of thousands of splats in hundreds of frames need not be on the device together.
+    moved = np.stack([follow(frame).cpu().numpy() for frame in anchors])
     return Prediction(trajectory, facts | contraction(centres, moved[0]), moved)
 
 

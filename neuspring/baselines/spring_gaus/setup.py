@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuspring import vgg16_weights
 from neuspring.artifacts import Observations
-from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.objectives import Follower, Points, Silhouettes
@@ -39,8 +39,8 @@ class Seen:
 
     splats: Splats
     views: dict[str, View]
-    masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor]]
-    """(camera, frame) -> bool [H, W]: the object, and what counts."""
+    masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
+    """(camera, frame) -> bool [H, W]: the object, and what counts (None: everything)."""
     backend: Backend
 
     @classmethod
@@ -48,12 +48,12 @@ class Seen:
         """From a capture, the records of its masks and a file of splats. Frames of the future are not read."""
         capture, images = Capture.load(folder), settings.images
         perceived = masks_of_cameras(capture, records)
-        masks = {}
+        masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]] = {}
         for name, found in perceived.items():
             for frame in (frame for frame in range(capture.train_end) if capture.has(name, frame)):
                 labels = torch.tensor(found.labels[frame], device=device)
-                covered = (labels == HANDS) & settings.baselines.spring_gaus.ignore_hands
-                masks[name, frame] = labels == OBJECT, ~covered
+                counts = labels != HANDS if settings.baselines.spring_gaus.ignore_hands else None
+                masks[name, frame] = labels == OBJECT, counts
         views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
         return cls(Splats.load(splats), views, masks, choose_backend(images.backend, device))
 

@@ -51,7 +51,7 @@ class SilhouetteLoss:
         if settings.centroid and bool(mask.any()):
             total = total + settings.centroid * (centroid(drawn) - centroid(mask)).norm() / drawn.shape[1]
         if settings.features and self.features is not None:
-            pair = torch.stack([drawn, mask])[:, None].expand(-1, 3, -1, -1)
-            found = self.features(pair)
-            total = total + settings.features * (found[0] - found[1]).square().mean()
+            with torch.no_grad():
+                wanted = self.features(mask.expand(1, 3, -1, -1))
+            total = total + settings.features * (self.features(drawn.expand(1, 3, -1, -1)) - wanted).square().mean()
         return total + settings.total_variation * total_variation(drawn)

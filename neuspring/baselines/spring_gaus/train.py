@@ -3,7 +3,7 @@
 The gradient goes through one frame only. One initial velocity v0 is added on entering every frame and taken away on leaving it, as
 in the public code, so a step of the optimiser moves the velocity in the middle of a trajectory. A frame that leaves the range of
 plausible states, or whose loss or gradient is not finite, is simulated again with more substeps; with no more to give, training
-ends as a named failure that keeps the last usable parameters. The last iteration is the result.
+ends as a named failure that keeps the parameters of the last complete iteration. The last iteration is the result.
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ import numpy as np
 import pandas as pd
 import torch
 
-from neuspring.baselines.results import Trained
+from neuspring.baselines.results import LIMIT, Trained
 from neuspring.baselines.spring_gaus.model import TRAINED, SpringGausModel
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
 from neuspring.checkpoint import Checkpoint
 from neuspring.config_spring_gaus import SpringGaus
 from neuspring.progress import Progress
-from neuspring.rollout import FAR
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(iteration, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""
@@ -66,6 +65,7 @@ class Training:
         self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON)
         self.rest = torch.tensor(model.anchors, device=device)
         self.hands = torch.tensor(problem.hands, device=device)
+        self.keep()
 
     @property
     def frames(self) -> range:
@@ -121,7 +121,7 @@ class Training:
         ends = self.hands[frame - 1], self.hands[frame]
         after, speed = self.solver.frame(parameters, x, v + self.values["velocity"], *ends)
         # NaN compares false, so this catches it together with infinity and absurd distances.
-        if not bool((after.detach().abs() < FAR).all() and torch.isfinite(speed.detach()).all()):
+        if not bool((after.detach().abs() < LIMIT).all() and torch.isfinite(speed.detach()).all()):
             raise UnusableFrame("the anchors left the scene")
         state = after.detach(), (speed - self.values["velocity"]).detach()
         loss = self.problem.objective(iteration, frame, after)
@@ -138,11 +138,19 @@ class Training:
             for tensor in tensors:
                 torch.nn.utils.clip_grad_norm_([tensor], limit)
         self.optimiser.step()
+        if not self.problem.settings.negative_damping:
+            # Here and not in the forces alone, where a clamp would leave no gradient to come back with.
+            with torch.no_grad():
+                self.values["theta"].clamp_(min=1.0)
         return *state, float(loss.detach()), float(norms.max())
 
+    def keep(self) -> None:
+        """Remember the present values: an iteration was completed with them."""
+        self.kept = {name: tensor.detach().clone() for name, tensor in self.values.items()}
+
     def model(self) -> SpringGausModel:
-        """With the present values."""
-        values: dict[str, Any] = {name: tensor.detach().cpu().numpy() for name, tensor in self.values.items()}
+        """With the values of the last complete iteration."""
+        values: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in self.kept.items()}
         return replace(self.problem.start, **values, substeps=self.substeps)
 
     def checkpoint(self, values: dict[str, Any]) -> Checkpoint:
@@ -165,6 +173,7 @@ class Training:
                 _, index, name = key.split(".")
                 slots.setdefault(int(index), {})[name] = torch.tensor(value)
         self.optimiser.load_state_dict(described | {"state": slots})
+        self.keep()
 
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
@@ -184,6 +193,7 @@ def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained
         except UnusableFrame as fault:
             failure = f"training ended early: {fault}"
             break
+        training.keep()
         history.append({"step": number, **row})
         progress.update(number + 1, f"loss {row['loss']:.4g}, {training.substeps} substeps")
         if partial and (number + 1) % settings.checkpoint_every == 0:

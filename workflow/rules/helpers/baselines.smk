@@ -40,11 +40,8 @@ def model_of(wildcards):
 
 
 def train_digest(wildcards):
-    return code_digest(
-        f"neuspring.baselines.{model_of(wildcards)}.train",
-        "neuspring.baselines.spring_gaus.setup",
-        stage="stages_baselines.train",
-    )
+    module = config_baselines.TRAINING[model_of(wildcards)]
+    return code_digest(module, stage="stages_baselines.train")
 
 
 def feature_weights(wildcards):

@@ -1,0 +1,100 @@
+"""A frame of Spring-Gaus with its gradient, by kernels and in eager torch: python -m tests.benchmarks.bench_spring_gaus [DEVICE]
+
+Both in float32, on one CPU thread or on a GPU (`cuda`); states and gradients are compared before the times.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+import torch
+
+from neuspring.baselines.spring_gaus import reference
+from neuspring.baselines.spring_gaus.graph import AnchorGraph
+from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.config_spring_gaus import SpringGaus
+from neuspring.physics.solver import resolve_device
+
+ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
+
+
+def main() -> None:
+    """Print milliseconds per frame, and their ratio."""
+    torch.set_num_threads(1)
+    device = resolve_device(sys.argv[1] if len(sys.argv) > 1 else "cpu")
+    model, hands = bar()
+    kernels, eager = ByKernels(model, hands, device), InTorch(model, hands, device)
+    for found, wanted in zip(kernels.run(), eager.run(), strict=True):
+        scale = float(wanted.abs().max())
+        # Rounding grows in so stiff a body; the tests compare them in float64.
+        np.testing.assert_allclose(found.cpu(), wanted.cpu(), atol=1e-2 * scale)
+    first, second = milliseconds(kernels), milliseconds(eager)
+    print(f"Spring-Gaus, {ANCHORS} anchors, {SUBSTEPS} substeps, a frame and its gradient, {device}, ms (minimum of {REPEATS})")
+    print(f"    kernels       {first:8.1f}")
+    print(f"    eager torch   {second:8.1f}    {second / first:.1f} x as long")
+
+
+def bar() -> tuple[SpringGausModel, np.ndarray]:
+    """A body that falls, and its hands [2, 30, 3], m."""
+    rng = np.random.default_rng(0)
+    cells = np.stack(np.meshgrid(range(16), range(8), range(8), indexing="ij"), axis=-1).reshape(-1, 3)
+    anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
+    hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
+    settings = SpringGaus()
+    graph = AnchorGraph.of(anchors, hands[0], settings.neighbours, settings.link_reach, settings.link_count)
+    model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
+    return model, hands
+
+
+class ByKernels:
+    """As in training."""
+
+    def __init__(self, model: SpringGausModel, hands: np.ndarray, device: str) -> None:
+        self.model, self.hands = model, torch.tensor(hands, device=device)
+        self.x = torch.tensor(model.anchors, device=device)
+        self.values = {name: tensor.requires_grad_() for name, tensor in model.tensors(device).items()}
+        self.solver = AnchorSolver(model.graph, model.physics, SUBSTEPS, device)
+
+    def run(self) -> list[torch.Tensor]:
+        """Positions after a frame, and gradients of their sum of squares."""
+        for tensor in self.values.values():
+            tensor.grad = None
+        after = self.frame(torch.zeros_like(self.x) + self.values["velocity"])
+        after.square().sum().backward()
+        return [after.detach(), *(tensor.grad for tensor in self.values.values())]
+
+    def frame(self, v: torch.Tensor) -> torch.Tensor:
+        """Positions after a frame."""
+        return self.solver.frame(self.model.parameters(self.values), self.x, v, *self.hands)[0]
+
+
+class InTorch(ByKernels):
+    """The reference, in float32."""
+
+    def frame(self, v: torch.Tensor) -> torch.Tensor:
+        """Positions after a frame."""
+        model, x = self.model, self.x
+        parameters = model.parameters(self.values)
+        for k in range(SUBSTEPS):
+            at = self.hands[0] + (k + 1) / SUBSTEPS * (self.hands[1] - self.hands[0])
+            x, v = reference.substep(model.graph, model.physics, parameters, x, v, at, model.frame_time / SUBSTEPS)
+        return x
+
+
+def milliseconds(way: ByKernels) -> float:
+    """Shortest time of a run."""
+    best = float("inf")
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        way.run()
+        if way.x.is_cuda:
+            torch.cuda.synchronize()
+        best = min(best, time.perf_counter() - start)
+    return 1e3 * best
+
+
+if __name__ == "__main__":
+    main()
