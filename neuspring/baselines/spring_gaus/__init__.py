@@ -15,8 +15,8 @@ Written anew from a description of the public adaptation to PhysTwin's captures.
   platform's splats, not 30,000, on the schedules of 30,000; hands, dilated, are not compared; SSIM is taken around the object.
 - Negative damping is clamped at zero (`negative_damping` allows it); rest lengths of links are at least 0.1 mm.
 - A frame that leaves the scene (10 m), or whose loss or gradient is not finite, counts as failed like NaN does. What still fails
-  with the most substeps ends training as a failure with a reason; the parameters of the last complete iteration are rolled out, and held
-  at the last finite frame for the average over all runs.
+  with the most substeps ends training as a failure with a reason; the parameters of the last complete iteration are rolled out, and
+  held at the last finite frame for the average over all runs.
 - Without VGG16's weights, which are never downloaded, its term of the loss is left out, and the run's notes say so.
 - Where the mask is empty there is no distance of centroids.
 - The initial velocity is added on entering a frame and removed on leaving it, as in the public code.

@@ -40,8 +40,8 @@ def model_of(wildcards):
 
 
 def train_digest(wildcards):
-    module = config_baselines.TRAINING[model_of(wildcards)]
-    return code_digest(module, stage="stages_baselines.train")
+    code = config_baselines.TRAINING[model_of(wildcards)]
+    return code_digest(code, stage="stages_baselines.train")
 
 
 def feature_weights(wildcards):
