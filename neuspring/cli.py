@@ -299,7 +299,8 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--appearance", type=Path, help="appearance.json of the splats that the model moves")
 
     transfer = add("transfer", _transfer, "twin -> scores on other recordings of the object", "settings", "compute", "output")
-    transfer.add_argument("--twin", type=Path, required=True, help="search.json or fit.json that names the twin")
+    learned = "search.json or fit.json that names the twin, or train.json of GS-Dynamics"
+    transfer.add_argument("--twin", type=Path, required=True, help=learned)
     transfer.add_argument("--targets", type=Path, nargs="+", required=True, help="observations.npz of the other recordings")
     transfer.add_argument("--method", required=True)
     transfer.add_argument("--seed", type=int, default=0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -214,32 +214,23 @@ def rollout(observations_path: Path, twin_records: Sequence[Path], carry: bool, 
 def transfer(
     targets: Sequence[Path], twin_record: Path, method: str, seed: int, settings: Config, device: str, output: Path
 ) -> None:
-    """Twin of one recording -> scores on other recordings of the same object (transfer.parquet), transfer.json.
+    """What was learned from one recording -> scores on other recordings of the same object (transfer.parquet), transfer.json.
 
-    All frames after the first of a target count (task `transfer`); with observed initial velocities the first two of them also
-    set the start. Rest lengths are re-based on the target's rest shape, unless they were trained. A rollout that diverges leaves
-    out its target.
+    `twin_record` names a twin, or a trained GS-Dynamics model. All frames after the first of a target count (task `transfer`); with
+    observed initial velocities the first two of them also set the start. A twin's rest lengths are re-based on the target's rest
+    shape, unless they were trained. A rollout that diverges leaves out its target.
     """
-    from neuspring.motion import initial_velocity
     from neuspring.physics.solver import resolve_device
-    from neuspring.rollout import roll_out
-    from neuspring.transfer import rebase
 
     clock = Stopwatch()
     before, device = StageRecord.load(twin_record), resolve_device(device)
     inputs = {before.stage: digest_file(twin_record)} | {f"target{i}": digest_file(path) for i, path in enumerate(targets)}
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
-    twin = Twin.load(before.file("twin", twin_record)) if before.status == "ok" else None
-    kept = {
-        "keep_lengths": bool(before.settings.get("fit", {}).get("rest_length_bound")),
-        "keep_frame_time": before.settings["released_quirks"]["frame_time_667"],
-    }
-    for path in targets if twin else ():
+    predict = _elsewhere(before, twin_record, settings, device) if before.status == "ok" else None
+    for path in targets if predict else ():
         observations = Observations.load(path)
-        assert twin is not None
-        moved = rebase(twin, observations, safety=settings.simulation.safety, **kept)
-        velocity = initial_velocity(observations, moved.simulation.initial_velocity)
-        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity)
+        assert predict is not None
+        trajectory = predict(observations)
         frames = range(1, observations.scenario.frame_count)
         if trajectory.diverged_frame is not None:
             diverged.append(observations.scenario.name)
@@ -249,6 +240,31 @@ def transfer(
     clock.stage("transfer", before.status, {"scores": path}, reason=before.reason, facts=facts, inputs=inputs, device=device).save(
         output
     )
+
+
+def _elsewhere(before: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+    """How what a record names predicts another recording."""
+    if before.stage == "train":
+        from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
+        from neuspring.baselines.gs_dynamics.predict import predict
+
+        model = GsDynamicsModel.load(before.file("model", path))
+        return lambda observations: predict(model, observations, device).trajectory
+    from neuspring.motion import initial_velocity
+    from neuspring.rollout import roll_out
+    from neuspring.transfer import rebase
+
+    twin = Twin.load(before.file("twin", path))
+    keep_lengths = bool(before.settings.get("fit", {}).get("rest_length_bound"))
+    keep_frame_time = before.settings["released_quirks"]["frame_time_667"]
+
+    def roll(observations: Observations) -> Trajectory:
+        safety = settings.simulation.safety
+        moved = rebase(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
+        velocity = initial_velocity(observations, moved.simulation.initial_velocity)
+        return roll_out(moved, observations.controller_points, device, velocity=velocity)
+
+    return roll
 
 
 def score(

@@ -7,8 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring import config, config_baselines, stages, stages_baselines, tables
+from neuspring import config, config_baselines, metrics, stages, stages_baselines, tables
 from neuspring.artifacts import Observations, SplatCentres, Trajectory
+from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
+from neuspring.baselines.gs_dynamics.predict import predict
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.config_baselines import Baselines
 from neuspring.config_gs_dynamics import GsDynamics
@@ -76,6 +78,19 @@ def test_training_reads_no_frame_of_the_future(seen, tmp_path, model):
         stages_baselines.train(path, model, settings(), 0, "cpu", path.with_name("train.json"))
         found.append(StageRecord.load(path.with_name("train.json")).files["model"][1])
     assert found[0] == found[1]
+
+
+def test_a_network_moves_to_another_recording(seen, tmp_path):
+    out, target = seen.parent / "gs_dynamics" / "0", tmp_path / "other" / "observations.npz"
+    other = small.scene("rope/shake/smooth").observations
+    other.save(target)
+    stages_baselines.train(seen, "gs_dynamics", settings(), 0, "cpu", out / "train.json")
+    stages.transfer([target], out / "train.json", "gs_dynamics", 0, settings(), "cpu", out / "transfer.json")
+    scores = pd.read_parquet(out / "transfer.parquet")
+    model = GsDynamicsModel.load(out / "model.npz")
+    frames = {"transfer": range(1, other.scenario.frame_count)}
+    wanted = metrics.score_tasks(predict(model, other, "cpu").trajectory, other, "gs_dynamics", 0, frames)
+    pd.testing.assert_frame_equal(scores, wanted)
 
 
 def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen):

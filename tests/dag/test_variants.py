@@ -58,6 +58,7 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
             "gs_dynamics": {"width": 8, "batch": 2, "epochs": 1, "updates_per_epoch": 2, "step": 0.002},
         },
         "studies": ["table1"],
+        "transfers": {SCENE: ["toy_rope_shake_smooth"]},
         "compare_with": "static",
         "tracking": {"enabled": False},
     }
@@ -70,6 +71,8 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
     runs = pd.read_csv(results / "tables" / "runs.csv")
     assert set(runs["method"]) == set(changes["methods"]) - {"spring_gaus"}
     assert set(runs["status"]) == {"ok"}
+    # Of the baselines only GS-Dynamics was ever moved to other recordings.
+    assert set(pd.read_csv(results / "tables" / "transfers.csv")["method"]) == {"search_only", "gs_dynamics"}
     folder = results / SCENE / "gs_dynamics" / "0"
     assert {"train.json", "model.npz", "history.parquet", "rollout.json", "trajectory.npz", "run.json"} <= set(names(folder))
     assert "train.json" not in names(results / SCENE / "static" / "0")

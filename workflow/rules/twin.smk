@@ -96,7 +96,7 @@ rule rollout:
 rule transfer:
     input:
         targets=transfer_targets,
-        twin=twin_record,
+        twin=learned_record,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/transfer.json",
     log:
@@ -115,13 +115,7 @@ rule transfer:
         runtime=minutes("transfer", 60, frame_work),
     params:
         settings=section("simulation"),
-        code=code_digest(
-            "neuspring.rollout",
-            "neuspring.transfer",
-            "neuspring.motion",
-            "neuspring.metrics",
-            stage="transfer",
-        ),
+        code=transfer_digest,
     shell:
         gpu_job(
             "transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"

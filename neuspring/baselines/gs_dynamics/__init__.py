@@ -14,8 +14,8 @@ Choices of this platform, for lack of better knowledge:
   those seen in the history take part, and errors are of what is seen.
 - Edges are those of positions with noise; an action is the tool's next place minus the noisy one.
 - An epoch is 100 updates on windows drawn with replacement; 50 epochs. Presets where the public values span a range: `rules`.
-- A rollout starts at the structure points of frame 0, thrice; farthest points start at node 0. Transfers are no rule of the
-  workflow yet; by hand (`neuspring predict` on the target's observations) they start at the target's points.
+- A rollout starts at the structure points of frame 0, thrice; farthest points start at node 0. Transfers start at the target's
+  points, not at the source's registered to it.
 - Without any window, no motion is learned and none predicted; a failure only where the hands do move later.
 - Up: the network sees a world with +z up; one with -z up is turned about x. So z is the coordinate along up.
 Mistakes of the public code that are put right, each with a switch: the length loss of edges to tools (`faithful_length_loss`), and

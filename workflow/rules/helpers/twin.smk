@@ -64,6 +64,21 @@ def twin_record(wildcards):
     return (fit_records(wildcards) or [search_record(wildcards)])[0]
 
 
+def learned_record(wildcards):
+    """The record that names what is transferred: a twin, or the model of a baseline."""
+    return (train_records(wildcards) or [twin_record(wildcards)])[0]
+
+
+def transfer_digest(wildcards):
+    """The code that moves a twin, or a network, to another recording."""
+    own = (
+        ["neuspring.baselines.gs_dynamics.predict"]
+        if BENCHMARK.methods[wildcards.method].model
+        else ["neuspring.rollout", "neuspring.transfer", "neuspring.motion"]
+    )
+    return code_digest(*own, "neuspring.metrics", stage="transfer")
+
+
 def rollout_twins(wildcards):
     """The records whose trajectories a prediction is made of: one, or those of all seeds, whatever part of them runs now."""
     if not BENCHMARK.methods[wildcards.method].average_seeds:
@@ -114,11 +129,13 @@ def transfer_targets(wildcards):
 
 
 def transfer_records():
-    """One per source, method and seed. Carrying over and averaging concern the same recording's future, not another one."""
+    """One per source, method and seed. Carrying over and averaging concern the same recording's future, not another one; Spring-Gaus
+    was never transferred, and what has learned nothing has nothing to transfer."""
     methods = [
         name
         for name, method in BENCHMARK.methods.items()
-        if method.search and not (method.carry_over or method.average_seeds)
+        if (method.search or method.model == "gs_dynamics")
+        and not (method.carry_over or method.average_seeds)
     ]
     return expand(
         "{results}/{scenario}/{method}/{seed}/transfer.json",
