@@ -20,7 +20,7 @@ from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.network import Dynamics, initial_weights
 from neuspring.baselines.gs_dynamics.objective import draw, unroll
 from neuspring.baselines.gs_dynamics.rules import preset_name, resolve
-from neuspring.baselines.gs_dynamics.tracks import Tracks
+from neuspring.baselines.gs_dynamics.tracks import Tracks, tools_of
 from neuspring.baselines.gs_dynamics.windows import Windows, executed
 from neuspring.baselines.results import Trained
 from neuspring.checkpoint import Checkpoint
@@ -131,7 +131,7 @@ def run(
     if not len(training.windows):
         # What moves nothing yet must not move the object at random later.
         training.hold()
-        if executed(observations.controller_points, settings.step):
+        if executed(tools_of(observations.controller_points, training.rules), settings.step):
             frames = observations.scenario.train_end
             failure = f"training did not start: no window of a tool that moves {settings.step} m in {frames} training frames"
         epochs = 0
