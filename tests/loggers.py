@@ -17,6 +17,7 @@ from pathlib import Path
 
 from neuspring import tracking, tracking_store
 from neuspring.config import Tracking
+from neuspring.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -42,7 +43,8 @@ def outcomes(out: Path) -> list[tuple[float, str, str]]:
 
 
 def _log(records: list[str], results: Path, settings: Tracking, out: Path, index: int) -> None:
-    (out / f"{index}.pid").write_text(str(os.getpid()))
+    # Whole or not there: the test reads it as soon as it is.
+    write_text(out / f"{index}.pid", str(os.getpid()))
     with (out / f"{index}.tsv").open("w", buffering=1) as lines:
         for record in records:
             start = time.perf_counter()
