@@ -290,7 +290,7 @@ def score(
     if drawn is not None and trajectory is not None:
         table = _with_pictures(table, drawn, len(trajectory.positions), observations, method, seed)
     write_table(table, folder / "scores.parquet")
-    held_file = _write_held(stages, trajectory, drawn, observations, method, seed, folder) if last.status == "failed" else None
+    held_file = _write_held(trajectory, drawn, observations, method, seed, folder) if last.status == "failed" else None
     learned = [name for name in LEARNING if name in stages]
     histories = {name: records[name].parent / "history.parquet" for name in learned if "history" in _files(stages, name)}
     twin_stage = "fit" if "fit" in stages else "search"
@@ -364,7 +364,6 @@ def _with_pictures(
 
 
 def _write_held(
-    stages: Mapping[str, StageRecord],
     trajectory: Trajectory | None,
     drawn: pd.DataFrame | None,
     observations: Observations,

@@ -11,7 +11,7 @@ import pandas as pd
 from neuspring.artifacts import Artifact, Trajectory
 
 LIMIT = 10.0
-"""m from the origin, on the table: what is farther away has exploded. The hands reach less than a tenth of it."""
+"""m from the origin, on the table: what is farther away has exploded, as scenes are a metre or two wide."""
 Model = TypeVar("Model", bound=Artifact)
 
 
