@@ -1,5 +1,5 @@
 """`python -m neuspring` is the `neuspring` command."""
 
-from neuspring.cli import main
+from neuspring.cli.main import main
 
 raise SystemExit(main())

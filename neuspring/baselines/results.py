@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import pandas as pd
 
-from neuspring.artifacts import Artifact, Trajectory
+from neuspring.core.artifacts import Artifact, Trajectory
 
 LIMIT = 10.0
 """m from the origin, on the table: what is farther away has exploded, as scenes are a metre or two wide."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neuspring.artifacts import Observations, Trajectory
 from neuspring.baselines.results import Prediction
+from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.splats.skinning import Skin
 
 

@@ -26,12 +26,12 @@ import numpy as np
 from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
-from neuspring.config_types import STRICT, Finite, Name, Positive
+from neuspring.config.types import STRICT, Finite, Name, Positive
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from neuspring.core.records import digest_file
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
-from neuspring.errors import InputError
-from neuspring.files import write_text
-from neuspring.records import digest_file
 
 CAPTURE, TRACKS = "capture.json", "tracks.json"
 FORMAT = 1

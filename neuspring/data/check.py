@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.data import conformance, mocap, phystwin
+from neuspring.core.errors import InputError
+from neuspring.data import mocap, phystwin
 from neuspring.data.check_capture import check_capture, is_capture
 from neuspring.data.departure import Case, Departure, broken, note, unusual
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
+from neuspring.scores.released import conformance
 
 __all__ = ["Departure", "check", "render"]
 

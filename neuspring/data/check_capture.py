@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, description_departures, read_description
 from neuspring.data.departure import Case, Departure, broken, note, unusual
-from neuspring.errors import InputError
 
 NEAR, FAR = 0.1, 10.0
 """m: a median depth outside means another unit."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 
 Level = Literal["error", "warning", "note"]
 

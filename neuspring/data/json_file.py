@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 
 
 def load_json(path: Path) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -15,12 +15,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from neuspring.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.config import Mocap, ScenarioRow
+from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
-from neuspring.records import digest_file
 
 RECORD_RATE = 100.0
 """Samples per second of a recording."""

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.artifacts import Observations, Scenario
 from neuspring.config import ScenarioRow
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.records import digest_file
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
-from neuspring.records import digest_file
 
 FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
 FILES = (FINAL_DATA, SPLIT, TRACKS, METADATA)

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 
 from neuspring.config import ScenarioRow
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 from neuspring.data import phystwin
 from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer, description_departures
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
-from neuspring.records import digest_file
 
 CALIBRATION = "calibrate.pkl"
 FILES = (phystwin.METADATA, CALIBRATION, phystwin.SPLIT, phystwin.TRACKS)

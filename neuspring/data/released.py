@@ -14,13 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from neuspring.core.errors import InputError
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera, CameraEntry, Capture, Description, description_departures
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.json_file import load_json
 from neuspring.data.phystwin_raw import CALIBRATION, raw_departures
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
 
 DEPTH_GATE = (0.2, 1.5)
 """Camera depths that the released lifting keeps, m."""

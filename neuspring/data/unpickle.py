@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 
 DTYPE_CODE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|c8|c16)")
 """Booleans, integers, floats, complex numbers. Objects (O), records (V) and text (S, U) are refused."""

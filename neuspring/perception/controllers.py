@@ -8,9 +8,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config_perception import Lift
-from neuspring.errors import InputError
-from neuspring.points import farthest
+from neuspring.config.perception import Lift
+from neuspring.core.errors import InputError
+from neuspring.core.points import farthest
 
 HAND_GAP = 0.04
 """m; points of one hand lie nearer to some other of it."""

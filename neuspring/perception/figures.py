@@ -8,8 +8,8 @@ import cv2
 import matplotlib
 import numpy as np
 
+from neuspring.core.files import write_atomically
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.files import write_atomically
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 FRAMES = 5

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config_perception import ShapePriorSettings
+from neuspring.config.perception import ShapePriorSettings
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.synthetic.correspond import at_points, under_pixels
 from neuspring.data.synthetic.truth import Truth
-from neuspring.errors import InputError
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.perception.shape_prior import visual_hull

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config_perception import Lift
+from neuspring.config.perception import Lift
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.errors import InputError
 from neuspring.perception.controllers import choose_controllers
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 

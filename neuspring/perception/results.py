@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from neuspring.artifacts import Artifact, array
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
 from neuspring.data.capture import Capture
-from neuspring.errors import InputError
-from neuspring.records import StageRecord
 
 
 @dataclass(frozen=True, kw_only=True)

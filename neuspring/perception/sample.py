@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from neuspring.config_perception import Sampling
+from neuspring.config.perception import Sampling
 from neuspring.perception.results import LiftedTracks, ShapePrior
 from neuspring.perception.sample_kernels import winding
 

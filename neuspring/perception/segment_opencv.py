@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from neuspring.config_perception import OpenCvSegmentation
+from neuspring.config.perception import OpenCvSegmentation
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.errors import InputError
 
 BINS = (12, 64, 64)
 """Of L, a, b."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.config_perception import GroundedSam2
+from neuspring.config.perception import GroundedSam2
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config_perception import ShapePriorSettings
+from neuspring.config.perception import ShapePriorSettings
+from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, Camera, Capture
 from neuspring.data.mesh_file import read_mesh
-from neuspring.errors import InputError
 from neuspring.perception.results import Masks, ShapePrior
 
 POSES = 24 * 8

@@ -14,9 +14,9 @@ import warp as wp
 from scipy import ndimage
 from warp.geometry import IsoSurfaceMarchingCubes
 
-from neuspring.config_perception import ShapePriorSettings
+from neuspring.config.perception import ShapePriorSettings
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.errors import InputError
 from neuspring.perception.results import Masks, ShapePrior
 
 EMPTY = (np.zeros((0, 3)), np.zeros((0, 3), dtype=int))

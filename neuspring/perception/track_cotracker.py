@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.config_perception import CoTracker3
+from neuspring.config.perception import CoTracker3
+from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.errors import InputError
 from neuspring.perception.track_opencv import Followed, choose
 
 WEIGHTS = "scaled_online.pth"

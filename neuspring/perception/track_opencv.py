@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config_perception import OpenCvTracking
+from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import Capture
 
 PATCH = 9

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from neuspring.artifacts import SCALARS, Twin
+from neuspring.core.artifacts import SCALARS, Twin
 from neuspring.physics.solver import FrameSolver, Parameters
 
 ELASTICITY_RANGE = (0.0, 1.0)

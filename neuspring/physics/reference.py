@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from neuspring.artifacts import Simulation, Twin
+from neuspring.core.artifacts import Simulation, Twin
 from neuspring.physics.contact import APPROACH, MIN_TANGENT
 from neuspring.physics.springs import MIN_LENGTH
 

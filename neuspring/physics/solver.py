@@ -7,12 +7,6 @@ start (see `autograd.py`). Without gradients two substep slots are enough.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import os
-import re
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,74 +15,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from neuspring.artifacts import Simulation
-from neuspring.errors import InputError
-from neuspring.kernels import load, quiet
+from neuspring.core.artifacts import Simulation
+from neuspring.core.device import load, start_warp
 from neuspring.physics import contact, integrate, springs
-
-DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
-
-
-@functools.cache
-def start_warp() -> None:
-    """Initialise Warp once, quietly: kernels here carry their own adjoints."""
-    wp.config.enable_backward = False
-    quiet()
-    with _without_driver_warning():
-        wp.init()
-
-
-@contextlib.contextmanager
-def _without_driver_warning() -> Iterator[None]:
-    """Drop Warp's native line about a missing CUDA driver where torch finds no GPU either; pass on everything else."""
-    if torch.cuda.is_available():
-        yield
-        return
-    sys.stderr.flush()
-    kept = os.dup(2)
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            caught.seek(0)
-            for line in caught.read().decode(errors="replace").splitlines(keepends=True):
-                if "NVIDIA CUDA driver" not in line:
-                    sys.stderr.write(line)
-
-
-def resolve_device(device: str) -> str:
-    """`auto` -> `cuda:0` where CUDA works, else `cpu`. Raises InputError for other words and for a device that is not there."""
-    if not DEVICES.fullmatch(device):
-        raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    held = os.environ.get("CUDA_VISIBLE_DEVICES", "").strip()
-    holds = held not in ("", "-1")
-    # A job that holds a GPU which CUDA does not find has lost it; but a torch without CUDA never finds one.
-    lost = holds and bool(torch.version.cuda)
-    if device == "cpu" or (device == "auto" and count == 0 and not lost):
-        if device == "auto" and holds:
-            _warn_of_idle_gpu(held)
-        return "cpu"
-    if not torch.version.cuda:
-        raise InputError("device", "this torch is a build for the CPU alone", device, "Install its CUDA build, or use device: cpu.")
-    index = int(device.partition(":")[2] or 0)
-    if index >= count:
-        raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
-    return f"cuda:{index}"
-
-
-@functools.cache
-def _warn_of_idle_gpu(held: str) -> None:
-    """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
-    print(
-        f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
-        "With device: cuda this is an error.",
-        file=sys.stderr,
-        flush=True,
-    )
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
-from neuspring.artifacts import Twin
-from neuspring.errors import InputError
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
 
 LIMIT = 4.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
-from neuspring.errors import NumericalFailure
+from neuspring.core.errors import NumericalFailure
 
 LEAST_VOLUME = 1e-15
 """m^3: flatter tetrahedra have no circumscribed sphere worth naming."""

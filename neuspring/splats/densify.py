@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neuspring.config_images import Appearance
+from neuspring.config.images import Appearance
 from neuspring.splats.project import rotations
 from neuspring.splats.rasterise import Rendered
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats.view import LIMITS, Limits, View
 
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import torch
 
-from neuspring.config_images import Appearance
-from neuspring.errors import InputError
-from neuspring.image_metrics import ssim_map
+from neuspring.config.images import Appearance
+from neuspring.core.errors import InputError
+from neuspring.scores.images import ssim_map
 from neuspring.splats.rasterise import Rendered
 from neuspring.splats.view import View
 

@@ -9,9 +9,9 @@ from typing import ClassVar, Self
 import numpy as np
 import torch
 
-from neuspring.artifacts import Artifact, array
-from neuspring.errors import InputError
-from neuspring.files import write_atomically
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_atomically
 from neuspring.splats.project import degree_of
 from neuspring.splats.rasterise import Backend, Rendered, rasterise
 from neuspring.splats.view import LIMITS, Limits, View

@@ -13,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
 from neuspring.splats.project import boxes, project, radii
 from neuspring.splats.tiles import blend, tiles

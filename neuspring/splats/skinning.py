@@ -21,9 +21,8 @@ import torch
 import warp as wp
 from scipy.spatial import cKDTree
 
-from neuspring.errors import InputError
-from neuspring.kernels import load
-from neuspring.physics.solver import start_warp
+from neuspring.core.device import load, start_warp
+from neuspring.core.errors import InputError
 from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
 
 NEIGHBOURS = 16

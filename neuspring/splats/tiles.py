@@ -8,8 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from neuspring.kernels import load
-from neuspring.physics.solver import start_warp
+from neuspring.core.device import load, start_warp
 from neuspring.splats.blend import kernels
 from neuspring.splats.view import Limits, View
 

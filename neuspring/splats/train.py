@@ -1,6 +1,6 @@
 """Training of splats on the views of frame 0: Adam, one view per step, harmonics unlocked by and by, adaptive density.
 
-After section 3.1 of the released appearance; every number is a setting (`neuspring.config_images.Appearance`).
+After section 3.1 of the released appearance; every number is a setting (`neuspring.config.images.Appearance`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from neuspring.config_images import Appearance
-from neuspring.errors import InputError, NumericalFailure
-from neuspring.progress import Progress
+from neuspring.config.images import Appearance
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.progress import Progress
 from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss

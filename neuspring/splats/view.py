@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from neuspring.baselines.gs_dynamics.objective import draw, length_loss, pick, p
 from neuspring.baselines.gs_dynamics.rules import PRESETS, Rules, preset_name, resolve
 from neuspring.baselines.gs_dynamics.tracks import Tracks, ordinary, smoothed, tools_of
 from neuspring.baselines.gs_dynamics.windows import Windows, ahead, past, window_frames
-from neuspring.config_gs_dynamics import GsDynamics
-from neuspring.errors import InputError
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.core.errors import InputError
 
 RULES, RECIPE = resolve(GsDynamics(width=16), "sloth")
 

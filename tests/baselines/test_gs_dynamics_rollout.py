@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring.artifacts import Observations, Scenario
 from neuspring.baselines.gs_dynamics import train
 from neuspring.baselines.gs_dynamics.graph import connect
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
@@ -16,8 +15,9 @@ from neuspring.baselines.gs_dynamics.predict import predict
 from neuspring.baselines.gs_dynamics.propagate import carry, turns
 from neuspring.baselines.gs_dynamics.rules import Rules, resolve
 from neuspring.baselines.gs_dynamics.tracks import upright
-from neuspring.config_gs_dynamics import GsDynamics
-from neuspring.errors import InputError
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.errors import InputError
 
 PLAIN = GsDynamics(
     width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0, smoothing_passes=0,

@@ -13,8 +13,8 @@ from neuspring.baselines.spring_gaus.model import SpringGausModel, soft_vector
 from neuspring.baselines.spring_gaus.predict import contraction, roll_out
 from neuspring.baselines.spring_gaus.solver import AnchorParameters, AnchorPhysics, AnchorSolver
 from neuspring.baselines.spring_gaus.train import Problem, Training, run
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.errors import NumericalFailure
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.errors import NumericalFailure
 
 FRAME = 1 / 30
 SMALL = SpringGaus(anchors=72, neighbours=12, full_neighbours=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)

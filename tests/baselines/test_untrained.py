@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring import metrics
-from neuspring.artifacts import Trajectory
 from neuspring.baselines.untrained import controller_lbs, static
-from tests import small
+from neuspring.core.artifacts import Trajectory
+from neuspring.scores import metrics
+from tests.support import small
 
 
 def test_static_holds_frame_0():

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from neuspring import vgg16_weights
+from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.baselines.spring_gaus.vgg16 import Vgg16
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.errors import InputError
-from neuspring.records import digest_file
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from neuspring.core.device import start_warp
 from neuspring.physics import springs
-from neuspring.physics.solver import start_warp
-from neuspring.topology import uniform_topology
+from neuspring.twin.topology import uniform_topology
 
 NODES, LAUNCHES, REPEATS = 400, 200, 7
 STIFFNESS = 1e3

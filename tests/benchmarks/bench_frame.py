@@ -17,11 +17,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from neuspring.artifacts import Material, Simulation, Twin
+from neuspring.core.artifacts import Material, Simulation, Twin
 from neuspring.physics import reference, stability
 from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
 from neuspring.physics.solver import FrameSolver
-from neuspring.topology import uniform_topology
+from neuspring.twin.topology import uniform_topology
 
 HANDS = 8
 FRAME_TIME = 1 / 30

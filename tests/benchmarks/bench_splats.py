@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats.rasterise import Backend, choose_backend, rasterise
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View

@@ -15,8 +15,8 @@ from neuspring.baselines.spring_gaus import reference
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.physics.solver import resolve_device
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.device import resolve_device
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 

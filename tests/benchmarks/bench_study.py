@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from neuspring import config
-from neuspring.config_tune import Tune
-from tests import stores
-from tests.test_tune import furnish, settings, slots, study, work
+from neuspring.config.tuning import Tune
+from tests.experiments.test_tune import furnish, settings, slots, study, work
+from tests.support import stores
 
 WORKERS, TRIALS, KILLS = 4, 24, 8
 PAUSE = (6.0, 12.0)

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import psutil
 
-from neuspring import tracking
 from neuspring.config import Tracking
-from tests import loggers, stores
+from neuspring.experiments.tracking import log as tracking
+from tests.support import loggers, stores
 
 
 class Times(NamedTuple):

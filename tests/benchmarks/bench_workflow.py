@@ -15,8 +15,9 @@ from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
-from neuspring import gpus, job
-from neuspring.job_records import JobRecord, read_jobs
+from neuspring.core.job_records import JobRecord, read_jobs
+from neuspring.experiments.jobs import gpus
+from neuspring.experiments.jobs import wrapper as job
 
 DEVICES = 8
 SNAKEFILE = """
@@ -27,7 +28,7 @@ rule nap:
     log: "results/logs/nap/{{i}}.log"
     retries: 2
     resources: gpu=1, attempt=lambda wildcards, attempt: attempt
-    shell: "{python} -m neuspring.job --log {{log}} --gpus 1 -- {nap} && touch {{output}}"
+    shell: "{python} -m neuspring.experiments.jobs.wrapper --log {{log}} --gpus 1 -- {nap} && touch {{output}}"
 """
 WELL = "sleep {seconds}"
 CRASH = """bash -c 'if [ {{resources.attempt}} = 1 ]; then sleep 0.$((RANDOM % 9)); kill -9 $$; fi; sleep {seconds}'"""

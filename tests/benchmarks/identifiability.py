@@ -40,15 +40,19 @@ from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from neuspring import config, figures_twin, figures_views, metrics, tables
-from neuspring.artifacts import Twin
-from neuspring.benchmark import read_scenarios
-from neuspring.data import toy
-from neuspring.errors import NumericalFailure
-from neuspring.files import write_text
-from neuspring.fit import FitProblem, fit
-from neuspring.losses import FrameLoss
-from neuspring.rollout import roll_out
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import NumericalFailure
+from neuspring.core.files import write_text
+from neuspring.data.synthetic import toy
+from neuspring.experiments.benchmark import read_scenarios
+from neuspring.report.figures import twin as figures_twin
+from neuspring.report.figures import views as figures_views
+from neuspring.report.tables import summary as tables
+from neuspring.scores import metrics
+from neuspring.twin.fit import FitProblem, fit
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.rollout import roll_out
 
 SCENES = tuple(f"{shape}/shake/{law}" for shape in ("rope", "cloth", "blob") for law in ("smooth", "two_region"))
 NOISES = (0.0, 0.0005, 0.002)

@@ -15,13 +15,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from neuspring import config, metrics
-from neuspring.artifacts import Observations, Twin
-from neuspring.benchmark import Benchmark, fit_of
+from neuspring import config
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.data import mocap
-from neuspring.motion import initial_velocity
-from neuspring.rollout import roll_out
-from neuspring.transfer import rebase
+from neuspring.experiments.benchmark import Benchmark, fit_of
+from neuspring.scores import metrics
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.transfer import rebase
 
 ROOT = Path(__file__).resolve().parents[2]
 

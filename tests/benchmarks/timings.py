@@ -10,8 +10,8 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
-from neuspring.job_records import read_jobs
-from neuspring.plan import SHIPPED
+from neuspring.core.job_records import read_jobs
+from neuspring.experiments.plan import SHIPPED
 
 # "About 12 minutes" of CMA-ES (220 rollouts) and "about 5" of first-order optimisation (200 epochs) for stuffed animals without
 # self-collision, whose scenarios have some 50 training frames.

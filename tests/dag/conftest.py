@@ -1,6 +1,6 @@
 import pytest
 
-from .project import copy_workflow
+from tests.support.project import copy_workflow
 
 
 @pytest.fixture

@@ -11,10 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from neuspring.job_records import JobRecord, read_jobs
-from tests.data.phystwin_case import write_case
-
-from .project import ROOT, SCENE, arguments, planned_jobs
+from neuspring.core.job_records import JobRecord, read_jobs
+from tests.support.phystwin_case import write_case
+from tests.support.project import ROOT, SCENE, arguments, planned_jobs
 
 RELEASED = "weird_package"
 SABOTAGE = '''
@@ -67,7 +66,7 @@ def wrapper_of(*words):
     """The wrapper process of a job, by words of its command line."""
     for process in psutil.process_iter(["cmdline"]):
         line = process.info["cmdline"] or []
-        if line[1:3] == ["-m", "neuspring.job"] and all(word in " ".join(line) for word in words):
+        if line[1:3] == ["-m", "neuspring.experiments.jobs.wrapper"] and all(word in " ".join(line) for word in words):
             return process
     raise AssertionError(f"no wrapper with {words}")
 

@@ -8,9 +8,8 @@ import sys
 
 import pytest
 
-from neuspring.job_records import read_jobs
-
-from .project import ROOT, SCENE, arguments
+from neuspring.core.job_records import read_jobs
+from tests.support.project import ROOT, SCENE, arguments
 
 PODS = ROOT / "workflow/profiles/kubernetes/pods.py"
 GPU = "nvidia.com/gpu"

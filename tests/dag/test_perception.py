@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.artifacts import Observations
-from tests.data.phystwin_case import dump
-from tests.perception.filmed import film, write_raw
-from tests.perception.test_perceive import perceived
-
-from .project import copy_finished, copy_workflow, jobs, run
+from neuspring.core.artifacts import Observations
+from tests.stages.test_perceive import perceived
+from tests.support.filmed import film, write_raw
+from tests.support.phystwin_case import dump
+from tests.support.project import copy_finished, copy_workflow, jobs, run
 
 PACKAGE = "synthetic_weird_package"
 PERCEPTION = {

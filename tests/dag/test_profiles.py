@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from .project import ROOT, arguments, jobs
+from tests.support.project import ROOT, arguments, jobs
 
 PLUGINS = {"slurm": "snakemake_executor_plugin_slurm", "kubernetes": "snakemake_executor_plugin_cluster_generic"}
 PLANNED = {

@@ -11,12 +11,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from neuspring import gpus
+from neuspring.core.job_records import read_jobs
 from neuspring.data.cases import released_cases
-from neuspring.job_records import read_jobs
-from tests.perception.filmed import film, write_raw
-
-from .project import ROOT, SCENE, arguments, copy_workflow, jobs
+from neuspring.experiments.jobs import gpus
+from tests.support.filmed import film, write_raw
+from tests.support.project import ROOT, SCENE, arguments, copy_workflow, jobs
 
 TWO_GPUS = {gpus.VISIBLE: "0,1"}
 """Devices that are not there: torch falls back to the CPU with device: auto, leases do not mind."""

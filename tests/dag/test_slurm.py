@@ -14,10 +14,9 @@ import pandas as pd
 import pytest
 import yaml
 
-from neuspring.job_records import Attempt, read_jobs
-
-from . import slurm
-from .project import ROOT, SCENE, config_with, copy_workflow
+from neuspring.core.job_records import Attempt, read_jobs
+from tests.support import slurm
+from tests.support.project import ROOT, SCENE, config_with, copy_workflow
 
 GPU_RULES = {"search", "fit", "rollout"}
 PATIENCE = 600

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from neuspring import config, tracking
-
-from .project import SCENE, jobs, run
+from neuspring import config
+from neuspring.experiments.tracking import log as tracking
+from tests.support.project import SCENE, jobs, run
 
 
 def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(place):

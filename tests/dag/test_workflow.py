@@ -13,12 +13,12 @@ import pandas as pd
 import pytest
 import yaml
 
-from neuspring import config, tracking
-from neuspring.artifacts import Twin
-from neuspring.benchmark import Benchmark, read_scenarios
-from neuspring.errors import InputError
-
-from .project import ROOT, SCENE, arguments, config_with, copy_finished, copy_workflow, jobs, run
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.experiments.benchmark import Benchmark, read_scenarios
+from neuspring.experiments.tracking import log as tracking
+from tests.support.project import ROOT, SCENE, arguments, config_with, copy_finished, copy_workflow, jobs, run
 
 
 @pytest.fixture(scope="module")

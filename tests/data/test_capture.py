@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Camera, CameraEntry, Capture, Description, Writer
-from neuspring.errors import InputError
 
 FRAMES = 5
 POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))

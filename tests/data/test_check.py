@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from neuspring.core.errors import InputError
 from neuspring.data.cases import released_cases
 from neuspring.data.check import Departure, check, render
-from neuspring.errors import InputError
-from tests.data.phystwin_case import dump, edit, stored, write_case, write_json, write_raw_frame, write_results
+from tests.support.phystwin_case import dump, edit, stored, write_case, write_json, write_raw_frame, write_results
 
 
 def of_level(departures: list[Departure], *levels: str) -> list[str]:
@@ -249,8 +249,8 @@ def test_sizes_of_a_released_case_are_compared(tmp_path: Path) -> None:
 
 
 def test_released_results_of_several_cases(tmp_path: Path) -> None:
-    pytest.importorskip("neuspring.topology")
-    pytest.importorskip("neuspring.metrics")
+    pytest.importorskip("neuspring.twin.topology")
+    pytest.importorskip("neuspring.scores.metrics")
     for name in ("a", "b"):
         write_results(write_case(tmp_path, name))
     found = check(tmp_path)
@@ -265,7 +265,7 @@ def test_released_results_of_several_cases(tmp_path: Path) -> None:
 
 def test_other_springs_are_an_error(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    pytest.importorskip("neuspring.topology")
+    pytest.importorskip("neuspring.twin.topology")
     folder = write_case(tmp_path)
     write_results(folder)
     checkpoint = tmp_path / "experiments" / folder.name / "train" / "best_199.pth"

@@ -9,7 +9,7 @@ import pytest
 from neuspring.data.capture import CAPTURE
 from neuspring.data.check import check
 from tests.data.test_check import of_level, serious
-from tests.perception.filmed import film
+from tests.support.filmed import film
 
 
 @pytest.fixture

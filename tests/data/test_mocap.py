@@ -14,9 +14,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from neuspring.config import Mocap, ScenarioRow
+from neuspring.core.errors import InputError
 from neuspring.data import mocap
 from neuspring.data.check import check
-from neuspring.errors import InputError
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
 REAL = Path(__file__).parents[2].parent / "shared" / "data" / "mocap_dlo"

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from neuspring.config import ScenarioRow
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 from neuspring.data import phystwin
-from neuspring.errors import InputError
-from neuspring.records import digest_file
-from tests.data.phystwin_case import dump, edit, stored, write_case, write_json
+from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 
 ROW = ScenarioRow(scenario="thing", source="phystwin", category="toy", path="x", self_collision=True, ground=True)
 

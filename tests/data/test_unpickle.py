@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuspring.core.errors import InputError
 from neuspring.data.unpickle import load_pickle
-from neuspring.errors import InputError
 
 PLAIN: list[Any] = [
     {"a": np.arange(6.0).reshape(2, 3), "b": [np.float32(0.1), 2, None, True, "text", b"bytes", (1, 2.5)]},

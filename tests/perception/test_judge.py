@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 from neuspring.config import ScenarioRow
-from neuspring.config_perception import Lift, ShapePriorSettings, Synthetic
+from neuspring.config.perception import Lift, ShapePriorSettings, Synthetic
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
 from neuspring.data.synthetic.correspond import at_points, under_pixels
 from neuspring.data.synthetic.truth import truth_of, truth_path
-from neuspring.errors import InputError, NumericalFailure
 from neuspring.perception import track_truth
 from neuspring.perception.judge import judge
 from neuspring.perception.lift import lift
 from neuspring.perception.results import Masks, PixelTracks
-
-from .filmed import film
+from tests.support.filmed import film
 
 ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)
 TINY = Synthetic(size="tiny", frames=6, cameras=2)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neuspring.config_perception import Lift
+from neuspring.config.perception import Lift
+from neuspring.core.errors import InputError
+from neuspring.core.points import farthest
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
-from neuspring.errors import InputError
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import choose_controllers, fill_rigidly, hands_of, rigid_motion
 from neuspring.perception.results import Masks, PixelTracks
-from neuspring.points import farthest
 from tests.data.test_capture import FRAMES, describe, entry
 
 SETTINGS = Lift(neighbourhood=0.03, outlier_neighbours=460.0, least_neighbours=3, least_controllers=3, controllers=4)

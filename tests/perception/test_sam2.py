@@ -8,12 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from neuspring.config_perception import GroundedSam2
-from neuspring.errors import InputError
+from neuspring.config.perception import GroundedSam2
+from neuspring.core.errors import InputError
 from neuspring.perception import segment_sam2
 from neuspring.perception.segment_sam2 import Detection, Models
-
-from .filmed import FRAMES, film
+from tests.support.filmed import FRAMES, film
 
 transformers = pytest.importorskip("transformers", reason="needs the extra perception")
 torch = pytest.importorskip("torch")

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from neuspring.config_perception import OpenCvSegmentation
+from neuspring.config.perception import OpenCvSegmentation
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Writer
-from neuspring.errors import InputError
 from neuspring.perception import segment_opencv
 from tests.data.test_capture import describe, entry
-
-from .filmed import FRAMES, film
+from tests.support.filmed import FRAMES, film
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config_perception import Sampling, ShapePriorSettings
+from neuspring.config.perception import Sampling, ShapePriorSettings
+from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, CameraEntry, Writer
 from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, Part, Renderer
 from neuspring.data.synthetic.sensor import quantised
-from neuspring.errors import InputError
 from neuspring.perception import shape_mesh, shape_prior
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside, on_table, structure

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config_perception import CoTracker3, OpenCvTracking
+from neuspring.config.perception import CoTracker3, OpenCvTracking
+from neuspring.core.errors import InputError
 from neuspring.data.capture import Writer
-from neuspring.errors import InputError
 from neuspring.perception import track_cotracker, track_opencv
 from tests.data.test_capture import describe, entry
 

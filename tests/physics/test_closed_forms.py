@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from neuspring.physics.contact import APPROACH
-
-from .scenes import ENGINES, Engine, no_hands, scene
+from tests.support.scenes import ENGINES, Engine, no_hands, scene
 
 # Rounding of float64 accumulated over up to 10^4 substeps at metres and metres per second.
 ROUNDING = 1e-10

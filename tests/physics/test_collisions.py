@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring import rollout
-from neuspring.artifacts import Topology, Trajectory, Twin
-from neuspring.errors import InputError
+from neuspring.core.artifacts import Topology, Trajectory, Twin
+from neuspring.core.errors import InputError
 from neuspring.physics import reference
-
-from .scenes import DEVICES, no_hands, random_scene, scene, solver_for, twin_of
+from neuspring.twin import rollout
+from tests.support.scenes import DEVICES, no_hands, random_scene, scene, solver_for, twin_of
 
 DISTANCE = 0.02
 
@@ -173,7 +172,7 @@ def test_an_unstable_rollout_is_refused() -> None:
 
 
 def test_a_missing_device_is_named() -> None:
-    from neuspring.physics.solver import resolve_device
+    from neuspring.core.device import resolve_device
 
     assert resolve_device("cpu") == "cpu"
     assert resolve_device("auto") in ("cpu", "cuda:0")

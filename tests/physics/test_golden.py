@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.losses import acceleration
 from neuspring.physics import reference, stability
 from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver
-
-from .golden import CONTACT_SCALARS, NAMES, Clip, clip
-from .scenes import DEVICES
+from neuspring.twin.losses import acceleration
+from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
+from tests.support.scenes import DEVICES
 
 # Tolerances: the golden data's README, section "Simulator". The record is float32; without self-collision an independent
 # float64 simulation follows it to 2e-5 m over the whole clip.

@@ -11,12 +11,12 @@ import pytest
 import torch
 import warp as wp
 
-from neuspring.artifacts import Simulation
+from neuspring.core.artifacts import Simulation
+from neuspring.core.device import start_warp
 from neuspring.physics import contact, integrate, reference, springs
 from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.solver import FrameSolver, start_warp
-
-from .scenes import packed, random_scene, scene, solver_for, tensors, with_values
+from neuspring.physics.solver import FrameSolver
+from tests.support.scenes import packed, random_scene, scene, solver_for, tensors, with_values
 
 # Central differences with step h of a smooth function: truncation h^2 f''' / 6 plus rounding 1e-16 f / h. With h = 1e-6 of
 # values of order 1, both stay below 1e-9 of the largest derivative; third derivatives grow with 1 / length^2 = 1e3..1e4.

@@ -8,8 +8,7 @@ import torch
 
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.solver import FrameSolver
-
-from .scenes import random_scene, solver_for, tensors
+from tests.support.scenes import random_scene, solver_for, tensors
 
 VECTOR = 3 * 4
 """Bytes of a float32 vector."""

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from neuspring.physics import reference
-
-from .scenes import DEVICES, no_hands, random_scene, scene, warp
+from tests.support.scenes import DEVICES, no_hands, random_scene, scene, warp
 
 # Two float64 programs of the same equations differ by rounding (1e-16 of 0.1 m and 1 m/s), amplified along 60 substeps of
 # stiff springs and bounces by less than 1e5; a decision that flips would show as 1e-6 or more.

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuspring.artifacts import Twin
-from neuspring.errors import InputError
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
 from neuspring.physics import reference, stability
 from neuspring.physics.reference import Scene
 from neuspring.physics.stability import LIMIT, Spectrum
-
-from .scenes import random_scene, scene, twin_of
+from tests.support.scenes import random_scene, scene, twin_of
 
 MARGIN = 0.01
 """Relative distance of dt from the bound on either side."""

@@ -7,8 +7,8 @@ import types
 import pytest
 import torch
 
-from neuspring.config_images import Appearance
-from neuspring.errors import InputError
+from neuspring.config.images import Appearance
+from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.project import boxes, project, radii

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats.model import Gaussians, Splats
 
 

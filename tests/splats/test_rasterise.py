@@ -11,12 +11,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats import reference
 from neuspring.splats.project import project
 from neuspring.splats.rasterise import choose_backend, rasterise
 from neuspring.splats.view import LIMITS, View
-from tests.splats.golden import CASES, Golden
+from tests.support.golden_splats import CASES, Golden
 
 CLOSE = "r04_culling"
 SINGLE = {"rgb": 2e-5, "alpha": 2e-5, "depth": 1e-4, "means": 1e-4, "conics": 1e-4, "gradient": 1e-4, "loss": 2e-5}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.errors import InputError
+from neuspring.core.errors import InputError
 from neuspring.splats.skinning import Skin
 
 FOLDER = Path(__file__).parents[1] / "golden"

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.config_images import Appearance
+from neuspring.config.images import Appearance
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.synthetic.make import looking
-from neuspring.errors import InputError, NumericalFailure
-from neuspring.image_metrics import psnr
+from neuspring.scores.images import psnr
 from neuspring.splats import harmonics
 from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import Statistics, densify
@@ -18,7 +18,7 @@ from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.train import extent_of, first_splats, restricted, train
 from neuspring.splats.view import View
-from tests.perception.filmed import EYES, intrinsics
+from tests.support.filmed import EYES, intrinsics
 
 SIZE = (96, 64)
 HELD_OUT = (0.1, -0.55, 0.35)

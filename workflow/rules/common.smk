@@ -11,20 +11,18 @@ import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
-from neuspring import benchmark as benchmarks
+from neuspring.experiments import benchmark as benchmarks
 from neuspring import config as settings
-from neuspring import (
-    config_baselines,
-    gpus,
-    job,
-    needs,
-    plan,
-    tune_space,
-    vgg16_weights,
-)
+from neuspring.config import baselines as config_baselines
+from neuspring.experiments.jobs import gpus
+from neuspring.experiments.jobs import wrapper as job
+from neuspring.experiments import needs
+from neuspring.experiments import plan
+from neuspring.experiments.tuning import space as tune_space
+from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.data import phystwin, phystwin_raw
-from neuspring.errors import InputError
-from neuspring.job_records import (
+from neuspring.core.errors import InputError
+from neuspring.core.job_records import (
     FOLDER,
     RUN,
     begin_run,
@@ -32,8 +30,8 @@ from neuspring.job_records import (
     read_jobs,
     this_run,
 )
-from neuspring.lpips_weights import configured
-from neuspring.provenance import code_digest
+from neuspring.scores.lpips_weights import configured
+from neuspring.core.provenance import code_digest
 
 # The graph of jobs stays until the end. To look for garbage in it again and again, at last at the exit, is a fifth of a dry run.
 gc.set_threshold(100_000, 50, 100)
@@ -135,8 +133,8 @@ shell.prefix(job_prefix())
 
 
 def wrapped(options, command):
-    """A `neuspring` command in the wrapper that every job runs in: GPU lease, log, record, cause of failure (`neuspring.job`)."""
-    run = "python -m neuspring.job --log {log:q}"
+    """A `neuspring` command in the wrapper that every job runs in: GPU lease, log, record, cause of failure (`neuspring.experiments.jobs.wrapper`)."""
+    run = "python -m neuspring.experiments.jobs.wrapper --log {log:q}"
     return f"{run} {options} -- python -m neuspring {command}"
 
 

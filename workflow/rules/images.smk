@@ -29,8 +29,8 @@ rule appearance:
         code=code_digest(
             "neuspring.splats.train",
             "neuspring.perception.lift",
-            "neuspring.pictures",
-            stage="appearance.learn",
+            "neuspring.splats.draw",
+            stage="stages.appearance.learn",
         ),
     shell:
         gpu_job(
@@ -76,11 +76,11 @@ rule render:
         lpips=lpips_weights(),
         images=image_stamps,
         code=code_digest(
-            "neuspring.pictures",
+            "neuspring.splats.draw",
             "neuspring.splats.train",
-            "neuspring.lpips",
-            "neuspring.video",
-            stage="appearance.render",
+            "neuspring.scores.lpips",
+            "neuspring.report.video",
+            stage="stages.appearance.render",
         ),
     shell:
         gpu_job(

@@ -19,7 +19,7 @@ rule synthesise:
     params:
         settings=section("synthetic"),
         row=scenario_row,
-        code=code_digest("neuspring.data.synthetic.make", stage="perceive.make_capture"),
+        code=code_digest("neuspring.data.synthetic.make", stage="stages.perceive.make_capture"),
     shell:
         scenario_job(
             "capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
@@ -49,7 +49,7 @@ rule capture:
         settings=section("data_root"),
         row=scenario_row,
         images=image_stamps,
-        code=code_digest("neuspring.data.phystwin_raw", stage="perceive.make_capture"),
+        code=code_digest("neuspring.data.phystwin_raw", stage="stages.perceive.make_capture"),
     shell:
         scenario_job(
             "capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
@@ -145,7 +145,7 @@ rule lift:
         code=code_digest(
             "neuspring.perception.lift",
             "neuspring.perception.shape_prior",
-            stage="perceive.lift",
+            stage="stages.perceive.lift",
         ),
     shell:
         scenario_job(
@@ -177,7 +177,7 @@ rule judge:
         runtime=minutes("judge", 30, frame_work),
     params:
         settings=perception_settings("shape"),
-        code=code_digest("neuspring.perception.judge", stage="perceive.judge"),
+        code=code_digest("neuspring.perception.judge", stage="stages.perceive.judge"),
     shell:
         scenario_job(
             "judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
@@ -203,6 +203,6 @@ rule perception_table:
         runtime=minutes("perception_table", 10),
     params:
         arguments=perception_arguments(),
-        code=code_digest("neuspring.tables_perception"),
+        code=code_digest("neuspring.report.tables.perception"),
     shell:
         common_job("perception-table {params.arguments:q} --output {output:q}")

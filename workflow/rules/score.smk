@@ -25,7 +25,7 @@ rule score:
         stages=stage_options,
         pictures=picture_options,
         variant=variant,
-        code=code_digest("neuspring.metrics", "neuspring.figures", stage="score"),
+        code=code_digest("neuspring.scores.metrics", "neuspring.report.figures.run", stage="stages.stages.score"),
     shell:
         scenario_job(
             "score --observations {input.observations:q} {params.stages:q}"

@@ -18,7 +18,7 @@ rule study:
     params:
         arguments=study_arguments,
         definition=study_definition,
-        code=code_digest("neuspring.tables_paper"),
+        code=code_digest("neuspring.report.tables.study"),
     shell:
         common_job("study {params.arguments:q}")
 

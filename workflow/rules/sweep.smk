@@ -27,7 +27,7 @@ if CONFIG.tune:
             settings=tune_settings(),
             rows=tuned_rows(),
             code=code_digest(
-                "neuspring.fit", "neuspring.search", stage="tune_trial.run"
+                "neuspring.twin.fit", "neuspring.twin.search", stage="experiments.tuning.trial.run"
             ),
         shell:
             common_gpu_job(
@@ -53,7 +53,7 @@ if CONFIG.tune:
             runtime=minutes("sweep", 20),
         params:
             settings=tune_settings(),
-            code=code_digest("neuspring.tune_report"),
+            code=code_digest("neuspring.experiments.tuning.report"),
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")
 

@@ -17,7 +17,7 @@ rule tables:
         runtime=minutes("tables", 10),
     params:
         arguments=table_arguments(),
-        code=code_digest("neuspring.tables", "neuspring.gallery"),
+        code=code_digest("neuspring.report.tables.summary", "neuspring.report.gallery"),
     shell:
         common_job("tables {params.arguments:q}")
 
@@ -44,6 +44,6 @@ rule report:
         arguments=report_arguments(),
         templates=template_digest(),
         sweeps=finished_sweeps(),
-        code=code_digest("neuspring.report"),
+        code=code_digest("neuspring.report.page"),
     shell:
         common_job("report {params.arguments:q}")

@@ -20,7 +20,7 @@ rule search:
     params:
         settings=search_settings,
         clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
-        code=code_digest("neuspring.search"),
+        code=code_digest("neuspring.twin.search"),
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
@@ -51,7 +51,7 @@ rule fit:
     params:
         settings=fit_settings,
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
-        code=code_digest("neuspring.fit"),
+        code=code_digest("neuspring.twin.fit"),
     shell:
         gpu_job(
             "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
@@ -84,7 +84,7 @@ rule rollout:
     params:
         carry=carry_option,
         code=code_digest(
-            "neuspring.rollout", "neuspring.motion", "neuspring.carry", stage="rollout"
+            "neuspring.twin.rollout", "neuspring.twin.motion", "neuspring.twin.carry", stage="stages.stages.rollout"
         ),
     shell:
         gpu_job(

@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from neuspring.artifacts import Artifact, array
 from neuspring.baselines.gs_dynamics.network import Dynamics, weight_count
 from neuspring.baselines.gs_dynamics.rules import Rules
-from neuspring.errors import InputError
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from neuspring.artifacts import Observations, Trajectory
 from neuspring.baselines.gs_dynamics.graph import connect, sample
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.network import Dynamics
@@ -15,6 +14,7 @@ from neuspring.baselines.gs_dynamics.propagate import carry, turns
 from neuspring.baselines.gs_dynamics.tracks import tools_of, upright
 from neuspring.baselines.gs_dynamics.windows import executed
 from neuspring.baselines.results import LIMIT, Prediction
+from neuspring.core.artifacts import Observations, Trajectory
 
 
 @dataclass

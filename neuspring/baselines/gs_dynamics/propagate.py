@@ -17,8 +17,7 @@ import warp as wp
 
 from neuspring.baselines.gs_dynamics.graph import Graph
 from neuspring.baselines.gs_dynamics.rules import Rules
-from neuspring.kernels import load
-from neuspring.physics.solver import start_warp
+from neuspring.core.device import load, start_warp
 from neuspring.splats.skinning_kernels import turn_nodes
 
 CLOSE = 1e-4

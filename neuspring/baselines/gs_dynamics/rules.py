@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from neuspring.config_gs_dynamics import GsDynamics, NodeInput, Propagation, Tools
+from neuspring.config.gs_dynamics import GsDynamics, NodeInput, Propagation, Tools
 
 PresetName = Literal["rope", "animals", "cloth"]
 Values = TypeVar("Values")

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from neuspring.artifacts import Observations, Up
 from neuspring.baselines.gs_dynamics.rules import Rules
-from neuspring.config_gs_dynamics import GsDynamics
-from neuspring.points import farthest
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.core.artifacts import Observations, Up
+from neuspring.core.points import farthest
 
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
 """About the x axis: takes a world with -z up to one with +z up, and back, without making a mirror image of it."""

@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from neuspring.artifacts import Observations
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.network import Dynamics, initial_weights
 from neuspring.baselines.gs_dynamics.objective import draw, unroll
@@ -23,9 +22,10 @@ from neuspring.baselines.gs_dynamics.rules import preset_name, resolve
 from neuspring.baselines.gs_dynamics.tracks import Tracks, tools_of
 from neuspring.baselines.gs_dynamics.windows import Windows, executed
 from neuspring.baselines.results import Trained
-from neuspring.checkpoint import Checkpoint
-from neuspring.config_gs_dynamics import GsDynamics
-from neuspring.progress import Progress
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.core.artifacts import Observations
+from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.progress import Progress
 
 COLUMNS = ["step", "loss", "position_loss", "length_loss"]
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from neuspring.baselines.gs_dynamics.tracks import Tracks
-from neuspring.config_gs_dynamics import GsDynamics
+from neuspring.config.gs_dynamics import GsDynamics
 
 
 def moved(tools: np.ndarray, before: int, after: int) -> float:

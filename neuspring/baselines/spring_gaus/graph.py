@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.errors import NumericalFailure
+from neuspring.core.errors import NumericalFailure
 
 SHORTEST_LINK = 1e-4
 """Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""

@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from neuspring.artifacts import Artifact, array
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.solver import AnchorParameters, AnchorPhysics
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.errors import InputError
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,10 @@ import torch
 
 from neuspring.baselines.spring_gaus.graph import Binding
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
-from neuspring.losses import FrameLoss
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterise import Backend, rasterise
 from neuspring.splats.view import View
+from neuspring.twin.losses import FrameLoss
 
 
 class Follower:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neuspring.artifacts import Observations, Trajectory
 from neuspring.baselines.results import LIMIT, Prediction
 from neuspring.baselines.spring_gaus.graph import Binding
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.objectives import Follower
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.core.artifacts import Observations, Trajectory
 
 
 @torch.no_grad()

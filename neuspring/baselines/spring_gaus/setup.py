@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuspring import vgg16_weights
-from neuspring.artifacts import Observations
+from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.objectives import Follower, Points, Silhouettes
@@ -19,15 +18,16 @@ from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.baselines.spring_gaus.train import Objective, Problem
 from neuspring.baselines.spring_gaus.vgg16 import Vgg16
 from neuspring.config import Config
-from neuspring.config_spring_gaus import SpringGaus
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.artifacts import Observations
+from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.errors import InputError
-from neuspring.losses import FrameLoss
 from neuspring.perception.results import masks_of_cameras
-from neuspring.pictures import view_of
+from neuspring.splats.draw import view_of
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterise import Backend, choose_backend
 from neuspring.splats.view import View
+from neuspring.twin.losses import FrameLoss
 
 CELLS = (0.01, 0.001)
 """m, of the grids that anchors are drawn from."""

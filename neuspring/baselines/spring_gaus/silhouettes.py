@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import torch
 
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.image_metrics import ssim
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.scores.images import ssim
 
 Features = Callable[[torch.Tensor], torch.Tensor]
 """Pictures [B, 3, H, W] in 0..1 -> features."""

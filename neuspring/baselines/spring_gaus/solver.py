@@ -11,8 +11,7 @@ import warp as wp
 
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.kernels import substep_kernels
-from neuspring.kernels import load
-from neuspring.physics.solver import start_warp
+from neuspring.core.device import load, start_warp
 
 
 @dataclass(frozen=True)

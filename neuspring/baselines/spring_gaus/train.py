@@ -21,9 +21,9 @@ import torch
 from neuspring.baselines.results import LIMIT, Trained
 from neuspring.baselines.spring_gaus.model import TRAINED, SpringGausModel
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
-from neuspring.checkpoint import Checkpoint
-from neuspring.config_spring_gaus import SpringGaus
-from neuspring.progress import Progress
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.progress import Progress
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(iteration, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""

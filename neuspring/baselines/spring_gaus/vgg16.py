@@ -1,6 +1,6 @@
 """Features of VGG16 (Simonyan and Zisserman 2015) up to its second ReLU of 128 channels: layers 0 to 8 of torchvision's `features`.
 
-Written out here, so torchvision is not needed. The weights are a file, see `neuspring.vgg16_weights`; nothing is downloaded.
+Written out here, so torchvision is not needed. The weights are a file, see `vgg16_weights`; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from neuspring.weight_files import read_tensors
+from neuspring.core.weights import read_tensors
 
 LAYERS = (0, 2, 5, 7)
 """Places of the convolutions, each followed by a ReLU; a max-pooling comes before the third."""

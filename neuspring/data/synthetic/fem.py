@@ -14,12 +14,12 @@ import newton
 import numpy as np
 import warp as wp
 
+from neuspring.core.errors import NumericalFailure
 from neuspring.data.synthetic import fem_kernels as kernels
 from neuspring.data.synthetic.body import Body
 from neuspring.data.synthetic.fem_model import GRAVITY, build, lame
 from neuspring.data.synthetic.hands import Hand
 from neuspring.data.synthetic.tetrahedra import edges, volumes
-from neuspring.errors import NumericalFailure
 
 SAFETY = 0.6
 """Fraction of the critical step."""

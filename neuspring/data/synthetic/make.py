@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.config import ScenarioRow
-from neuspring.config_perception import Synthetic
+from neuspring.config.perception import Synthetic
+from neuspring.core.device import quiet
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.points import farthest
+from neuspring.core.progress import Progress
+from neuspring.core.records import digest_file
 from neuspring.data.capture import Camera, CameraEntry, Capture, Description, Writer
 from neuspring.data.synthetic.body import Body
 from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, certify, settle
@@ -19,11 +24,6 @@ from neuspring.data.synthetic.scenes import SCENES
 from neuspring.data.synthetic.sensor import measured, quantised
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.data.synthetic.vbd import VertexBlockDescent
-from neuspring.errors import InputError, NumericalFailure
-from neuspring.kernels import quiet
-from neuspring.points import farthest
-from neuspring.progress import Progress
-from neuspring.records import digest_file
 
 FRAME_RATE = 30.0
 DEPTH_UNIT = 0.001

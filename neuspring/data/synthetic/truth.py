@@ -11,10 +11,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from neuspring.artifacts import Artifact, array
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.errors import InputError
-from neuspring.records import digest_file
 
 
 @dataclass(frozen=True, kw_only=True)

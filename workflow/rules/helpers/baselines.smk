@@ -41,7 +41,7 @@ def model_of(wildcards):
 
 def train_digest(wildcards):
     code = config_baselines.TRAINING[model_of(wildcards)]
-    return code_digest(code, stage="stages_baselines.train")
+    return code_digest(code, stage="stages.baselines.train")
 
 
 def feature_weights(wildcards):
@@ -60,7 +60,7 @@ def predict_digest(wildcards):
         if model in settings.UNTRAINED
         else f"neuspring.baselines.{model}.predict"
     )
-    return code_digest(kind, "neuspring.metrics", stage="stages_baselines.predict")
+    return code_digest(kind, "neuspring.scores.metrics", stage="stages.baselines.predict")
 
 
 def train_records(wildcards):

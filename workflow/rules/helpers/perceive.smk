@@ -26,7 +26,7 @@ def scenario_row(wildcards):
 def reader_digest(wildcards):
     source = BENCHMARK.scenarios[wildcards.scenario].source
     if source in settings.FILMED:
-        return code_digest("neuspring.perception.sample", stage="perceive.assemble")
+        return code_digest("neuspring.perception.sample", stage="stages.perceive.assemble")
     return code_digest(f"neuspring.data.{source}")
 
 
@@ -125,7 +125,7 @@ BACKENDS = {
 def backend_digest(step):
     """The code of a step's chosen backend, and of the step."""
     backend = getattr(CONFIG.perception, step).backend
-    return code_digest(BACKENDS[step, backend], stage=f"perceive.{step}")
+    return code_digest(BACKENDS[step, backend], stage=f"stages.perceive.{step}")
 
 
 def segment_backend(wildcards):
@@ -142,7 +142,7 @@ def segment_settings(wildcards):
 
 def segment_digest(wildcards):
     return code_digest(
-        BACKENDS["segment", segment_backend(wildcards)], stage="perceive.segment"
+        BACKENDS["segment", segment_backend(wildcards)], stage="stages.perceive.segment"
     )
 
 

@@ -69,7 +69,7 @@ def table_arguments(output=TABLE_FOLDER):
 
 def template_digest():
     """Of the report's templates, which the digest of its code does not hold."""
-    folder = Path(needs.__file__).parent / "report" / "templates"
+    folder = ROOT / "neuspring" / "report" / "page" / "templates"
     texts = [path.read_bytes() for path in sorted(folder.iterdir())]
     return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
 

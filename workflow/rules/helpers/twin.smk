@@ -74,9 +74,9 @@ def transfer_digest(wildcards):
     own = (
         ["neuspring.baselines.gs_dynamics.predict"]
         if BENCHMARK.methods[wildcards.method].model
-        else ["neuspring.rollout", "neuspring.transfer", "neuspring.motion"]
+        else ["neuspring.twin.rollout", "neuspring.twin.transfer", "neuspring.twin.motion"]
     )
-    return code_digest(*own, "neuspring.metrics", stage="transfer")
+    return code_digest(*own, "neuspring.scores.metrics", stage="stages.stages.transfer")
 
 
 def rollout_twins(wildcards):

@@ -1,0 +1,19 @@
+"""Where the weights of VGG16 lie. Imports nothing heavy, because the workflow asks before any job exists."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neuspring.core.weights import find_file, hub_folder
+
+FILE = "vgg16-397923af.pth"
+DIGEST = "397923af"
+"""First digits of the SHA-256, by torch hub's convention those in the name."""
+
+
+def find(path: str | None) -> Path | str:
+    """The weight file that the configuration names or that lies in torch hub's cache, else one line that says why not.
+
+    Raises InputError only for a named file that is missing or has another content.
+    """
+    return find_file("VGG16 weights", Path(path) if path else None, [hub_folder() / FILE], DIGEST, False)

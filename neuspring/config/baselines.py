@@ -1,0 +1,27 @@
+"""Settings of the baseline models, which learn or need no spring-mass twin: `model` of a method row names one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.types import STRICT
+
+Model = Literal["spring_gaus", "gs_dynamics", "static", "controller_lbs"]
+"""spring_gaus: anchors with directed springs. gs_dynamics: a graph network. static: frame 0 is held. controller_lbs: the object is
+skinned to the controllers."""
+TRAINING = {"spring_gaus": "neuspring.baselines.spring_gaus.setup", "gs_dynamics": "neuspring.baselines.gs_dynamics.train"}
+"""Models that are trained, and the module that all their code is reached from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baselines:
+    """The models of the baselines; a method's own `settings` go on top."""
+
+    __pydantic_config__ = STRICT
+    spring_gaus: SpringGaus = field(default_factory=SpringGaus)
+    """See [baselines.spring_gaus](#baselinesspring_gaus)."""
+    gs_dynamics: GsDynamics = field(default_factory=GsDynamics)
+    """See [baselines.gs_dynamics](#baselinesgs_dynamics)."""

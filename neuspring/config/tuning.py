@@ -1,0 +1,91 @@
+"""Settings of a tuning study; part of `neuspring.config.settings`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints
+
+from neuspring.config.types import STRICT, Count, Name
+from neuspring.core.uri import refuse_password
+
+Whole = Annotated[int, Field(ge=0)]
+Number = int | Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dimension:
+    """What a study may choose for one setting: a range of numbers (`low`, `high`), or one of `choices`."""
+
+    __pydantic_config__ = STRICT
+    low: Number | None = None
+    """Smallest value, in the setting's unit; whole numbers where the setting is one."""
+    high: Number | None = None
+    """Largest value."""
+    log: bool = False
+    """Draw on a logarithmic scale."""
+    step: Number | None = None
+    """Distance of the values from `low` on; null: 1 for whole numbers, continuous otherwise."""
+    choices: tuple[Any, ...] = ()
+    """Instead of a range: any values that the setting may have."""
+
+    def __post_init__(self) -> None:
+        if self.choices:
+            if (self.low, self.high, self.log, self.step) != (None, None, False, None):
+                raise ValueError("either choices or low and high (with log or step) are required, received both")
+            if len(self.choices) < 2 or any(value in self.choices[:place] for place, value in enumerate(self.choices)):
+                raise ValueError(f"choices: at least two, all different, are required, received {list(self.choices)}")
+            return
+        if self.low is None or self.high is None:
+            raise ValueError("low and high, or choices, are required")
+        if not self.low < self.high:
+            raise ValueError(f"low < high is required, received {self.low} and {self.high}")
+        if self.log and (self.low <= 0 or self.step is not None):
+            raise ValueError(f"log: low > 0 and no step are required, received low {self.low} and step {self.step}")
+        if self.step is not None and not 0 < self.step <= self.high - self.low:
+            raise ValueError(f"step: 0 < step <= high - low is required, received {self.step}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune:
+    """A study: which settings of one method are varied, and how trials are spent. Test frames are never read."""
+
+    __pydantic_config__ = STRICT
+    study: Annotated[Name, StringConstraints(max_length=60)]
+    """Name of the study and of its folder in `<results>/tune`. A study keeps its method, space, settings and data for good."""
+    method: Name
+    """Row of the method table that is varied; its own settings, and its search row's, are the baseline (trial 0). What it does to
+    predictions alone (`carry_over`, `average_seeds`) plays no part."""
+    space: dict[str, Dimension]
+    """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
+    `released_quirks`, and `clusters`, the number of regions of the method's search."""
+    scenarios: tuple[Name, ...] = ()
+    """Scenarios whose mean loss is minimised; empty: the configuration's."""
+    seed: Whole = 0
+    """Of search, field and sampler."""
+    trials: Count = 40
+    """Finished, pruned and failed ones, over all workers. More than before: the study goes on."""
+    workers: Count = 1
+    """Jobs that share the study."""
+    storage: Annotated[str, StringConstraints(pattern=r"^postgresql(\+\w+)?://\S+$")] | None = None
+    """PostgreSQL URI, for workers on several machines (no password in it: libpq reads PGPASSWORD or ~/.pgpass); null: SQLite
+    in the study's folder, for workers of one machine."""
+    pruner: Literal["median", "hyperband", "none"] = "median"
+    """Which trials end early: those above the median of finished ones at the same epoch, those that successive halving drops, or
+    none."""
+    startup_trials: Whole = 10
+    """Random trials before the sampler (TPE) learns from earlier ones, and before the median prunes any."""
+    warmup_scenarios: Whole | None = None
+    """Scenarios that every trial runs to their end before it may be pruned: losses of one alone say little about the mean. They
+    are run in the order given; null: a third of them, rounded up, if there are several."""
+    warmup_epochs: Whole = 5
+    """Epochs after those in which no trial is pruned either."""
+
+    def __post_init__(self) -> None:
+        if not self.space:
+            raise ValueError("space: at least one setting is required")
+        if self.storage:
+            refuse_password("storage", self.storage, "PGPASSWORD or ~/.pgpass")
+        if len(set(self.scenarios)) != len(self.scenarios):
+            raise ValueError(f"scenarios: entries must differ, received {list(self.scenarios)}")

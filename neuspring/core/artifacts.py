@@ -1,0 +1,432 @@
+"""The nouns that cross a rule boundary: frozen, validated dataclasses, each saved to one file.
+
+Every array is declared with its shape, dtype and unit (`array(...)`). Symbolic dimensions (T frames, N nodes, S springs,
+...) must agree within one artefact. Files are `.npz` without pickle: the arrays, plus one JSON text under `meta` that
+holds the kind, the format version and the plain fields. Writes go to a temporary file that is renamed when complete, so
+a killed job never leaves a half file that looks whole.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import zipfile
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self, get_type_hints
+
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_atomically
+
+FORMAT_VERSION = 1
+Up = Literal["+z", "-z"]
+InitialVelocity = Literal["rest", "observed"]
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
+"""Names become folder names and command-line words: no separators, spaces or shell characters."""
+NO_REST_SHAPE = np.zeros((0, 3))
+"""The rest shape that stands for: as in frame 0."""
+
+
+def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False) -> Any:
+    """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
+
+    An optional one is empty where it is not given.
+    """
+    sizes = tuple(shape.split(","))
+    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan}
+    if not optional:
+        return field(metadata=metadata)
+    empty = tuple(int(size) if size.isdigit() else 0 for size in sizes)
+    return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Artifact:
+    """Base of all artefacts: validation against the declaration, `save` and `load`."""
+
+    kind: ClassVar[str] = "artifact"
+
+    def __post_init__(self) -> None:
+        sizes: dict[str, int] = {}
+        for spec in dataclasses.fields(self):
+            if "shape" not in spec.metadata:
+                continue
+            value = np.asarray(getattr(self, spec.name))
+            value = self._validated(spec, value, sizes)
+            value.setflags(write=False)
+            object.__setattr__(self, spec.name, value)
+        self.check()
+
+    def _validated(self, spec: dataclasses.Field[Any], value: np.ndarray, sizes: dict[str, int]) -> np.ndarray:
+        shape, dtype = spec.metadata["shape"], spec.metadata["dtype"]
+        where = f"{self.kind}.{spec.name}"
+        declared = f"[{', '.join(shape)}] {dtype.name}"
+        if value.ndim != len(shape):
+            raise InputError(where, f"the shape must be {declared}", f"{value.shape}")
+        for axis, (symbol, size) in enumerate(zip(shape, value.shape, strict=True)):
+            wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
+            if size != wanted:
+                raise InputError(where, f"the shape must be {declared}, so axis {axis} must have {wanted} entries", value.shape)
+        same_family = np.can_cast(value.dtype, dtype, casting="same_kind")
+        if not same_family or (dtype.kind == "b") != (value.dtype.kind == "b"):
+            raise InputError(where, f"the dtype must be {dtype.name}", value.dtype)
+        if dtype.kind == "i" and value.size and not (value.min() >= np.iinfo(dtype).min and value.max() <= np.iinfo(dtype).max):
+            raise InputError(where, f"every entry must fit {dtype.name}", f"[{value.min()}, {value.max()}]")
+        value = np.array(value, dtype=dtype, order="C", copy=True)
+        if dtype.kind == "f" and not spec.metadata["nan"] and not np.isfinite(value).all():
+            first = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
+            raise InputError(where, "every entry must be finite", f"{value[first]} at index {first}")
+        return value
+
+    def check(self) -> None:
+        """Raise InputError if fields contradict each other."""
+
+    def save(self, path: Path) -> None:
+        """Write this artefact to `path` (.npz) atomically."""
+        arrays: dict[str, np.ndarray] = {}
+        plain = self._flatten(arrays, "")
+        meta = {"kind": self.kind, "format": FORMAT_VERSION, "fields": plain}
+        text = json.dumps(meta, sort_keys=True, allow_nan=False)
+        arrays["meta"] = np.frombuffer(text.encode(), dtype=np.uint8)
+
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as stream:
+                np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+        write_atomically(Path(path), write)
+
+    def _flatten(self, arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
+        plain: dict[str, Any] = {}
+        for spec in dataclasses.fields(self):
+            value = getattr(self, spec.name)
+            if "shape" in spec.metadata:
+                arrays[prefix + spec.name] = value
+            elif isinstance(value, Artifact):
+                plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
+            elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+                plain[spec.name] = dataclasses.asdict(value)
+            else:
+                plain[spec.name] = value
+        return plain
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read an artefact of this kind from `path`. Raises InputError if the file is missing, damaged or of another kind."""
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that makes it first.")
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            meta = json.loads(arrays.pop("meta").tobytes().decode())
+            if not isinstance(meta, dict):
+                raise ValueError("`meta` holds no mapping")
+        # zipfile raises RuntimeError for damaged flags, and np.load returns a bare array (TypeError) for an .npy file.
+        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            raise InputError(
+                path,
+                f"this file must be readable, of kind {cls.kind}",
+                f"{type(error).__name__}: {error}",
+                "Delete it and re-run its step.",
+            ) from error
+        if meta.get("kind") != cls.kind:
+            raise InputError(path, f"this file must be of kind {cls.kind}", meta.get("kind"))
+        if meta.get("format") != FORMAT_VERSION:
+            raise InputError(
+                path, f"this version reads format {FORMAT_VERSION}", meta.get("format"), "Re-run the step that made it."
+            )
+        try:
+            return cls._build(arrays, meta["fields"], "")
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                path, f"this file must hold every field of kind {cls.kind}", f"{type(error).__name__}: {error}"
+            ) from error
+
+    @classmethod
+    def _build(cls, arrays: dict[str, np.ndarray], plain: dict[str, Any], prefix: str) -> Self:
+        hints = get_type_hints(cls)
+        values: dict[str, Any] = {}
+        for spec in dataclasses.fields(cls):
+            if "shape" in spec.metadata:
+                optional = spec.default_factory is not dataclasses.MISSING
+                if not optional or prefix + spec.name in arrays:
+                    values[spec.name] = arrays[prefix + spec.name]
+                continue
+            kind, value = hints[spec.name], plain[spec.name]
+            if isinstance(kind, type) and issubclass(kind, Artifact):
+                value = kind._build(arrays, value, f"{prefix}{spec.name}.")
+            elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
+                value = kind(**value)
+            elif isinstance(value, list):
+                value = _tuples(value)
+            values[spec.name] = value
+        return cls(**values)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario(Artifact):
+    """Where a capture comes from and how it is split.
+
+    Training frames are [0, train_end), future frames [train_end, frame_count).
+    """
+
+    kind: ClassVar[str] = "scenario"
+    name: str
+    source: str
+    """The reader that made it: phystwin, mocap or toy."""
+    category: str
+    frame_count: int
+    train_end: int
+    frame_rate: float
+    """Frames per second."""
+    up: Up
+    """Which way is up along the world's z axis; the ground is the plane z = 0."""
+    self_collision: bool = False
+    ground: bool = True
+    provenance: dict[str, str] = field(default_factory=dict)
+    """What the reader used, as text: files with digests, options."""
+
+    def check(self) -> None:
+        if not SAFE_NAME.fullmatch(self.name):
+            raise InputError("scenario.name", f"a name must match {SAFE_NAME.pattern}", repr(self.name))
+        if not 1 < self.train_end <= self.frame_count:
+            raise InputError(
+                f"scenario {self.name}, split",
+                f"1 < train_end <= frame_count = {self.frame_count} is required",
+                f"train_end = {self.train_end}",
+                "Correct the split; at least one frame after frame 0 must be for training.",
+            )
+        if not (np.isfinite(self.frame_rate) and self.frame_rate > 0):
+            raise InputError(
+                f"scenario {self.name}, frame_rate", "a positive number of frames per second is required", self.frame_rate
+            )
+        if self.up not in ("+z", "-z"):
+            raise InputError(f"scenario {self.name}, up", "must be '+z' or '-z'", repr(self.up))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations(Artifact):
+    """What was seen: tracked object points, the hands, and the structure of the object at frame 0.
+
+    The canonical node order is [object_points[0] | surface_points | interior_points]; the first No + Ns nodes are "surface".
+    """
+
+    kind: ClassVar[str] = "observations"
+    scenario: Scenario
+    object_points: np.ndarray = array("T,No,3", np.float32, "m", "tracked points; zeros where invisible")
+    object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is seen in each frame")
+    object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from frame t to t+1 may be trusted")
+    controller_points: np.ndarray = array("T,C,3", np.float32, "m", "points that move the object (hands, grippers)")
+    surface_points: np.ndarray = array("Ns,3", np.float32, "m", "further surface nodes of frame 0")
+    interior_points: np.ndarray = array("Ni,3", np.float32, "m", "interior nodes of frame 0")
+    tracks: np.ndarray = array("T,K,3", np.float32, "m", "annotated tracks for scoring only; NaN where not annotated", nan=True)
+    rest_shape: np.ndarray = array(
+        "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
+    )
+
+    def check(self) -> None:
+        name = f"observations of {self.scenario.name}"
+        frames, points = self.object_visibility.shape
+        if frames != self.scenario.frame_count:
+            raise InputError(name, f"the scenario declares {self.scenario.frame_count} frames", f"arrays of {frames} frames")
+        if points == 0:
+            raise InputError(name, "at least one tracked object point is required", "none")
+        if self.controller_points.shape[1] == 0:
+            raise InputError(name, "at least one controller point is required", "none", "Without a hand nothing moves the object.")
+        if not self.object_visibility[0].all():
+            count = int((~self.object_visibility[0]).sum())
+            raise InputError(
+                name, "every tracked point must be visible in frame 0, where every rollout starts", f"{count} of {points} are not"
+            )
+        _require_rest_shape(name, self.rest_shape, len(self.nodes) + self.controller_points.shape[1])
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Nodes of frame 0 [N, 3], metres."""
+        return np.concatenate([self.object_points[0], self.surface_points, self.interior_points])
+
+    @property
+    def canonical(self) -> np.ndarray:
+        """Nodes, then controllers [N + C, 3], m, in the shape that topology, regions and the field are defined on."""
+        return canonical_shape(self.nodes, self.controller_points[0], self.rest_shape)
+
+    @property
+    def surface_count(self) -> int:
+        """How many of the first nodes count as surface: No + Ns."""
+        return len(self.object_points[0]) + len(self.surface_points)
+
+
+def canonical_shape(nodes: np.ndarray, controllers: np.ndarray, rest_shape: np.ndarray) -> np.ndarray:
+    """The rest shape [N + C, 3], m, or, where it is empty, nodes [N, 3] and controllers [C, 3] of frame 0."""
+    return rest_shape if len(rest_shape) else np.concatenate([nodes, controllers])
+
+
+def _require_rest_shape(name: str, rest_shape: np.ndarray, points: int) -> None:
+    if len(rest_shape) not in (0, points):
+        raise InputError(f"{name}.rest_shape", f"one position per node and controller ({points}), or none", len(rest_shape))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topology(Artifact):
+    """The spring graph. Spring end points index nodes; an index i >= N means controller i - N."""
+
+    kind: ClassVar[str] = "topology"
+    nodes: np.ndarray = array("N,3", np.float32, "m", "positions of frame 0")
+    controllers: np.ndarray = array("C,3", np.float32, "m", "controller positions of frame 0")
+    springs: np.ndarray = array("S,2", np.int32, "1", "end points; object springs first, then controller springs")
+    rest_lengths: np.ndarray = array("S", np.float32, "m", "lengths without force")
+    labels: np.ndarray = array("N", np.int32, "1", "cluster of each node; all zero when the topology is uniform")
+    rest_shape: np.ndarray = array(
+        "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
+    )
+
+    def check(self) -> None:
+        nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
+        _require_rest_shape("topology", self.rest_shape, total)
+        if len(self.springs) and (self.springs.min() < 0 or self.springs.max() >= total):
+            raise InputError(
+                "topology.springs", f"indices must lie in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]"
+            )
+        of_controller = (self.springs >= nodes).any(axis=1)
+        if (np.diff(of_controller.astype(np.int8)) < 0).any():
+            raise InputError("topology.springs", "object springs must come before controller springs")
+        if (self.springs >= nodes).all(axis=1).any():
+            raise InputError("topology.springs", "a spring may not join two controllers")
+        short = np.flatnonzero(~(self.rest_lengths > 0))
+        if len(short):
+            raise InputError(
+                "topology.rest_lengths",
+                "every spring must have a positive rest length",
+                f"{self.rest_lengths[short[0]]} m for spring {short[0]} between {self.springs[short[0]].tolist()}",
+                "Remove duplicate points before building the springs.",
+            )
+
+    @property
+    def canonical(self) -> np.ndarray:
+        """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
+        return canonical_shape(self.nodes, self.controllers, self.rest_shape)
+
+    @property
+    def object_spring_count(self) -> int:
+        """How many springs join two object nodes; they come first."""
+        return int(np.count_nonzero((self.springs < len(self.nodes)).all(axis=1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material(Artifact):
+    """Physical parameters. Every node has unit mass (1 kg), as in the released simulator; forces scale with it."""
+
+    kind: ClassVar[str] = "material"
+    stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")
+    dashpot: np.ndarray = array("S", np.float32, "N s/m", "damping along the spring")
+    drag: float
+    """Exponential velocity decay, 1/s."""
+    ground_elasticity: float
+    ground_friction: float
+    contact_elasticity: float
+    contact_friction: float
+    contact_distance: float
+    """Distance below which approaching nodes collide, m."""
+
+    def check(self) -> None:
+        for name in ("stiffness", "dashpot"):
+            values = getattr(self, name)
+            if (values < 0).any():
+                raise InputError(f"material.{name}", "must not be negative", float(values.min()))
+        for name in SCALARS:
+            value = getattr(self, name)
+            if not np.isfinite(value):
+                raise InputError(f"material.{name}", "must be finite", value)
+        if self.drag < 0 or self.contact_distance <= 0:
+            raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
+
+
+SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """How a twin is integrated: everything a rollout needs besides topology, material and controller motion."""
+
+    frame_time: float
+    """Simulated time per frame, s. The substep is frame_time / substeps."""
+    substeps: int
+    up: Up = "+z"
+    gravity: float = 9.8
+    """m/s^2, towards -up."""
+    ground: bool = True
+    self_collision: bool = False
+    collision_capacity: int = 500
+    """Candidate partners kept per node and frame; more are reported, never written."""
+    controller_velocity: bool = False
+    """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
+    initial_velocity: InitialVelocity = "rest"
+    """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
+            rule = "finite frame_time > 0, substeps >= 1, collision_capacity >= 1, finite gravity are required"
+            raise InputError("simulation", rule, self)
+        if self.up not in ("+z", "-z"):
+            raise InputError("simulation.up", "must be '+z' or '-z'", repr(self.up))
+
+    @property
+    def substep(self) -> float:
+        """Integration step, s."""
+        return self.frame_time / self.substeps
+
+    @property
+    def up_sign(self) -> float:
+        """+1 when +z is up, -1 when -z is up."""
+        return 1.0 if self.up == "+z" else -1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Twin(Artifact):
+    """Topology + Material + Simulation: enough to roll out anywhere."""
+
+    kind: ClassVar[str] = "twin"
+    topology: Topology
+    material: Material
+    simulation: Simulation
+
+    def check(self) -> None:
+        springs, values = len(self.topology.springs), len(self.material.stiffness)
+        if springs != values:
+            raise InputError("twin", f"the material must have one stiffness per spring ({springs})", values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory(Artifact):
+    """Predicted node positions. A rollout that diverges is a named result: it keeps the frames before `diverged_frame`."""
+
+    kind: ClassVar[str] = "trajectory"
+    positions: np.ndarray = array("F,N,3", np.float32, "m", "positions at the end of each frame; frame 0 is the rest state")
+    frame_count: int
+    """Frames asked for; F is smaller only when the rollout diverged."""
+    diverged_frame: int | None = None
+    reason: str = ""
+    collision_overflow: int = 0
+    """Collision candidates that did not fit the list, summed over frames."""
+
+    def check(self) -> None:
+        frames = len(self.positions)
+        expected = self.frame_count if self.diverged_frame is None else self.diverged_frame
+        if frames != expected:
+            raise InputError("trajectory.positions", f"{expected} frames are expected", frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatCentres(Artifact):
+    """Where a method's own model puts its splats; their other properties are those of frame 0."""
+
+    kind: ClassVar[str] = "splat_centres"
+    positions: np.ndarray = array("F,G,3", np.float32, "m", "centre of each splat at the end of each frame")

@@ -1,0 +1,110 @@
+"""Where things are computed: Warp's start, the device that a setting means, kernels compiled once however many processes start.
+
+The only module of this package that imports torch and Warp.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import logging
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from filelock import FileLock
+
+from neuspring.core.errors import InputError
+
+DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
+_loaded: set[tuple[int, str]] = set()
+
+
+@functools.cache
+def start_warp() -> None:
+    """Initialise Warp once, quietly: kernels here carry their own adjoints."""
+    wp.config.enable_backward = False
+    quiet()
+    with _without_driver_warning():
+        wp.init()
+
+
+@contextlib.contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Drop Warp's native line about a missing CUDA driver where torch finds no GPU either; pass on everything else."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            caught.seek(0)
+            for line in caught.read().decode(errors="replace").splitlines(keepends=True):
+                if "NVIDIA CUDA driver" not in line:
+                    sys.stderr.write(line)
+
+
+def resolve_device(device: str) -> str:
+    """`auto` -> `cuda:0` where CUDA works, else `cpu`. Raises InputError for other words and for a device that is not there."""
+    if not DEVICES.fullmatch(device):
+        raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    held = os.environ.get("CUDA_VISIBLE_DEVICES", "").strip()
+    holds = held not in ("", "-1")
+    # A job that holds a GPU which CUDA does not find has lost it; but a torch without CUDA never finds one.
+    lost = holds and bool(torch.version.cuda)
+    if device == "cpu" or (device == "auto" and count == 0 and not lost):
+        if device == "auto" and holds:
+            _warn_of_idle_gpu(held)
+        return "cpu"
+    if not torch.version.cuda:
+        raise InputError("device", "this torch is a build for the CPU alone", device, "Install its CUDA build, or use device: cpu.")
+    index = int(device.partition(":")[2] or 0)
+    if index >= count:
+        raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
+    return f"cuda:{index}"
+
+
+@functools.cache
+def _warn_of_idle_gpu(held: str) -> None:
+    """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
+    print(
+        f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
+        "With device: cuda this is an error.",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def quiet() -> None:
+    """Warp says nothing of modules that it loads, only of errors. Call this before it starts."""
+    wp.config.log_level = logging.ERROR
+
+
+def load(kernel: Any, device: Any) -> Any:
+    """Compile and load a kernel on a device before it is launched; returns the kernel."""
+    key = (id(kernel), str(device))
+    if key not in _loaded:
+        wp.init()
+        assert wp.config.kernel_cache_dir, "Warp sets it when it starts"
+        folder = Path(wp.config.kernel_cache_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        name = hashlib.sha256(f"{kernel.module.name} {kernel.key}".encode()).hexdigest()[:16]
+        with FileLock(folder / f"{name}.lock"):
+            wp.load_module(kernel.module, device=device)
+        # Kernels live as long as the process: each module caches its own.
+        _loaded.add(key)
+    return kernel

@@ -1,0 +1,157 @@
+"""What code made a result: a digest of the package modules a stage uses, and the commit.
+
+Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
+syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
+`fit.py` re-runs fits; editing a docstring, or `tables.py`, re-runs nothing that costs time. Of `stages.py`, which reaches
+everything, the rules that cost little (rollout, transfer, score) follow the function that they call.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = "neuspring"
+STAGES = f"{PACKAGE}.stages"
+ROOT = Path(__file__).parents[1]
+NOT_NUMERICS = tuple(f"{PACKAGE}.{name}" for name in ("config", "core.progress", "core.records"))
+"""Declarations and reporting: configured values reach a rule as parameters of their own."""
+
+
+@functools.cache
+def _source(module: str) -> Path | None:
+    parts = module.split(".")[1:]
+    path = ROOT.joinpath(*parts)
+    for file in (path.with_suffix(".py"), path / "__init__.py"):
+        if file.is_file():
+            return file
+    return None
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module:
+    """The syntax of a module, without its documentation."""
+    path = _source(module)
+    assert path is not None, module
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in _statements(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            # Any bare string is documentation: docstrings, and the notes under fields and constants.
+            node.body = [item for item in node.body if not _is_text(item)] or [ast.Pass()]
+    return tree
+
+
+def _statements(tree: ast.Module) -> Iterator[ast.AST]:
+    """A module and all statements in it: expressions, which are ten times as many, cost every start of the workflow time."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        # Handlers of exceptions and cases of a match hold statements without being one.
+        waiting += [
+            item
+            for values in vars(node).values()
+            if isinstance(values, list)
+            for item in values
+            if isinstance(item, ast.stmt | ast.excepthandler | ast.match_case)
+        ]
+
+
+@functools.cache
+def imported_modules(module: str) -> frozenset[str]:
+    """Package modules that `module` imports directly, anywhere in its text."""
+    found = set()
+    for node in _statements(_tree(module)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            # `from package import name` may name a module or something in one.
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        found |= {name for name in names if name.split(".")[0] == PACKAGE and name != PACKAGE and _source(name) is not None}
+    return frozenset(found)
+
+
+def used_modules(module: str) -> list[str]:
+    """`module` and every package module it reaches, sorted."""
+    seen: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            waiting.extend(imported_modules(name))
+    return sorted(seen)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def _stage_code(stage: str) -> str:
+    """The function `stage` of `neuspring.stages.stages`, or `module.function` of another module, and what it uses there."""
+    module, _, function = stage.rpartition(".")
+    tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
+    functions: dict[str, ast.stmt] = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            functions[node.name] = node
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+            functions |= dict.fromkeys(names, node)
+    found: dict[str, str] = {}
+    waiting = [function]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found[name] = ast.dump(functions[name])
+            waiting += [node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name) and node.id in functions]
+    return "".join(found[name] for name in sorted(found))
+
+
+def _declares(module: str) -> bool:
+    return module in NOT_NUMERICS or module.startswith(tuple(f"{name}." for name in NOT_NUMERICS))
+
+
+@functools.cache
+def _module_code(module: str) -> bytes:
+    return ast.dump(_tree(module)).encode()
+
+
+@functools.cache
+def code_digest(*modules: str, stage: str = "") -> str:
+    """A short SHA-256 over the code that the given package modules use and, if named, a function (see `_stage_code`)."""
+    digest = hashlib.sha256()
+    used = {name for module in modules for name in used_modules(module) if not _declares(name)}
+    for name in sorted(used):
+        digest.update(name.encode())
+        digest.update(_module_code(name))
+    digest.update(_stage_code(stage).encode() if stage else b"")
+    return digest.hexdigest()[:16]
+
+
+def commit_named(name: str) -> str:
+    """The commit that git means by a name such as HEAD~1 or a branch in the working copy; the name itself where it means none."""
+    try:
+        ask = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}"]
+        found = subprocess.run(ask, cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return name
+    return found.stdout.strip()
+
+
+def commit() -> str:
+    """The commit of the working copy this package runs from, with `-dirty` if it has changes; empty if unknown."""
+    try:
+        run = functools.partial(subprocess.run, cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
+        name = run(["git", "rev-parse", "HEAD"]).stdout.strip()
+        changed = run(["git", "status", "--porcelain", "--untracked-files=no", "--", "."]).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return f"{name}-dirty" if changed else name

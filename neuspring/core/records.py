@@ -1,0 +1,143 @@
+"""Stage and run records: small JSON files that say what a step did, beside the artefacts they name.
+
+A stage record is the declared output of a workflow rule. It is written last, so its presence means that the files it names
+are complete. A numerical failure is a record too (`status: failed` with its reason); later stages pass it on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+
+RECORD_FORMAT = 1
+COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
+"""Packages on whose versions results depend."""
+Status = Literal["ok", "failed"]
+
+
+def digest_file(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hex."""
+    with Path(path).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def canonical(values: Any) -> str:
+    """JSON text that is equal for equal values: sorted keys, no spaces, no NaN."""
+    return json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def now() -> str:
+    """UTC time, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageRecord:
+    """What one stage did. `files` maps a role (for example "twin") to [file name beside the record, SHA-256]."""
+
+    stage: str
+    status: Status
+    reason: str = ""
+    files: dict[str, list[str]] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
+    """Role -> SHA-256 of what was read."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Numbers and text worth keeping: parameters found, counts, versions."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    started: str = ""
+    seconds: float = 0.0
+    """Wall time, with the attempts that it continued."""
+    peak_memory_mb: float = 0.0
+    attempts: int = 1
+    """1, plus one for every time the stage continued from a checkpoint."""
+    device: str = "cpu"
+    machine: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Of the packages that compute."""
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, atomically."""
+        write_text(
+            Path(path), json.dumps({"format": RECORD_FORMAT, **self.__dict__}, indent=1, sort_keys=True, allow_nan=False) + "\n"
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> StageRecord:
+        """Read a record. Raises InputError if it is missing or damaged."""
+        values = read_json(path, RECORD_FORMAT)
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise InputError(path, "must be a stage record", str(error), "Delete it and run again.") from error
+
+    def file(self, role: str, record_path: Path) -> Path:
+        """The file of a role, checked against its digest. Raises InputError if it is missing or has changed."""
+        if role not in self.files:
+            raise InputError(record_path, f"this record must name a {role}", sorted(self.files))
+        name, digest = self.files[role]
+        path = Path(record_path).parent / name
+        if not path.is_file():
+            raise InputError(path, f"named by {record_path}", "no such file", f"Delete {record_path} and run again.")
+        if digest_file(path) != digest:
+            raise InputError(
+                path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and run again."
+            )
+        return path
+
+
+def read_json(path: Path, version: int) -> dict[str, Any]:
+    """A JSON record of the given format version, without its `format` key. Raises InputError."""
+    try:
+        values = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
+    except ValueError as error:
+        raise InputError(path, "this record must be JSON", str(error), "Delete it and run again.") from error
+    if not isinstance(values, dict) or values.pop("format", None) != version:
+        raise InputError(path, f"this version reads records of format {version}", None, "Delete it and run again.")
+    return values
+
+
+class Stopwatch:
+    """Wall time and peak memory of a stage."""
+
+    def __init__(self) -> None:
+        self.started = now()
+        self._start = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self._start
+
+    def stage(
+        self, stage: str, status: Status, files: Mapping[str, Path] | None = None, earlier_seconds: float = 0.0, **values: Any
+    ) -> StageRecord:
+        """A record of this stage with its time, memory, machine and the digests of its files."""
+        named = {role: [path.name, digest_file(path)] for role, path in (files or {}).items()}
+        # Linux counts in KiB, macOS in bytes.
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
+        return StageRecord(
+            stage=stage,
+            status=status,
+            files=named,
+            started=self.started,
+            seconds=round(earlier_seconds + self.seconds, 3),
+            peak_memory_mb=round(peak, 1),
+            machine=f"{platform.machine()}, Python {platform.python_version()}",
+            versions={name: version(name) for name in COMPUTING},
+            **values,
+        )

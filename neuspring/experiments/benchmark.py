@@ -1,0 +1,356 @@
+"""A benchmark: the configuration with the rows of the three tables that it names, checked together before any job exists."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import fnmatch
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring.config import (
+    FILMED,
+    MADE,
+    Config,
+    Fit,
+    Method,
+    ScenarioRow,
+    Search,
+    SearchRow,
+    merge,
+    parse,
+    plain,
+    read_text,
+    read_yaml,
+)
+from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.images import Appearance
+from neuspring.config.spring_gaus import SpringGaus
+from neuspring.core.errors import InputError
+from neuspring.data import capture, phystwin_raw
+from neuspring.scores.lpips_weights import configured
+from neuspring.scores.studies import Study, read_studies
+
+RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
+"""Folders of the results that are no scenarios or methods."""
+
+
+def read_methods(path: Path) -> dict[str, Method]:
+    """The method table: name -> Method."""
+    return {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+
+
+def read_searches(path: Path) -> dict[str, SearchRow]:
+    """The search table: name -> SearchRow."""
+    return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
+
+
+def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
+    """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
+    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    columns = [f.name for f in dataclasses.fields(ScenarioRow)]
+    if not lines or lines[0].split("\t") != columns:
+        raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
+    rows: dict[str, ScenarioRow] = {}
+    for line in lines[1:]:
+        cells = line.split("\t")
+        where = f"{path}, row {cells[0]!r}"
+        if len(cells) != len(columns):
+            raise InputError(where, f"{len(columns)} tab-separated cells are required", len(cells))
+        values: dict[str, Any] = dict(zip(columns, cells, strict=True))
+        for flag in ("self_collision", "ground"):
+            if values[flag] not in ("true", "false"):
+                raise InputError(f"{where}, {flag}", "must be true or false", values[flag])
+            values[flag] = values[flag] == "true"
+        if cells[0] in rows:
+            raise InputError(where, "scenario names must differ")
+        rows[cells[0]] = parse(ScenarioRow, values, where)
+    return rows
+
+
+def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
+    """The configuration with what `only` leaves of its scenarios, methods and seeds. Raises InputError for terms without match."""
+    where = "configuration, only"
+    rule = "terms scenario=..., category=..., method=..., seed=..., each with names or patterns separated by commas"
+    kept: dict[str, tuple[Any, ...]] = {"scenarios": config.scenarios, "methods": config.methods, "seeds": config.seeds}
+    try:
+        terms = shlex.split(config.only)
+    except ValueError as error:
+        raise InputError(where, rule, config.only, f"{error}.") from error
+    for term in terms:
+        key, _, text = term.partition("=")
+        names = {"scenario": "scenarios", "category": "scenarios", "method": "methods", "seed": "seeds"}
+        if key not in names or not text:
+            raise InputError(where, rule, term)
+        for pattern in text.split(","):
+            known = [_word(entry, key, scenarios) for entry in kept[names[key]]]
+            if not fnmatch.filter(known, pattern):
+                raise InputError(where, f"{key} {pattern!r} matches none of the configuration's", ", ".join(dict.fromkeys(known)))
+        kept[names[key]] = tuple(
+            entry
+            for entry in kept[names[key]]
+            if any(fnmatch.fnmatchcase(_word(entry, key, scenarios), pattern) for pattern in text.split(","))
+        )
+    return dataclasses.replace(config, scenarios=kept["scenarios"], methods=kept["methods"], seeds=kept["seeds"])
+
+
+def _word(entry: Any, key: str, scenarios: Mapping[str, ScenarioRow]) -> str:
+    return scenarios[entry].category if key == "category" else str(entry)
+
+
+def fit_of(config: Config, method: Method, name: str) -> Fit:
+    """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
+    return parse(Fit, _overlaid(config.fit, method.settings), f"method {name}, settings")
+
+
+def search_of(config: Config, row: SearchRow, name: str) -> Search:
+    """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
+    return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
+
+
+def model_of(config: Config, method: Method, name: str) -> SpringGaus | GsDynamics:
+    """The settings of a trained baseline: its section, with the method's own on top. Raises InputError for unknown keys."""
+    section = config.baselines.spring_gaus if method.model == "spring_gaus" else config.baselines.gs_dynamics
+    return parse(type(section), _overlaid(section, method.settings), f"method {name}, settings")
+
+
+def appearance_of(config: Config, method: Method, name: str) -> Appearance:
+    """How a method's splats are trained: as all, with the method's own settings on top. Raises InputError for unknown keys."""
+    return parse(Appearance, _overlaid(config.images.appearance, method.appearance or {}), f"method {name}, appearance")
+
+
+def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
+    values = plain(settings)
+    merge(values, own)
+    return values
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A validated configuration with the rows it names."""
+
+    config: Config
+    """With what `only` leaves of scenarios, methods and seeds."""
+    whole: Config
+    """As it was given: what tables are laid out for, and whose seeds are averaged, whatever part of it is run now."""
+    scenarios: dict[str, ScenarioRow]
+    """Chosen ones, those that twins are transferred to, those of the tuning study."""
+    whole_scenarios: dict[str, ScenarioRow]
+    """Those of the whole configuration."""
+    methods: dict[str, Method]
+    searches: dict[str, SearchRow]
+    fits: dict[str, Method]
+    """The methods whose fits are made: of all rows of the table with the same fit, the first."""
+    fit_of_method: dict[str, str]
+    """Chosen method -> the method in whose folder its fit lies."""
+    transfers: dict[str, tuple[str, ...]]
+    """Chosen scenario -> those that its twins are transferred to."""
+    pictured: frozenset[str]
+    """Methods of the whole configuration that are trained on pictures, so that scenarios without any are left out."""
+    splats: dict[str, Method]
+    """Methods whose own splats are made: of all rows of the table with the same settings, the first."""
+    splats_of_method: dict[str, str]
+    """Chosen method with splats of its own -> the method in whose name they are made."""
+    studies: dict[str, Study]
+    """All rows of the study table; `config.studies` names those that are made without being asked for."""
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
+        """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
+        whole = parse(Config, values, "configuration")
+        for name in ("scenarios", "methods", "seeds"):
+            if not getattr(whole, name):
+                raise InputError(f"configuration, {name}", "at least one entry is required")
+        scenarios, methods = read_scenarios(root / whole.scenario_table), read_methods(root / whole.method_table)
+        _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
+        _require_known("methods", whole.methods, methods, whole.method_table)
+        studies = read_studies(root / whole.study_table)
+        _require_known("studies", whole.studies, studies, whole.study_table)
+        config = chosen_part(whole, scenarios)
+        searches = read_searches(root / config.search_table)
+        wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
+        _require_known("methods' search", wanted, searches, config.search_table)
+        _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
+        pairs = config.transfers or {}
+        everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
+        _require_known("transfers", everyone, scenarios, config.scenario_table)
+        transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
+        targets = tuple(name for names in transfers.values() for name in names)
+        _require_alike(config, scenarios, transfers)
+        if whole.tune:
+            of = "this configuration's scenarios"
+            _require_known("tune.scenarios", whole.tune.scenarios, dict.fromkeys(whole.scenarios + targets), of)
+        owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
+        looks = {name: owner for name, owner in _splat_owners(config, methods).items() if name in config.methods}
+        chosen = cls(
+            config,
+            whole,
+            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + _tuned(whole))},
+            {n: scenarios[n] for n in whole.scenarios},
+            {n: methods[n] for n in config.methods},
+            {n: searches[n] for n in wanted},
+            {n: methods[n] for n in owners.values()},
+            owners,
+            transfers,
+            frozenset(name for name in whole.methods if _trained_on_pictures(whole, methods[name], name)),
+            {n: methods[n] for n in looks.values()},
+            looks,
+            studies,
+        )
+        for name in [*chosen.scenarios, *chosen.methods]:
+            if name in (*RESERVED, config.tables) or name.startswith("search-"):
+                rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
+                raise InputError("name of a scenario or method", rule, name, "Rename it.")
+        for name, method in chosen.methods.items():
+            chosen._check_settings(name, method)
+        chosen._require_data()
+        chosen._require_applying()
+        return chosen
+
+    def _check_settings(self, name: str, method: Method) -> None:
+        """Settings of a method's own, before any job starts."""
+        if method.model:
+            chosen = model_of(self.config, method, name) if method.trained else None
+            if name in self.pictured and isinstance(chosen, SpringGaus):
+                # Named weights that are missing or wrong are an error before the first job.
+                vgg16_weights.find(chosen.vgg16)
+            appearance_of(self.config, method, name)
+        if not (method.search and method.fit):
+            return
+        wanted_low, wanted_high = search_of(self.config, self.searches[method.search], method.search).ranges.stiffness
+        low, high = fit_of(self.config, method, name).stiffness_range
+        if not low <= wanted_low < wanted_high <= high:
+            rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
+            raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+
+    @property
+    def tuned(self) -> tuple[str, ...]:
+        """The scenarios of the tuning study: a study keeps them, whatever part of the runs is made now."""
+        return _tuned(self.whole)
+
+    @property
+    def compared_with(self) -> str:
+        """The method that tables compare the others with."""
+        wanted = self.whole.compare_with
+        return wanted if wanted in self.whole.methods else self.whole.methods[0]  # type: ignore[return-value]
+
+    def methods_of(self, study: str) -> tuple[str, ...]:
+        """The chosen methods that stand in a study's rows."""
+        return tuple(dict.fromkeys(name for name in self.studies[study].rows.values() if name in self.methods))
+
+    def _row(self, name: str) -> ScenarioRow:
+        """Of a scenario, whether it is chosen or not."""
+        return self.scenarios.get(name) or self.whole_scenarios[name]
+
+    def data_path(self, name: str) -> Path | None:
+        """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""
+        row = self._row(name)
+        return None if row.source in MADE else Path(self.config.data_root or ".") / row.path
+
+    def has_images(self, name: str) -> bool:
+        """Whether a scenario's predictions are drawn and scored."""
+        source, path = self._row(name).source, self.data_path(name)
+        beside = source == "phystwin" and path is not None and phystwin_raw.has_images(path)
+        return self.config.images.enabled and (source in FILMED or beside)
+
+    def applies(self, method: str, scenario: str) -> bool:
+        """Whether a method can be run on a scenario: what is trained on silhouettes needs images."""
+        return method not in self.pictured or self.has_images(scenario)
+
+    @property
+    def whole_left_out(self) -> dict[str, tuple[str, ...]]:
+        """Of the whole configuration: method -> the scenarios to which it does not apply; methods that apply to all are no keys."""
+        without = tuple(name for name in self.whole_scenarios if self.pictured and not self.has_images(name))
+        return {name: without for name in self.whole.methods if name in self.pictured and without}
+
+    def _require_applying(self) -> None:
+        """Raise InputError if nothing of what was asked for can be run."""
+        if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
+            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images"
+            remedy = "Choose scenarios with images (and images.enabled), or a variant such as spring_gaus_points."
+            raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
+
+    def capture_folder(self, name: str) -> Path:
+        """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
+        own = self.data_path(name) if self.scenarios[name].source == "capture" else None
+        return own or Path(self.config.results) / name / "capture"
+
+    def cameras(self, name: str) -> tuple[str, ...]:
+        """Names of a filmed scenario's cameras, which are known before its capture is made. Raises InputError."""
+        source, path = self.scenarios[name].source, self.data_path(name)
+        if source == "synthetic":
+            return tuple(map(str, range(self.config.synthetic.cameras)))
+        assert path is not None
+        if source in ("phystwin_raw", "phystwin"):
+            return tuple(map(str, range(phystwin_raw.camera_count(path))))
+        return tuple(camera.name for camera in capture.read_description(path / capture.CAPTURE).cameras)
+
+    def _require_data(self) -> None:
+        if self.config.images.enabled:
+            # Named weights that are missing or wrong are an error before the first job.
+            configured(self.config.images.lpips)
+        for name, row in self.scenarios.items():
+            path = self.data_path(name)
+            if path is None:
+                continue
+            if self.config.data_root is None:
+                raise InputError(
+                    f"scenario {name}",
+                    f"{row.source} scenarios need data_root",
+                    "null",
+                    "Give it: --config data_root=/path/to/data.",
+                )
+            if not path.exists():
+                raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+
+
+def _tuned(whole: Config) -> tuple[str, ...]:
+    """The scenarios of the tuning study; none without one."""
+    return whole.tune.scenarios or whole.scenarios if whole.tune else ()
+
+
+def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
+    """Method with a fit -> the first row of the table with the same search, stage and settings."""
+    first: dict[tuple[Any, ...], str] = {}
+    fitted = {name: method for name, method in methods.items() if method.fit}
+    return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+
+
+def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
+    """Method with splats of its own -> the first row of the table with the same settings of theirs."""
+    first: dict[Any, str] = {}
+    own = {name: method for name, method in methods.items() if method.appearance is not None}
+    return {name: first.setdefault(appearance_of(config, method, name), name) for name, method in own.items()}
+
+
+def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
+    if method.model != "spring_gaus":
+        return False
+    chosen = model_of(config, method, name)
+    return isinstance(chosen, SpringGaus) and chosen.supervision == "masks"
+
+
+def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:
+    """A twin moves only to a recording of the same object with as many nodes, which `mocap.spacing` does not promise."""
+    for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
+        here, there = scenarios[source], scenarios[target]
+        if (here.source, here.category) != (there.source, there.category):
+            rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
+            raise InputError("configuration, transfers", rule, f"source {there.source}, category {there.category}")
+        if here.source == "mocap" and config.mocap.rings is None:
+            rule = "must be set where twins are transferred, so that all recordings have as many nodes"
+            raise InputError("configuration, mocap.rings", rule, None)
+
+
+def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        close = {name: difflib.get_close_matches(name, known, n=1) for name in unknown}
+        hints = [f"{name!r}" + (f" (did you mean {match[0]!r}?)" if match else "") for name, match in close.items()]
+        raise InputError(
+            f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
+        )

@@ -1,0 +1,199 @@
+"""What a study varies: settings of one method and of its search, checked before the first trial.
+
+A trial's settings are the baseline's (the configuration, with the method's and its search row's own settings on top) with the
+trial's values on top. Nothing heavy is imported: the workflow makes a plan before any job exists.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import difflib
+import functools
+import itertools
+import math
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neuspring import config
+from neuspring.config import Config, Method, SearchRow
+from neuspring.config.tuning import Dimension, Tune
+from neuspring.core.errors import InputError
+from neuspring.experiments.benchmark import fit_of, read_methods, read_searches, search_of
+
+SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
+"""What a trial reads; observations are made before."""
+CLUSTERS = "clusters"
+FIXED = ("losses.chamfer", "losses.track", "fit.selection", "fit.tail_fraction", "released_quirks.frozen_loss_denominators")
+"""The objective is measured with these, so all trials must share them."""
+MOST_COMBINATIONS = 256
+"""Of the ends of all ranges, checked before the first trial; of more, the lowest and highest."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A study with everything that it refers to."""
+
+    tune: Tune
+    method: Method
+    row: SearchRow
+    """The method's search."""
+    base: dict[str, Any]
+    """`SECTIONS` and `clusters` of the unchanged configuration, as plain values."""
+
+    @classmethod
+    def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
+        """Check a study as far as it can be without data. Tables are read relative to `root`. Raises InputError."""
+        methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
+        method = _row("tune.method", tune.method, methods, settings.method_table)
+        row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
+        base = {name: config.plain(getattr(settings, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
+        base["fit"] = config.plain(fit_of(settings, method, tune.method))
+        base["search"] = config.plain(search_of(settings, row, method.search))
+        plan = cls(tune, method, row, base)
+        for name, dimension in tune.space.items():
+            plan._require_setting(name)
+            _require_kind(name, dimension)
+        for values in plan._corners():
+            plan.at(values, "tune.space, " + ", ".join(f"{name} = {value!r}" for name, value in values.items()))
+        return plan
+
+    def at(self, values: Mapping[str, Any], where: str) -> tuple[Config, int]:
+        """The settings (`SECTIONS` of a configuration) and number of regions of a trial. Raises InputError."""
+        changed = copy.deepcopy(self.base)
+        for name, value in values.items():
+            *path, key = name.split(".")
+            functools.reduce(lambda inside, part: inside[part], path, changed)[key] = value
+        clusters = changed.pop(CLUSTERS)
+        settings = config.parse(Config, changed, where)
+        low, high = settings.fit.stiffness_range
+        searched = settings.search.ranges.stiffness
+        if self.method.fit and not low <= searched[0] < searched[1] <= high:
+            raise InputError(f"{where}: fit.stiffness_range", f"must hold search.ranges.stiffness = {list(searched)}", [low, high])
+        if not isinstance(clusters, int) or clusters < 1:
+            raise InputError(f"{where}: clusters", "must be a whole number, at least 1", clusters)
+        return settings, clusters
+
+    @property
+    def baseline(self) -> dict[str, Any]:
+        """The varied settings as they are in the unchanged configuration."""
+        return {name: functools.reduce(lambda inside, part: inside[part], name.split("."), self.base) for name in self.tune.space}
+
+    @property
+    def epochs(self) -> int:
+        """The most epochs that a trial may have; 1 for a method without first-order stage."""
+        dimension = self.tune.space.get("fit.epochs")
+        most = self.base["fit"]["epochs"] if dimension is None else max(_ends(dimension), default=0)
+        return int(most) if self.method.fit else 1
+
+    def facts(self) -> dict[str, Any]:
+        """What must not change while a study lasts, as plain values."""
+        space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
+        return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": self.tune.seed}
+
+    def flat(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """All settings of a trial under their dotted names."""
+        return _flat(self.base) | dict(values)
+
+    def _require_setting(self, name: str) -> None:
+        where, section = f"tune.space, {name}", name.partition(".")[0]
+        if name == CLUSTERS:
+            return
+        if section not in SECTIONS:
+            raise InputError(
+                where, f"must begin with {', '.join(SECTIONS)}, or be {CLUSTERS}", None, _suggestion(section, SECTIONS)
+            )
+        if name in FIXED:
+            raise InputError(where, "must be the same in all trials: their losses are measured with it")
+        if section == "fit" and self.method.fit is None:
+            raise InputError(where, f"method {self.tune.method} has no first-order stage that would read it")
+        if name.startswith("fit.field.") and self.method.fit != "field":
+            raise InputError(where, f"method {self.tune.method} trains springs and reads no settings of a field")
+
+    def _corners(self) -> Iterator[dict[str, Any]]:
+        """The baseline, every end of every dimension by itself, then combinations of ends: all if few, else lowest and highest."""
+        ends = {name: _ends(dimension) for name, dimension in self.tune.space.items()}
+        yield {}
+        yield from ({name: value} for name, values in ends.items() for value in values)
+        if math.prod(map(len, ends.values())) <= MOST_COMBINATIONS:
+            yield from (dict(zip(ends, chosen, strict=True)) for chosen in itertools.product(*ends.values()))
+        else:
+            yield from ({name: values[place] for name, values in ends.items()} for place in (0, -1))
+
+
+def is_whole(name: str) -> bool:
+    """Whether a setting with a range takes whole numbers only."""
+    return name == CLUSTERS or float not in _kinds(_annotation(name))
+
+
+def holds(dimension: Dimension, value: Any) -> bool:
+    """Whether a dimension can take a value."""
+    if dimension.choices:
+        return value in dimension.choices
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    assert dimension.low is not None
+    assert dimension.high is not None
+    steps = 0.0 if dimension.step is None else (value - dimension.low) / dimension.step
+    return dimension.low <= value <= dimension.high and math.isclose(steps, round(steps), abs_tol=1e-9)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
+
+
+def _ends(dimension: Dimension) -> list[Any]:
+    return list(dimension.choices) or [dimension.low, dimension.high]
+
+
+def _require_kind(name: str, dimension: Dimension) -> None:
+    where, kinds = f"tune.space, {name}", {int} if name == CLUSTERS else _kinds(_annotation(name))
+    if dimension.choices:
+        return
+    if not kinds & {int, float}:
+        raise InputError(where, "is no number: choices are required", f"low {dimension.low}, high {dimension.high}")
+    for key in ("low", "high", "step"):
+        if float not in kinds and isinstance(value := getattr(dimension, key), float):
+            raise InputError(f"{where}, {key}", "must be a whole number", value)
+
+
+def _annotation(name: str) -> Any:
+    """The declared type of a setting. Raises InputError for unknown ones and for sections."""
+    where, kind = f"tune.space, {name}", Config
+    for part in name.split("."):
+        hints = typing.get_type_hints(kind, include_extras=True) if dataclasses.is_dataclass(kind) else {}
+        if part not in hints:
+            raise InputError(where, f"{part} must be a setting", None, _suggestion(part, hints))
+        kind = hints[part]
+    if dataclasses.is_dataclass(kind):
+        remedy = "The number of regions is called clusters." if name == "search.clusters" else ""
+        raise InputError(where, "must be one setting, not a section", [f.name for f in dataclasses.fields(kind)], remedy)
+    return kind
+
+
+def _kinds(annotation: Any) -> set[type]:
+    """The plain types that an annotation allows."""
+    origin, inside = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _kinds(inside[0])
+    if origin in (typing.Union, types.UnionType):
+        return set().union(*map(_kinds, inside))
+    return set() if origin is not None else {annotation}
+
+
+def _suggestion(word: str, known: Any) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {close[0]}?" if close else ""
+
+
+def _row(where: str, name: str, rows: Mapping[str, Any], table: str) -> Any:
+    if name not in rows:
+        raise InputError(where, f"must be a row of {table}", name, _suggestion(name, rows))
+    return rows[name]

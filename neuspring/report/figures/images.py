@@ -1,0 +1,145 @@
+"""Pictures and film of appearance: training views beside splats, prediction beside observation over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+import torch
+from matplotlib import pyplot as plt
+
+from neuspring.core.artifacts import Scenario
+from neuspring.report.figures.run import chosen_frames
+from neuspring.report.figures.views import save
+from neuspring.scores.images import psnr
+from neuspring.splats.losses import Shot
+
+WORST = 0.5
+"""Colour difference, of 1, at the bright end of error pictures."""
+BAR = 6
+"""Height of the bar that shows the time, px."""
+TITLE = 20
+"""Height of the line of names, px."""
+TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
+"""Colours of the two parts of the time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What was seen and what is predicted, in one frame of one camera."""
+
+    observed: np.ndarray
+    """[H, W, 3] uint8."""
+    rendered: np.ndarray
+    """[H, W, 4] uint8, over black."""
+    truth: torch.Tensor
+    """[3, H, W], masked as for metrics."""
+    prediction: torch.Tensor
+    """[3, H, W], masked as for metrics."""
+    silhouettes: tuple[np.ndarray, np.ndarray]
+    """Observed and predicted [H, W] bool."""
+    hands: np.ndarray
+    """[H, W] bool."""
+
+    @property
+    def error(self) -> np.ndarray:
+        """Mean absolute colour difference in false colours [H, W, 3] uint8, grey behind hands."""
+        difference = (self.truth - self.prediction).abs().mean(0).numpy() / WORST
+        picture = (255 * matplotlib.colormaps["inferno"](np.clip(difference, 0, 1))[..., :3]).astype(np.uint8)
+        picture[self.hands] = 70
+        return picture
+
+
+def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], around: Mapping[int, np.ndarray], path: Path) -> Path:
+    """Rows: each training view observed, as splats, and their difference; below, the splats from three other sides (degrees)."""
+    columns = 3
+    height, width = shots[0].mask.shape
+    figure, axes = plt.subplots(
+        len(shots) + 1, columns, figsize=(2.9 * columns, 2.9 * height / width * (len(shots) + 1) + 0.9), layout="constrained"
+    )
+    for row, shot in zip(axes, shots, strict=False):
+        seen, known = shot.colour.cpu().numpy(), shot.known.cpu().numpy()[..., None]
+        splats = drawn[shot.name][..., :3] / 255
+        quality = float(psnr(*(torch.tensor(p, dtype=torch.float32).permute(2, 0, 1) for p in (splats * known, seen))))
+        titles = (f"camera {shot.name}: frame 0, masked", f"splats ({quality:.1f} dB)", f"difference, 0 to {WORST:g}")
+        for axis, picture, title in zip(row, (seen, splats, np.abs(splats * known - seen).mean(-1)), titles, strict=False):
+            axis.imshow(np.clip(picture, 0, WORST if picture.ndim == 2 else 1), cmap="inferno", vmin=0, vmax=WORST)
+            axis.set_title(title, fontsize=8)
+    for axis, (angle, picture) in zip(axes[-1], around.items(), strict=False):
+        axis.imshow(picture)
+        axis.set_title(f"camera {shots[0].name}, turned by {angle}°", fontsize=8)
+    for axis in axes.flat:
+        axis.axis("off")
+    return save(figure, path)
+
+
+class Strip:
+    """A few frames: observed, predicted and their difference, one below the other."""
+
+    def __init__(self, scenario: Scenario, frames: int) -> None:
+        self._names = chosen_frames(scenario, frames)
+        self._scenario = scenario.name
+        self._pairs: dict[int, Pair] = {}
+
+    def add(self, frame: int, pair: Pair) -> None:
+        """Keep the frame if it is one to show."""
+        if frame in self._names:
+            self._pairs[frame] = pair
+
+    def save(self, path: Path) -> Path:
+        """Write the picture."""
+        count = max(len(self._pairs), 1)
+        height, width = next(iter(self._pairs.values())).hands.shape if self._pairs else (9, 16)
+        figure, axes = plt.subplots(
+            3, count, figsize=(3.2 * count + 0.4, 3 * 3.2 * height / width + 0.9), layout="constrained", squeeze=False
+        )
+        for column, (frame, pair) in zip(axes.T, self._pairs.items(), strict=False):
+            quality = float(psnr(pair.prediction, pair.truth))
+            column[0].set_title(f"frame {frame}: {self._names[frame]}\n{quality:.1f} dB", fontsize=9)
+            for axis, picture in zip(column, (pair.observed, pair.rendered[..., :3], pair.error), strict=True):
+                axis.imshow(picture)
+        for axis, label in zip(axes[:, 0], ("observed", "predicted", f"difference, 0 to {WORST:g}"), strict=True):
+            axis.set_ylabel(label, fontsize=9)
+        for axis in axes.flat:
+            axis.set(xticks=[], yticks=[])
+        figure.suptitle(self._scenario, fontsize=10)
+        return save(figure, path)
+
+
+class Film:
+    """Lays out the frames of the two videos: observed, predicted and difference side by side; the twin seen all around."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+
+    def compared(self, frame: int, pair: Pair) -> np.ndarray:
+        """A frame of the comparison [H, W, 3] uint8."""
+        panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": pair.error}
+        return self._titled(panels, frame)
+
+    def turned(self, frame: int, picture: np.ndarray) -> np.ndarray:
+        """A frame of the turntable [H, W, 3] uint8, from a picture of the twin."""
+        return self._titled({"twin": picture}, frame)
+
+    def _titled(self, panels: Mapping[str, np.ndarray], frame: int) -> np.ndarray:
+        """Panels side by side below their names and a bar of the time: training and future coloured, the border between white."""
+        picture = np.hstack(list(panels.values()))
+        width, total, end = picture.shape[1], self._scenario.frame_count, self._scenario.train_end
+        future = frame >= end
+        title = np.zeros((TITLE, width, 3), np.uint8)
+        for k, name in enumerate(panels):
+            text = f"{name}, frame {frame} ({'future' if future else 'training'})" if k == 0 else name
+            colour = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
+            place = (6 + k * width // len(panels), TITLE - 6)
+            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+        bar = np.zeros((BAR, width, 3), np.uint8)
+        border, now = (round(width * k / total) for k in (end, frame + 1))
+        for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):
+            bar[:, start:stop] = np.array(shade) // 4
+            bar[:, start : min(stop, now)] = shade
+        bar[:, max(border - 1, 0) : border + 1] = 255
+        return np.vstack([title, bar, picture])

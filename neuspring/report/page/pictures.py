@@ -1,0 +1,119 @@
+"""Pictures and films of every scenario, methods side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from neuspring.report.page.blocks import Block, Fold, Grid, Section, Text
+from neuspring.report.page.media import Media, Wanted
+from neuspring.report.page.sources import Material, Run
+from neuspring.report.page.words import several
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A picture that runs have."""
+
+    artifact: str
+    stem: str
+    title: str
+    width: int
+    paper: bool
+    """Drawn for a white page."""
+    least: int = 40
+    """Least width in the page, rem: so many stand side by side."""
+
+
+KINDS = (
+    Kind(artifact="images", stem="images", title="Observed, predicted, difference", width=1100, paper=False),
+    Kind(
+        artifact="plots",
+        stem="motion",
+        title="Motion: predicted nodes and observed points",
+        width=1200,
+        paper=True,
+    ),
+    Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
+    Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
+)
+FILMS = {"video": ("Films: observed, predicted, difference", 40), "turntable": ("Films: the twin from all around", 13)}
+"""Headings, and least widths in the page, rem."""
+APPEARANCE = "appearance"
+
+
+def wanted(material: Material) -> list[Wanted]:
+    """All pictures that the section would show, the most telling first."""
+    found = []
+    for scenario, place in ((name, index) for index, name in enumerate(material.choice.scenarios)):
+        for order, run in enumerate(material.first_runs(scenario).values()):
+            for rank, kind in enumerate(KINDS):
+                path = run.file(kind.artifact, kind.stem)
+                found += [Wanted(path=path, rank=(rank, order, place), width=kind.width)] if path is not None else []
+            for rank, film in enumerate(FILMS):
+                path = run.file("images", film)
+                found += [Wanted(path=path, rank=(rank, order, place))] if path is not None else []
+        for order, learned in enumerate(_splats(material.first_runs(scenario))):
+            found.append(Wanted(path=learned, rank=(len(KINDS), order, place), width=1000))
+    return found
+
+
+def section(material: Material, media: Media) -> Section:
+    """A fold per scenario."""
+    folds: list[Block] = []
+    for scenario in material.choice.scenarios:
+        runs = material.first_runs(scenario)
+        blocks = _scenario(runs, media)
+        if blocks:
+            seeds = sorted({run.seed for run in runs.values()})
+            summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
+            folds.append(Fold(summary=summary, blocks=blocks, open=not folds))
+    if not folds:
+        return Section(key="pictures", title="Pictures", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
+    about = "One seed of every scenario, methods side by side. Blue bars stand for training frames, orange ones for the future."
+    return Section(key="pictures", title="Pictures", about=about, blocks=folds)
+
+
+def _scenario(runs: dict[str, Run], media: Media) -> list[Block]:
+    blocks: list[Block] = []
+    for kind in KINDS:
+        made: list[Block] = []
+        for method, run in runs.items():
+            path = run.file(kind.artifact, kind.stem)
+            if path is not None:
+                alt = f"{kind.title}: {run.scenario}, {method}, seed {run.seed}"
+                made.append(media.picture(path, method, alt, wide=True, paper=kind.paper))
+        if made:
+            # The first kind that there is can be seen at once.
+            blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=made, least=kind.least)], open=not blocks))
+        if kind.stem == "images":
+            blocks += _filmed(runs, media)
+    splats = _splats(runs)
+    drawn: list[Block] = []
+    for path, methods in splats.items():
+        of = f", {', '.join(methods)}" if len(splats) > 1 else ""
+        alt = f"Splats of {runs[methods[0]].scenario} in frame 0{of}"
+        drawn.append(media.picture(path, f"Observed and drawn in frame 0{of}", alt, wide=True))
+    return [*blocks, Fold(summary="Splats of frame 0", blocks=drawn)] if drawn else blocks
+
+
+def _splats(runs: dict[str, Run]) -> dict[Path, list[str]]:
+    """Picture of splats -> the methods that are drawn with them: most share them, some have their own."""
+    found: dict[Path, list[str]] = {}
+    for method, run in runs.items():
+        path = run.file("images", APPEARANCE)
+        if path is not None:
+            found.setdefault(path.resolve(), []).append(method)
+    return found
+
+
+def _filmed(runs: dict[str, Run], media: Media) -> list[Block]:
+    blocks: list[Block] = []
+    for film, (title, least) in FILMS.items():
+        found = {method: run.file("images", film) for method, run in runs.items()}
+        videos: list[Block] = [
+            media.video(path, method, wide=film == "video") for method, path in found.items() if path is not None
+        ]
+        if videos:
+            blocks.append(Fold(summary=title, blocks=[Grid(blocks=videos, least=least)], open=film == "video"))
+    return blocks

@@ -1,0 +1,250 @@
+"""Where the time went: hours by step and method, waiting, memory, retries, and which GPU did what when."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from neuspring.core.job_records import JobRecord
+from neuspring.report.page.blocks import Block, Cell, Section, Table, Text
+from neuspring.report.page.sources import METHOD_RULES, Material, Run
+from neuspring.report.page.timeline import timeline
+from neuspring.report.page.words import DASH, duration, hours, memory
+
+ORDER = (
+    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "train", "predict"),
+    *("transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
+)
+"""Rules in the order of the workflow."""
+
+
+def place(rule: str) -> int:
+    """Where a rule stands in the workflow; those that are not known come last."""
+    return ORDER.index(rule) if rule in ORDER else len(ORDER)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spent:
+    """What a group of jobs cost."""
+
+    name: str
+    jobs: int
+    failed: int
+    retries: int
+    seconds: tuple[float, ...]
+    """Wall time of each job, all its attempts."""
+    gpu_seconds: float
+    cpu_seconds: float
+    waited: float
+    memory: float
+    gpu_memory: float | None
+    utilisation: float | None
+
+
+def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
+    """The cost of some jobs, their failed attempts included."""
+    attempts = [attempt for job in jobs for attempt in job.attempts]
+    on_gpu = [a for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
+    weights = [a.seconds * len(a.devices) for a in on_gpu]
+    used = [float(a.gpu_utilisation or 0.0) for a in on_gpu]
+    return Spent(
+        name=name,
+        jobs=len(jobs),
+        failed=sum(job.failed for job in jobs),
+        retries=sum(len(job.attempts) - 1 for job in jobs),
+        seconds=tuple(sum(a.seconds for a in job.attempts) for job in jobs),
+        gpu_seconds=sum(a.seconds * len(a.devices) for a in attempts),
+        cpu_seconds=sum(a.cpu_seconds for a in attempts),
+        waited=sum(a.waited for a in attempts),
+        memory=max([a.peak_memory_mb for a in attempts], default=0.0),
+        gpu_memory=max([a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None], default=None),
+        utilisation=float(np.average(used, weights=weights)) if sum(weights) else None,
+    )
+
+
+def by_rule(jobs: Iterable[JobRecord]) -> list[Spent]:
+    """In the order of the workflow."""
+    groups = _grouped(jobs, lambda job: job.rule)
+    return [spent(name, groups[name]) for name in sorted(groups, key=lambda name: (place(name), name))]
+
+
+def by_method(jobs: Iterable[JobRecord]) -> list[Spent]:
+    """Jobs of one method each; searches and splats, which methods share, by their row."""
+    groups = _grouped(jobs, _owner)
+    groups.pop("", None)
+    return [spent(name, groups[name]) for name in sorted(groups)]
+
+
+def _grouped(jobs: Iterable[JobRecord], key: Callable[[JobRecord], str]) -> dict[str, list[JobRecord]]:
+    groups: dict[str, list[JobRecord]] = defaultdict(list)
+    for job in jobs:
+        groups[key(job)].append(job)
+    return groups
+
+
+def _owner(job: JobRecord) -> str:
+    parts = job.name.split("/")
+    if len(parts) != 4:
+        return ""
+    if job.rule == "search":
+        return f"search {parts[2]}"
+    if job.rule == "appearance":
+        return f"splats {_splats(parts[2])}"
+    return parts[2] if job.rule in (*METHOD_RULES, "transfer") else ""
+
+
+def _splats(folder: str) -> str:
+    """Whose splats lie in a folder: `shared`, or those of a method."""
+    return folder.removeprefix("appearance").removeprefix("-") or "shared"
+
+
+def gpu_hours(material: Material) -> tuple[float | None, str]:
+    """GPU-hours, from job records or else from run records, and from which; None where nothing is known."""
+    if material.jobs:
+        return sum(a.seconds * len(a.devices) for job in material.jobs for a in job.attempts) / 3600, "job records"
+    if not material.runs:
+        return None, "no records"
+    return sum(seconds for _, _, seconds, device, _ in _stages(material.runs) if device.startswith("cuda")) / 3600, "run records"
+
+
+def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
+    """Rule, method, seconds, device and MiB of every stage; shared ones once, for `shared` or the method whose splats they are."""
+    seen, rows = set(), []
+    for run in runs:
+        named = {(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])}
+        places = {path.stem: path for path in named}
+        for stage, seconds in run.record.timings.items():
+            place = places.get(stage, run.folder / stage)
+            if place in seen:
+                continue
+            seen.add(place)
+            # Scoring is done on the CPU, whatever the device.
+            device = "cpu" if stage == "score" else run.record.device
+            peak = run.record.peak_memory_mb.get(stage, np.nan)
+            folder = place.parent.parent.name
+            owner = "shared" if stage == "search" else _splats(folder) if stage == "appearance" else run.method
+            rule = "predict" if stage == "rollout" and run.record.model else stage
+            rows.append((rule, owner, seconds, device, peak))
+    return rows
+
+
+def section(material: Material) -> Section:
+    """Tables of hours, and the timeline."""
+    if material.jobs:
+        return Section(key="work", title="Time and hardware", about=_about(material.jobs), blocks=_from_jobs(material.jobs))
+    if not material.runs:
+        return Section(key="work", title="Time and hardware", blocks=[Text(text="Nothing has been timed yet.", tone="mute")])
+    note = "There are no job records: times are those of the run records, without failed attempts, waiting and steps outside runs."
+    return Section(key="work", title="Time and hardware", blocks=[Text(text=note, tone="mute"), _from_runs(material.runs)])
+
+
+def _about(jobs: Sequence[JobRecord]) -> str:
+    attempts = [attempt for job in jobs for attempt in job.attempts]
+    hosts = sorted({a.host for a in attempts if a.host})
+    names = sorted({name for a in attempts for name in a.device_names})
+    return f"Hosts: {', '.join(hosts) or 'unknown'}. GPUs: {', '.join(names) or 'none used'}. Times include failed attempts."
+
+
+def _from_jobs(jobs: Sequence[JobRecord]) -> list[Block]:
+    blocks: list[Block] = [_costs("By step", "Step", by_rule(jobs), total=True)]
+    methods = by_method(jobs)
+    if methods:
+        blocks.append(_costs("By method (searches and splats apart, since methods share them)", "Method", methods, total=False))
+    return [*blocks, *timeline(jobs, sorted({job.rule for job in jobs}, key=lambda rule: (place(rule), rule)))]
+
+
+def _costs(caption: str, what: str, groups: Sequence[Spent], *, total: bool) -> Table:
+    header = [
+        what,
+        "Jobs",
+        "Failed",
+        "Retries",
+        "Median",
+        "Longest",
+        "GPU-hours",
+        "CPU-hours",
+        "Waited",
+        "Peak memory",
+        "GPU memory",
+        "GPU use",
+    ]
+    rows = [_cost(group) for group in groups]
+    if total and len(groups) > 1:
+        rows.append(
+            [
+                Cell(text="all", best=True),
+                *(_number(sum(getattr(group, name) for group in groups)) for name in ("jobs", "failed", "retries")),
+                Cell(text=""),
+                Cell(text=""),
+                *(_hours(sum(getattr(group, name) for group in groups)) for name in ("gpu_seconds", "cpu_seconds")),
+                Cell(text=duration(sum(group.waited for group in groups))),
+                Cell(text=memory(max(group.memory for group in groups))),
+                Cell(text=""),
+                Cell(text=""),
+            ]
+        )
+    note = "Waited: for a GPU. A GPU that two jobs share counts for both." if any(group.gpu_seconds for group in groups) else ""
+    return Table(caption=caption, header=header, rows=rows, sortable=not total, note=note)
+
+
+def _cost(group: Spent) -> list[Cell]:
+    failed = Cell(text=str(group.failed), tone="bad" if group.failed else "", value=group.failed)
+    return [
+        Cell(text=group.name),
+        _number(group.jobs),
+        failed,
+        _number(group.retries),
+        Cell(text=duration(float(np.median(group.seconds))), value=float(np.median(group.seconds))),
+        Cell(text=duration(max(group.seconds)), value=max(group.seconds)),
+        _hours(group.gpu_seconds),
+        _hours(group.cpu_seconds),
+        Cell(text=duration(group.waited) if group.gpu_seconds else DASH, value=group.waited),
+        Cell(text=memory(group.memory), value=group.memory),
+        Cell(text=memory(group.gpu_memory), value=group.gpu_memory or 0.0),
+        Cell(text=DASH if group.utilisation is None else f"{group.utilisation:.0f} %", value=group.utilisation or 0.0),
+    ]
+
+
+def _number(value: int) -> Cell:
+    return Cell(text=f"{value:,}", value=value)
+
+
+def _hours(seconds: float) -> Cell:
+    return Cell(text=hours(seconds) if seconds else DASH, value=seconds)
+
+
+def _from_runs(runs: Sequence[Run]) -> Table:
+    groups: dict[tuple[str, str], list[tuple[float, str, float]]] = defaultdict(list)
+    for stage, method, seconds, device, peak in _stages(runs):
+        groups[stage, method].append((seconds, device, peak))
+    rows = []
+    for (stage, method), found in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
+        times = [one for one, _, _ in found]
+        on_gpu = sum(one for one, device, _ in found if device.startswith("cuda"))
+        peak = max((one for _, _, one in found if np.isfinite(one)), default=np.nan)
+        cells = [Cell(text=duration(v), value=v) for v in (float(np.median(times)), max(times))]
+        rows.append(
+            [
+                Cell(text=stage),
+                Cell(text=method),
+                _number(len(found)),
+                *cells,
+                _hours(sum(times)),
+                _hours(on_gpu),
+                Cell(text=memory(peak), value=peak),
+            ]
+        )
+    header = ["Step", "Method", "Records", "Median", "Longest", "Hours", "GPU-hours", "Peak memory"]
+    return Table(caption="By step and method", header=header, rows=rows, stub=2, sortable=True)
+
+
+def machines(runs: Iterable[Run]) -> dict[str, Any]:
+    """Machine and device -> number of runs."""
+    counts: dict[str, int] = defaultdict(int)
+    for run in runs:
+        counts[f"{run.record.machine}; {run.record.device}"] += 1
+    return dict(sorted(counts.items()))

@@ -1,0 +1,292 @@
+"""The numbers of a study's table: for every row, task and metric ours beside the paper's, with intervals and verdicts.
+
+Two questions have two verdicts. Is the value the paper's? That can be asked on its 22 scenarios alone. Does the change against
+the study's baseline go where the paper's goes? That can be asked on any data. All values are in the paper's units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from neuspring.report.tables.summary import RESAMPLES, Collected, comparable
+from neuspring.scores import paper
+from neuspring.scores.metrics import averages
+from neuspring.scores.paper import MEASURES, Measure, Printed
+from neuspring.scores.studies import Study
+
+NOT_RUN, NOT_COMPUTED, NOTHING_TO_COMPARE = "not run", "not computed", "nothing to compare"
+OTHER_DATA, NO_VALUE, NO_INTERVAL = "other data", "not in the paper", "no interval"
+WITHIN, BETTER, WORSE = "within", "better", "worse"
+BASELINE, CONFIRMED, OPPOSITE = "baseline", "same direction, confirmed", "opposite"
+NOT_RESOLVED, UNCHANGED, TOO_FEW = "not resolved", "no change in the paper", "too few scenarios"
+LEAST_SCENARIOS = 6
+"""For a verdict on a change. Of n scenarios all change in one direction by chance once in 2^(n-1), and the interval leaves out 0
+whenever they do."""
+ROUND_OFF = 1e-9
+"""Of a value, which the comparison with half a unit of the last digit forgives."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Ours in one cell. NaN stands for what cannot be said: intervals of one scenario, the spread over one seed."""
+
+    ours: float = np.nan
+    """In the average that the paper takes for this metric."""
+    other_average: float = np.nan
+    spread: float = np.nan
+    """Standard deviation over the seeds that have every scenario."""
+    low: float = np.nan
+    high: float = np.nan
+    """95 % bootstrap interval of `ours`, over scenarios and seeds."""
+    scenarios: int = 0
+    seeds: int = 0
+    runs: int = 0
+    change: float = np.nan
+    """Minus the baseline, on the same scenarios and seeds."""
+    change_low: float = np.nan
+    change_high: float = np.nan
+    relative: float = np.nan
+    """The change over the baseline's mean; NaN where a ratio means nothing (dB)."""
+    relative_low: float = np.nan
+    relative_high: float = np.nan
+
+
+Estimates = dict[tuple[str, str, str], Estimate]
+"""By method, task, metric."""
+
+
+def of_study(study: Study, collected: Collected) -> Collected:
+    """The scores, in the paper's units, and the runs of a study's methods."""
+    methods = list(study.rows.values())
+    scores, held = (
+        table[table["method"].isin(methods) & table["metric"].isin(list(MEASURES))] for table in (collected.scores, collected.held)
+    )
+    runs = collected.runs[collected.runs["method"].isin(methods)]
+    left_out = {name: where for name, where in collected.left_out.items() if name in methods}
+    return Collected(_scaled(scores), runs, _scaled(held), left_out)
+
+
+def _scaled(scores: pd.DataFrame) -> pd.DataFrame:
+    """In the paper's units."""
+    factors = scores["metric"].map({name: measure.factor for name, measure in MEASURES.items()}).astype(float)
+    return scores.assign(value=scores["value"].astype(float) * factors)
+
+
+def counted(own: Collected) -> pd.DataFrame:
+    """The scores that averages take: of scenario and seed that every method finished, and every method has this metric of.
+
+    A method without any finished run takes no part; nor does one in a metric that it has nowhere.
+    """
+    scores = comparable(own) if len(own.scores) else own.scores
+    if not len(scores):
+        return scores
+    here = scores.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
+    return scores[here == scores.groupby(["task", "metric"])["method"].transform("nunique")]
+
+
+def accounted(study: Study, own: Collected) -> pd.DataFrame:
+    """Every run of a study: label, its identity, status, whether it counts, and why not if it does not."""
+    labels = {method: label for label, method in study.rows.items()}
+    status = {(row.scenario, row.seed, row.method): str(row.status) for row in own.runs.itertuples()}
+    begun = list(dict.fromkeys(own.runs.loc[own.runs["status"] == "ok", "method"]))
+    rows = []
+    for run in own.runs.itertuples():
+        lacking = [m for m in begun if status.get((run.scenario, run.seed, m)) != "ok"]
+        why = f"{run.status!s}: {run.reason!s}"
+        if run.status == "ok":
+            absent = {m: "does not apply" if run.scenario in own.left_out.get(m, ()) else "missing" for m in lacking}
+            names = ", ".join(f"{labels[m]} ({status.get((run.scenario, run.seed, m), absent[m])})" for m in lacking)
+            why = f"not comparable, since without this scenario and seed: {names}" if lacking else ""
+        identity = {"label": labels[str(run.method)], "scenario": run.scenario, "method": run.method, "seed": run.seed}
+        rows.append(identity | {"status": run.status, "counted": not why, "why": why, "source": run.source, "run_key": run.run_key})
+    columns = ["label", "scenario", "method", "seed", "status", "counted", "why", "source", "run_key"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def estimates(scores: pd.DataFrame, baseline: str) -> Estimates:
+    """Ours in every cell from scores that are `counted`; changes are against the method `baseline`, where it has scores."""
+    found: Estimates = {}
+    means = {(row["method"], row["task"], row["metric"]): row for row in averages(scores).to_dict("records")} if len(scores) else {}
+    for key, part in scores.groupby(["task", "metric"], sort=False):
+        task, metric = map(str, key)
+        measure = MEASURES[metric]
+        resampled, spreads = _resampled_means(part, measure), _spreads(part, measure)
+        for method, draws in resampled.items():
+            mean = means[method, task, metric]
+            ours, (low, high) = float(mean[measure.average]), _quantiles(draws)
+            change: dict[str, float] = {}
+            if baseline in resampled and method != baseline:
+                base = float(means[baseline, task, metric][measure.average])
+                change = _change(ours, base, draws, resampled[baseline], measure)
+            found[method, task, metric] = Estimate(
+                ours=ours,
+                other_average=float(mean[measure.other]),
+                spread=spreads[method],
+                low=low,
+                high=high,
+                scenarios=part["scenario"].nunique(),
+                seeds=part["seed"].nunique(),
+                runs=int((part["method"] == method).sum()),
+                **change,
+            )
+    return found
+
+
+def _change(ours: float, base: float, resampled: np.ndarray, resampled_base: np.ndarray, measure: Measure) -> dict[str, float]:
+    difference = resampled - resampled_base
+    low, high = _quantiles(difference)
+    values = {"change": ours - base, "change_low": low, "change_high": high}
+    if not measure.relative or base == 0 or not np.all(resampled_base):
+        return values
+    low, high = _quantiles(difference / resampled_base)
+    return values | {"relative": (ours - base) / base, "relative_low": low, "relative_high": high}
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, float]:
+    """95 % interval, NaN for the empty array that stands for one scenario."""
+    if not len(values):
+        return np.nan, np.nan
+    low, high = np.quantile(values, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _weights(scores: pd.DataFrame, measure: Measure) -> pd.Series:
+    return scores["frames"].astype(float) if measure.average == "frames" else pd.Series(1.0, index=scores.index)
+
+
+def _spreads(part: pd.DataFrame, measure: Measure) -> dict[str, float]:
+    """Method -> standard deviation over seeds of the mean over scenarios, of the seeds that have every scenario."""
+    weighted = part.assign(weight=_weights(part, measure), product=_weights(part, measure) * part["value"])
+    per_seed = weighted.groupby(["method", "seed"]).agg(
+        total=("product", "sum"), weight=("weight", "sum"), scenarios=("scenario", "nunique")
+    )
+    complete = per_seed[per_seed["scenarios"] == part["scenario"].nunique()]
+    spread = (complete["total"] / complete["weight"]).groupby(level="method").std(ddof=1)
+    return {str(method): float(spread.get(method, np.nan)) for method in part["method"].unique()}
+
+
+def _resampled_means(part: pd.DataFrame, measure: Measure) -> dict[str, np.ndarray]:
+    """Method -> its mean in every resample; empty arrays for a single scenario, which says nothing of others.
+
+    Scenarios are resampled, and within each the seeds, as in `tables.paired_differences`. All methods see the same draws, so
+    differences are paired; a weighted mean is divided by the weights that were drawn.
+    """
+    values = part.pivot(index=["scenario", "seed"], columns="method", values="value")
+    weights = part.assign(weight=_weights(part, measure)).pivot_table(index="scenario", columns="method", values="weight")
+    runs = [rows.to_numpy().T for _, rows in values.groupby(level="scenario")]
+    if len(runs) == 1:
+        return {str(method): np.empty(0) for method in values.columns}
+    counts = np.array([rows.shape[1] for rows in runs])
+    padded = np.stack([np.stack([np.resize(row, counts.max()) for row in rows]) for rows in runs], axis=1)
+    weight = weights[values.columns].to_numpy().T
+    rng = np.random.default_rng(0)
+    total, drawn = np.zeros((2, len(padded), RESAMPLES))
+    for _ in runs:
+        scenario = rng.integers(len(runs), size=RESAMPLES)
+        seed = (rng.random((RESAMPLES, counts.max())) * counts[scenario, None]).astype(int)
+        used = np.arange(counts.max()) < counts[scenario, None]
+        mean = (padded[:, scenario[:, None], seed] * used).sum(axis=2) / counts[scenario]
+        total += weight[:, scenario] * mean
+        drawn += weight[:, scenario]
+    return {str(method): means for method, means in zip(values.columns, total / drawn, strict=True)}
+
+
+def shown(study: Study, scores: pd.DataFrame) -> list[tuple[str, Measure]]:
+    """The columns of a study's table: the paper's; without a reference the Chamfer distance and what has scores."""
+    present = set(zip(scores["task"], scores["metric"], strict=True)) | {(task, "chamfer") for task in paper.TASKS}
+    known = {key[1:] for key in study.values} if study.reference else present
+    return [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure.name) in known]
+
+
+def cells(study: Study, own: Collected) -> pd.DataFrame:
+    """One row per label, task and metric: the paper's value, ours (`Estimate`), their difference, and both verdicts."""
+    scores = counted(own)
+    found = estimates(scores, study.rows[study.baseline])
+    rows = [_cell(study, own, scores, found, *key) for key in _keys(study, scores)]
+    return pd.DataFrame(rows)
+
+
+def _keys(study: Study, scores: pd.DataFrame) -> Iterator[tuple[str, str, Measure]]:
+    columns = shown(study, scores)
+    return ((label, task, measure) for label in study.rows for task, measure in columns)
+
+
+def _cell(
+    study: Study, own: Collected, scores: pd.DataFrame, found: Estimates, label: str, task: str, measure: Measure
+) -> dict[str, Any]:
+    method, base = study.rows[label], study.rows[study.baseline]
+    estimate = found.get((method, task, measure.name), Estimate())
+    printed = study.values.get((label, task, measure.name))
+    part = scores[(scores["task"] == task) & (scores["metric"] == measure.name) & (scores["method"] == method)]
+    foreign = is_foreign(own.runs, part)
+    absent = _absent(own, method, measure.name) if np.isnan(estimate.ours) else ""
+    verdict = absent or _verdict(estimate, printed, measure, foreign)
+    if verdict in (WITHIN, BETTER, WORSE, NO_INTERVAL) and estimate.scenarios < len(paper.scenarios()):
+        verdict = f"partial ({estimate.scenarios} of {len(paper.scenarios())}): {verdict}"
+    of_base = study.values.get((study.baseline, task, measure.name))
+    change = printed.value - of_base.value if printed and of_base else np.nan
+    lacking = absent or ("baseline not run" if np.isnan(estimate.change) else "")
+    status = own.runs.loc[own.runs["method"] == method, "status"].value_counts()
+    return {
+        **{"label": label, "method": method, "task": task, "metric": measure.name, "unit": measure.unit},
+        **{"average": measure.average, "paper": printed.text if printed else ""},
+        **asdict(estimate),
+        "difference": np.nan if foreign or not printed else estimate.ours - printed.value,
+        "verdict": verdict,
+        "baseline": study.baseline,
+        "paper_change": change,
+        "paper_relative": change / of_base.value if of_base and measure.relative else np.nan,
+        "direction": BASELINE if method == base else lacking or _direction(estimate, change, measure),
+        **{name: int(status.get(name, 0)) for name in ("ok", "failed", "missing")},
+    }
+
+
+def is_foreign(runs: pd.DataFrame, scores: pd.DataFrame) -> bool:
+    """Whether some of the scores are not of the paper's 22 scenarios, read from the released data."""
+    released = runs.loc[(runs["source"] == "phystwin") & runs["scenario"].isin(paper.scenarios()), "scenario"]
+    return bool((~scores["scenario"].isin(released)).any())
+
+
+def _absent(own: Collected, method: str, metric: str) -> str:
+    """Why a cell has no value of ours."""
+    runs = own.runs[own.runs["method"] == method]
+    finished = runs[runs["status"] == "ok"]
+    failed = int((runs["status"] == "failed").sum())
+    if not len(finished):
+        return f"{NOT_RUN} ({failed} failed)" if failed else NOT_RUN
+    mine = own.scores[(own.scores["method"] == method) & (own.scores["metric"] == metric)]
+    return NOTHING_TO_COMPARE if len(mine.merge(finished[["scenario", "seed"]])) else NOT_COMPUTED
+
+
+def _verdict(estimate: Estimate, printed: Printed | None, measure: Measure, foreign: bool) -> str:
+    """Whether ours is the paper's value, whose rounding is allowed for."""
+    if printed is None:
+        return NO_VALUE
+    if foreign:
+        return OTHER_DATA
+    slack = printed.slack + ROUND_OFF * abs(printed.value)
+    low, high = (estimate.low, estimate.high) if np.isfinite(estimate.low) else (estimate.ours, estimate.ours)
+    if low - slack <= printed.value <= high + slack:
+        return WITHIN
+    if not np.isfinite(estimate.low):
+        return NO_INTERVAL
+    return BETTER if (estimate.ours > printed.value) == measure.higher else WORSE
+
+
+def _direction(estimate: Estimate, change: float, measure: Measure) -> str:
+    """Where the change against the baseline goes: as in the paper; where that has no number, whether it is for the better."""
+    if estimate.scenarios < LEAST_SCENARIOS:
+        return TOO_FEW
+    low, high = estimate.change_low, estimate.change_high
+    if not (low > 0 or high < 0):
+        return NOT_RESOLVED
+    if np.isnan(change):
+        return BETTER if (low > 0) == measure.higher else WORSE
+    if change == 0:
+        return UNCHANGED
+    return CONFIRMED if (low > 0) == (change > 0) else OPPOSITE

@@ -1,0 +1,73 @@
+"""How well perception does on synthetic captures, per category, from the records of its judge (judged.json)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from neuspring.core.files import write_text
+from neuspring.core.records import StageRecord
+from neuspring.scores.layout import markdown
+
+COLUMNS = {
+    "mask_iou_object": ("Object IoU", ".3f"),
+    "mask_iou_hands": ("Hand IoU", ".3f"),
+    "track_median_px": ("Track px", ".2f"),
+    "track_p95_px": ("95 %", ".1f"),
+    "track_survival": ("Followed to the end", ".0%"),
+    "lifted_median_mm": ("Lifted mm", ".1f"),
+    "lifted_p95_mm": ("95 %", ".1f"),
+    "trusted_median_mm": ("Trusted mm", ".1f"),
+    "trusted_p95_mm": ("95 %", ".1f"),
+    "trusted_share": ("Trusted share", ".0%"),
+    "controllers_median_mm": ("Controllers mm", ".1f"),
+    "hull_iou_3": ("Hull IoU, 3 cameras", ".2f"),
+    "hull_iou_2": ("2", ".2f"),
+    "hull_iou_1": ("1", ".2f"),
+    "hull_distance_3_mm": ("Surface mm, 3 cameras", ".1f"),
+}
+
+
+def collect(results: Path, scenarios: Iterable[tuple[str, str]]) -> pd.DataFrame:
+    """One row per scenario that has been judged; `scenarios` are (name, category)."""
+    rows = []
+    for name, category in scenarios:
+        path = results / name / "perception" / "judged.json"
+        if not path.is_file():
+            continue
+        record = StageRecord.load(path)
+        rows.append({"scenario": name, "category": category, **record.facts, "seconds": record.seconds})
+    return pd.DataFrame(rows)
+
+
+def write(table: pd.DataFrame, folder: Path) -> str:
+    """perception.csv and perception.md; returns the text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "perception.csv", table.to_csv(index=False))
+    known = {key: value for key, value in COLUMNS.items() if key in table}
+    header = ["", "Scenes", *(heading for heading, _ in known.values())]
+    groups = [(str(name), rows) for name, rows in table.groupby("category", sort=True)]
+    if len(groups) > 1:
+        groups.append(("all", table))
+    lines = []
+    for name, rows in groups:
+        means = rows[list(known)].mean()
+        cells = ["–" if pd.isna(means[key]) else format(means[key], style) for key, (_, style) in known.items()]
+        lines.append([name, str(len(rows)), *cells])
+    sensors = ", ".join(sorted(set(table["sensor"]))) if "sensor" in table else "?"
+    backends = " and ".join(f"{step}: {', '.join(sorted(set(table[step])))}" for step in ("segment", "track"))
+    text = "\n".join(
+        [
+            "# Perception against the truth",
+            "",
+            f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.",
+            "Lifted: of the same points in the world; trusted: of those that move as their neighbours do, which losses use.",
+            "",
+            *markdown(header, lines),
+            "",
+        ]
+    )
+    write_text(folder / "perception.md", text)
+    return text

@@ -1,0 +1,299 @@
+"""Tables of a study as Markdown and LaTeX, in the layout of the paper: both tasks side by side, the best marked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from neuspring.scores import paper
+from neuspring.scores.failures import DASHES, WHY
+from neuspring.scores.layout import markdown
+from neuspring.scores.paper import MEASURES, Measure
+from neuspring.scores.studies import Study
+
+Mark = Literal["", "best", "second"]
+SHORT = {"reconstruction": "Recon.", "future": "Future"}
+LONG = {"reconstruction": "Reconstruction & Resimulation", "future": "Future Prediction"}
+DASH = "–"
+FAILED_MARK = "*"
+"""Beside the number of runs of a method of which some failed."""
+TEX = {
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{character: f"\\{character}" for character in "{}%_&#$"},
+    **{"±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "–": "--", "<": r"$<$", ">": r"$>$", "|": r"$|$", "[": "{[}"},
+}
+PREAMBLE = "% Needs \\usepackage{booktabs} and \\usepackage{graphicx}."
+
+
+class Text(NamedTuple):
+    """A cell and how it is marked."""
+
+    text: str
+    mark: Mark = ""
+
+
+Line = tuple[tuple[str, ...], list[Text]]
+"""Cells of the stub and of the columns; one whose first cell is empty belongs to the line above."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A table whose columns are tasks and metrics."""
+
+    title: str
+    note: str
+    """One paragraph."""
+    stub: tuple[str, ...]
+    """Headings of the columns before the metrics."""
+    columns: list[tuple[str, Measure]]
+    lines: list[Line]
+
+
+def number(value: float, measure: Measure, sign: str = "") -> str:
+    """Ours in the paper's unit; a dash for NaN."""
+    return DASH if np.isnan(value) else f"{value:{sign}.{measure.digits}f}"
+
+
+def _interval(low: float, high: float, show: Callable[[float], str]) -> str:
+    return f"[{show(low)}, {show(high)}]" if np.isfinite(low) else ""
+
+
+def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
+    """The paper's table with ours and the verdict below every row."""
+    columns = _columns(cells)
+    marks = {source: _marks(study, cells, columns, source) for source in ("paper", "ours")}
+    lines: list[Line] = []
+    for label, part in _rows(cells):
+        printed, ours, verdicts = [], [], []
+        for task, measure in columns:
+            cell = part[task, measure.name]
+            key = (label, task, measure.name)
+            spread = f" ± {number(cell.spread, measure)}" if np.isfinite(cell.spread) else ""
+            printed.append(Text(cell.paper or DASH, marks["paper"].get(key, "")))
+            ours.append(Text(number(cell.ours, measure) + spread, marks["ours"].get(key, "")))
+            verdicts.append(Text(cell.verdict))
+        lines += [((label, "", "paper"), printed)] if study.reference else []
+        lines.append((("" if study.reference else label, _runs(cell), "ours"), ours))
+        lines += [(("", "", "verdict"), verdicts)] if study.reference else []
+    note = (
+        f"{_units(columns)} Ours: mean over scenarios, seeds averaged within each, ± standard deviation over seeds"
+        f"{_conventions(columns)}."
+    )
+    if cells["failed"].any():
+        note += f" {FAILED_MARK} Some runs failed; the table of failures has both averages, without and with them."
+    return Grid(title="", note=note, stub=("Method", "Runs", ""), columns=columns, lines=lines)
+
+
+def interval_grid(cells: pd.DataFrame) -> Grid:
+    """The interval of our mean, and how far it lies from the paper's value; only what has finished."""
+    finished = cells[cells["ours"].notna()]
+    columns, lines = _columns(finished), list[Line]()
+    compared = bool(finished["difference"].notna().any())
+    for label, part in _rows(finished):
+        here = [(part.get((task, measure.name)), measure) for task, measure in columns]
+        intervals = [_interval(cell.low, cell.high, partial(number, measure=measure)) if cell else "" for cell, measure in here]
+        lines.append(((label, "95 %"), [Text(text or DASH) for text in intervals]))
+        if compared:
+            distances = [number(cell.difference, measure, "+") if cell else DASH for cell, measure in here]
+            lines.append((("", "ours - paper"), [Text(text) for text in distances]))
+    note = f"95 % bootstrap interval of our mean, over scenarios and seeds{'; ours minus the value of the paper' * compared}."
+    return Grid(title="Intervals", note=note, stub=("Method", ""), columns=columns, lines=lines)
+
+
+def change_grid(study: Study, cells: pd.DataFrame) -> Grid:
+    """The change against the baseline, in the paper and here."""
+    columns, lines = _columns(cells), list[Line]()
+    for label, part in _rows(cells):
+        if label == study.baseline:
+            continue
+        here = [(part[task, measure.name], measure) for task, measure in columns]
+        if any(np.isfinite(cell.paper_change) for cell, _ in here):
+            lines.append(((label, "paper"), [Text(paper_change(cell, measure)) for cell, measure in here]))
+        first = label if not lines or lines[-1][0][0] != label else ""
+        lines.append(((first, "ours"), [Text(our_change(cell, measure)) for cell, measure in here]))
+        lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
+    in_db = " (PSNR: in dB)" if any(not measure.relative for _, measure in columns) else ""
+    note = (
+        f"Change against {study.baseline} on the same scenarios and seeds, in per cent of its mean{in_db}, with the paired 95 % "
+        "bootstrap interval."
+    )
+    return Grid(title=f"Change against {study.baseline}", note=note, stub=("Method", ""), columns=columns, lines=lines)
+
+
+def other_grid(cells: pd.DataFrame) -> Grid:
+    """Ours in the average that the paper does not use."""
+    table = cells[cells["ours"].notna()].assign(value=cells["other_average"])
+    note = "Ours in the other average: CD and TE weighted by frames, pictures with equal weights of scenarios."
+    return values_grid("The other average", note, ("Method",), table, ["label"])
+
+
+def held_grid(study: Study, means: pd.DataFrame) -> Grid:
+    """The rows whose method failed somewhere: both averages (`tables_held.both_averages`), in the average that the paper takes."""
+    table = means[means["succeeded"] < means["attempted"]].dropna(subset="metric")
+    columns, lines = _columns(table), list[Line]()
+    columns = [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure) in columns]
+    for label, method in study.rows.items():
+        part = means[means["method"] == method]
+        known = {(row.task, row.metric): row for row in part.itertuples()}
+        if not len(part) or part.iloc[0]["succeeded"] == part.iloc[0]["attempted"]:
+            continue
+        count = f"{part.iloc[0]['succeeded']}/{part.iloc[0]['attempted']}"
+        for stub, name in (((label, count, "its successes"), "own"), (("", "", "all, failures held"), "all")):
+            here = [(known.get((task, measure.name)), measure) for task, measure in columns]
+            lines.append((stub, [Text(_held_number(row, name, measure)) for row, measure in here]))
+    note = f"Rows marked {FAILED_MARK} above. {WHY} {DASHES}"
+    return Grid(title="Failures", note=note, stub=("Method", "Succeeded", "Mean over"), columns=columns, lines=lines)
+
+
+def _held_number(row: Any, name: str, measure: Measure) -> str:
+    if row is None:
+        return DASH
+    return number(float(getattr(row, name if measure.average == "equal" else f"{name}_frames")), measure)
+
+
+def values_grid(title: str, note: str, stub: tuple[str, ...], table: pd.DataFrame, keys: list[str]) -> Grid:
+    """Any table of ours in long form (task, metric, value and `keys`), one line per combination of keys."""
+    present = set(zip(table["task"], table["metric"], strict=True)) if len(table) else set()
+    columns = [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure.name) in present]
+    lines: list[Line] = []
+    for names, part in table.groupby(keys, sort=False):
+        values = part.set_index(["task", "metric"])["value"].to_dict()
+        texts = [Text(number(values.get((task, measure.name), np.nan), measure)) for task, measure in columns]
+        lines.append((tuple(map(str, names)), texts))
+    return Grid(title=title, note=note, stub=stub, columns=columns, lines=lines)
+
+
+def our_change(cell: Any, measure: Measure) -> str:
+    """The change against the baseline and its interval, in per cent where that means something."""
+    if measure.relative and np.isfinite(cell.relative):
+        found = (cell.relative, cell.relative_low, cell.relative_high)
+        return f"{_percent(found[0])} % {_interval(*found[1:], _percent)}".rstrip()
+    if np.isnan(cell.change):
+        return DASH
+    interval = _interval(cell.change_low, cell.change_high, partial(number, measure=measure, sign="+"))
+    return f"{number(cell.change, measure, '+')} {interval}".rstrip()
+
+
+def paper_change(cell: Any, measure: Measure) -> str:
+    """The change against the baseline that the paper prints, rounded as it is."""
+    if np.isnan(cell.paper_change):
+        return DASH
+    return number(cell.paper_change, measure, "+") if not measure.relative else f"{_percent(cell.paper_relative)} %"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:+.1f}"
+
+
+def _columns(cells: pd.DataFrame) -> list[tuple[str, Measure]]:
+    pairs = dict.fromkeys(zip(cells["task"], cells["metric"], strict=True))
+    return [(str(task), MEASURES[str(metric)]) for task, metric in pairs]
+
+
+def _rows(cells: pd.DataFrame) -> Iterable[tuple[str, dict[tuple[str, str], Any]]]:
+    for label, part in cells.groupby("label", sort=False):
+        yield str(label), {(str(cell.task), str(cell.metric)): cell for cell in part.itertuples()}
+
+
+def _runs(cell: Any) -> str:
+    total = cell.ok + cell.failed + cell.missing
+    wrong = ", ".join(f"{count} {name}" for name, count in (("failed", cell.failed), ("missing", cell.missing)) if count)
+    mark = f" {FAILED_MARK}" if cell.failed else ""
+    return f"{cell.ok}/{total}" + (f" ({wrong})" if wrong else "") + mark if total else DASH
+
+
+def _units(columns: list[tuple[str, Measure]]) -> str:
+    text = "CD (single-directional L1 Chamfer distance) and TE (track error) in m"
+    return f"{text}, PSNR in dB." if any(measure.name == "psnr" for _, measure in columns) else f"{text}."
+
+
+def _conventions(columns: list[tuple[str, Measure]]) -> str:
+    if not any(measure.average == "frames" for _, measure in columns):
+        return ""
+    return "; as the paper does, CD and TE weigh scenarios equally, scores of pictures weigh them by their frames"
+
+
+def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Measure]], source: str) -> dict[tuple[str, str, str], Mark]:
+    """Best and, where the paper marks it, second best of every column, as far as the printed digits tell."""
+    found: dict[tuple[str, str, str], Mark] = {}
+    for task, measure in columns:
+        part = cells[(cells["task"] == task) & (cells["metric"] == measure.name)]
+        values = pd.to_numeric(part[source]).round(measure.digits)
+        ranked = sorted(values.dropna().unique(), reverse=measure.higher)
+        if values.notna().sum() < 2:
+            continue
+        names: tuple[Mark, ...] = ("best", "second") if study.reference in paper.UNDERLINED else ("best",)
+        for label, value in zip(part["label"], values, strict=True):
+            mark = dict(zip(ranked, names, strict=False)).get(value)
+            if mark:
+                found[label, task, measure.name] = mark
+    return found
+
+
+def as_markdown(grid: Grid, level: str = "##") -> str:
+    """Heading, note and table."""
+    header = [*grid.stub, *(f"{SHORT[task]} {_heading(measure)}" for task, measure in grid.columns)]
+    rows = [[*map(_plain, stub), *map(_marked, texts)] for stub, texts in grid.lines]
+    parts = [f"{level} {grid.title}"] * bool(grid.title) + [grid.note] * bool(grid.note)
+    return "\n\n".join([*parts, "\n".join(markdown(header, rows))]) + "\n"
+
+
+def _heading(measure: Measure) -> str:
+    return f"{measure.heading} {'↑' if measure.higher else '↓'}"
+
+
+def _plain(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _marked(cell: Text) -> str:
+    around = {"": "{}", "best": "**{}**", "second": "<ins>{}</ins>"}[cell.mark]
+    return around.format(_plain(cell.text))
+
+
+def as_latex(grid: Grid, label: str, title: str) -> str:
+    """A float to \\input, in the paper's layout; `PREAMBLE` says what it needs."""
+    stub, tasks = len(grid.stub), [task for task, _ in grid.columns]
+    spans, rules, first = [], [], stub + 1
+    for task in dict.fromkeys(tasks):
+        count = tasks.count(task)
+        spans.append(f"\\multicolumn{{{count}}}{{c}}{{{tex(LONG[task])}}}")
+        rules.append(f"\\cmidrule(lr){{{first}-{first + count - 1}}}")
+        first += count
+    lines = [
+        "\\begin{table*}[t]\n\\centering\n\\small\n\\resizebox{\\linewidth}{!}{%",
+        f"\\begin{{tabular}}{{@{{}} {'l' * stub} {'r' * len(tasks)} @{{}}}}",
+        "\\toprule",
+        _tex_row(["Task", *[""] * (stub - 1), *spans]),
+        " ".join(rules),
+        _tex_row([*map(tex, grid.stub), *(tex(_heading(measure)) for _, measure in grid.columns)]),
+        "\\midrule",
+    ]
+    grouped = any(not names[0] for names, _ in grid.lines)
+    for index, (names, texts) in enumerate(grid.lines):
+        lines += ["\\addlinespace"] if index and grouped and names[0] else []
+        lines.append(_tex_row([*map(tex, names), *map(_tex_marked, texts)]))
+    caption = f"\\caption{{\\textbf{{{tex(title)}.}} {tex(grid.note)}}}"
+    lines += ["\\bottomrule", "\\end{tabular}}", caption, f"\\label{{tab:{label}}}", "\\end{table*}"]
+    return "\n".join(lines) + "\n"
+
+
+def _tex_row(cells: list[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _tex_marked(cell: Text) -> str:
+    around = {"": "{}", "best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}[cell.mark]
+    return around.format(tex(cell.text))
+
+
+def tex(text: str) -> str:
+    """Plain text for LaTeX: special characters escaped, minus signs in mathematics."""
+    escaped = "".join(TEX.get(character, character) for character in text)
+    return re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", escaped)

@@ -1,0 +1,283 @@
+"""The tables of a study beside the paper's: CSV, Markdown and LaTeX from run records.
+
+Per study, in one folder: <study>.md and .tex (to read), .csv (a row per cell), _runs.csv (which runs count, and why not the
+others), _failures.csv (averages without and with failed runs), _scenarios.csv, _categories.csv, .json (what the table was made
+of, for `neuspring explain`); where the released PhysTwin's method is a row, and its scenarios are among the runs, also
+_released_phystwin.csv and .md; for the number of regions _curve.png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from neuspring.config import parse
+from neuspring.config.types import STRICT, Name
+from neuspring.core.files import write_text
+from neuspring.core.records import RECORD_FORMAT, read_json
+from neuspring.report.figures.clusters import cluster_methods, clusters_figure
+from neuspring.report.tables import summary as tables
+from neuspring.report.tables.cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
+from neuspring.report.tables.render import (
+    PREAMBLE,
+    Grid,
+    as_latex,
+    as_markdown,
+    change_grid,
+    held_grid,
+    interval_grid,
+    main_grid,
+    number,
+    other_grid,
+    values_grid,
+)
+from neuspring.report.tables.summary import Collected, collect
+from neuspring.scores import paper
+from neuspring.scores.failures import NOTHING, LeftOut, both_averages, left_out_lines, removed_lines, unknown_lines
+from neuspring.scores.metrics import averages
+from neuspring.scores.paper import MEASURES
+from neuspring.scores.studies import Study
+
+RELEASED_METHODS = ("phystwin", "baseline")
+"""Our rows for the method whose scores per scenario are released."""
+VERDICTS = (
+    "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
+    "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
+    "cannot be compared with the paper's."
+)
+DIRECTIONS = (
+    "Verdict: same direction, confirmed: our interval leaves out 0 on the paper's side; opposite: on the other side; not resolved: "
+    f"it holds 0; better, worse: it leaves out 0, and the paper has no number; too few scenarios: fewer than {LEAST_SCENARIOS}, "
+    "which too often change in one direction by chance."
+)
+NAMED = 6
+"""As many runs of one kind are named in a list; <study>_runs.csv has all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """What a study's table was made of."""
+
+    __pydantic_config__ = STRICT
+    name: Name
+    study: Study
+    scenarios: tuple[Name, ...]
+    methods: tuple[Name, ...]
+    """Those of the study that the benchmark has."""
+    seeds: tuple[int, ...]
+    left_out: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
+    """Method to the scenarios to which it does not apply."""
+
+    def save(self, folder: Path) -> None:
+        """Write <name>.json."""
+        text = json.dumps({"format": RECORD_FORMAT, **dataclasses.asdict(self)}, indent=1, ensure_ascii=False)
+        write_text(folder / f"{self.name}.json", text + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Made:
+        """Raises InputError."""
+        return parse(cls, read_json(path, RECORD_FORMAT), str(path))
+
+
+def write_study(
+    name: str,
+    study: Study,
+    results: Path,
+    scenarios: Sequence[str],
+    seeds: Sequence[int],
+    known_methods: Iterable[str],
+    folder: Path,
+    left_out: LeftOut = NOTHING,
+) -> str:
+    """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run".
+
+    `left_out`: method to the scenarios to which it does not apply.
+    """
+    known = set(known_methods)
+    methods = [method for method in study.rows.values() if method in known]
+    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder)
+
+
+def write_collected(name: str, study: Study, collected: Collected, folder: Path) -> str:
+    """As `write_study`, from runs that `collect` has read; methods of other studies among them are passed over."""
+    own = of_study(study, collected)
+    scores, table, runs = counted(own), cells(study, own), accounted(study, own)
+    scenarios, categories = by_scenario(study, own, runs), by_category(study, scores)
+    written = {"": table.assign(study=name), "_runs": runs, "_scenarios": scenarios, "_categories": categories}
+    for suffix, rows in written.items():
+        write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
+    names = {column: tuple(dict.fromkeys(own.runs[column].tolist())) for column in ("scenario", "method", "seed")}
+    absent = {method: tuple(where) for method, where in own.left_out.items()}
+    methods = tuple(dict.fromkeys([*names["method"], *absent]))
+    Made(name=name, study=study, scenarios=names["scenario"], methods=methods, seeds=names["seed"], left_out=absent).save(folder)
+    means = both_averages(own.scores, own.runs, own.held)
+    write_text(folder / f"{name}_failures.csv", means.to_csv(index=False))
+    grids = _captioned(study, own, scores, table, means)
+    titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
+    floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
+    write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
+    warning = tables.mixed_settings(own.runs)
+    parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
+    parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
+    parts.append(_left_out(runs, study, name, own))
+    if len(categories):
+        note = "Ours, in the average that the paper takes."
+        parts.append(as_markdown(values_grid("Per category", note, ("Category", "Method"), categories, ["category", "label"])))
+    if len(scenarios):
+        note = "Ours, all finished runs, seeds averaged."
+        parts.append(as_markdown(values_grid("Per scenario", note, ("Scenario", "Method"), scenarios, ["scenario", "label"])))
+    parts.append(_write_released(name, study, own, folder))
+    text = "\n".join(part for part in parts if part)
+    write_text(folder / f"{name}.md", text)
+    return text
+
+
+def by_scenario(study: Study, own: Collected, runs: pd.DataFrame) -> pd.DataFrame:
+    """A row per scenario, row label, task and metric: mean and spread over the finished seeds, and how many of them count."""
+    keys = ["scenario", "category", "label", "method", "task", "metric"]
+    finished = own.scores.merge(runs.loc[runs["status"] == "ok", ["label", "scenario", "method", "seed", "counted"]])
+    table = finished.groupby(keys, sort=False).agg(
+        value=("value", "mean"),
+        spread=("value", "std"),
+        seeds=("seed", "nunique"),
+        counted=("counted", "sum"),
+        frames=("frames", "mean"),
+    )
+    return _in_order(study, table.reset_index())
+
+
+def by_category(study: Study, scores: pd.DataFrame) -> pd.DataFrame:
+    """A row per category, row label, task and metric: `value` in the average that the paper takes, and both averages."""
+    labels = _labels(study)
+    columns = ["category", "label", "method", "task", "metric", "value", "equal", "frames", "seed_std", "scenarios"]
+    if not len(scores):
+        return pd.DataFrame(columns=[*columns, "unit"])
+    table = averages(scores, by=("category", "method", "task", "metric"))
+    frames = table["metric"].map({name: measure.average == "frames" for name, measure in MEASURES.items()})
+    table = table.assign(label=table["method"].map(labels), value=np.where(frames, table["frames"], table["equal"]))
+    return _in_order(study, table[columns])
+
+
+def released_comparison(own: Collected, method: str) -> pd.DataFrame:
+    """Every value of the released PhysTwin with ours beside it, m; NaN where there is no finished run on the released data."""
+    mine = (own.runs["status"] == "ok") & (own.runs["source"] == "phystwin") & (own.runs["method"] == method)
+    finished = own.runs.loc[mine, ["scenario", "method", "seed"]]
+    keys = ["scenario", "task", "metric"]
+    ours = own.scores.merge(finished).groupby(keys)["value"].agg(ours="mean", spread="std", seeds="count").reset_index()
+    table = paper.released().rename(columns={"value": "released"}).merge(ours, on=keys, how="left")
+    table["seeds"] = table["seeds"].fillna(0).astype(int)
+    return table.assign(difference=table["ours"] - table["released"], ratio=table["ours"] / table["released"])
+
+
+def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
+    """With units, rows of one scenario or category in the study's order, groups as they first appear."""
+    first = table.columns[0]
+    ranks = {first: list(dict.fromkeys(table[first])), "label": list(study.rows)}
+    ranks |= {"task": list(paper.TASKS), "metric": list(MEASURES)}
+    place = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
+    order = pd.DataFrame(place).sort_values(list(place)).index
+    return table.assign(unit=table["metric"].map({name: m.unit for name, m in MEASURES.items()})).loc[order].reset_index(drop=True)
+
+
+def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame, means: pd.DataFrame) -> list[Grid]:
+    """The blocks of the table that have lines; the note of the first says what every reader must know."""
+    pairs, kept = (len(table[["scenario", "seed"]].drop_duplicates()) for table in (own.runs, scores))
+    which = f"Averages take the {kept} of {pairs} pairs of scenario and seed that every method with a finished run has finished."
+    main, change = main_grid(study, table), change_grid(study, table)
+    labels = _labels(study)
+    removed = " ".join(removed_lines(own.runs, own.left_out, labels))
+    finished = (own.runs["status"] == "ok").any()
+    nothing = "No pair of scenario and seed was finished by every method." if finished else "Nothing has finished."
+    notes = [main.note, VERDICTS if study.reference else "", which if kept else nothing, removed, _pictures(own)]
+    notes += [paper.CLUSTER_CLAIM] if cluster_methods(study.rows.values()) else []
+    main = dataclasses.replace(main, note=" ".join(note for note in notes if note))
+    change = dataclasses.replace(change, note=f"{change.note} {DIRECTIONS}")
+    failures = held_grid(study, means)
+    unknown = unknown_lines(means, labels)
+    failures = dataclasses.replace(failures, note=" ".join([failures.note, *unknown]))
+    return [grid for grid in (main, failures, interval_grid(table), change, other_grid(table)) if grid.lines]
+
+
+def _labels(study: Study) -> dict[str, str]:
+    """Method to label."""
+    return {method: label for label, method in study.rows.items()}
+
+
+def _pictures(own: Collected) -> str:
+    """Of how pictures were scored, what moves them against the paper's."""
+    facts = [json.loads(text) for text in own.runs["images"].dropna()]
+    scored = [fact for fact in facts if fact and "failed" not in fact]
+    if not scored:
+        return ""
+    quirks = sorted({name for fact in scored for name in fact["quirks"]})
+    lpips = sorted({str(fact["lpips"]) for fact in scored} - {"computed"})
+    text = f"Quirks of the released evaluation of pictures that were on: {', '.join(quirks) or 'none'}."
+    return " ".join([text, *(f"LPIPS not computed in some runs: {reason}." for reason in lpips)])
+
+
+def _curve(study: Study, scores: pd.DataFrame, path: Path) -> str:
+    """The picture of the number of regions, for a study of it."""
+    if len(cluster_methods(study.rows.values())) < 2 or not len(scores) or clusters_figure(scores, path) is None:
+        path.unlink(missing_ok=True)
+        return ""
+    return f"![Chamfer distance against the number of regions K]({path.name})\n"
+
+
+def _left_out(runs: pd.DataFrame, study: Study, name: str, own: Collected) -> str:
+    """The runs that averages do not take: failures one by one, others by their reason; and the rows without a method."""
+    begun = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
+    lines = [
+        f"- {label}: {method} is not among the methods of this benchmark"
+        for label, method in study.rows.items()
+        if label not in begun
+    ]
+    left = runs[~runs["counted"].astype(bool)]
+    for (label, status, why), part in left.groupby(["label", "status", "why"], sort=False):
+        names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
+        shown = names if status == "failed" else names[:NAMED]
+        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+        lines.append(f"- {label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
+    lines += [f"- {text}" for text in left_out_lines(own.left_out, _labels(study))]
+    if not lines:
+        return ""
+    return "\n".join(["## Not in the averages\n", f"Every run: {name}_runs.csv.\n", *lines]) + "\n"
+
+
+def _write_released(name: str, study: Study, own: Collected, folder: Path) -> str:
+    """The comparison with the released PhysTwin, if its method is a row; returns the section that names it."""
+    method = next((method for method in RELEASED_METHODS if method in study.rows.values()), None)
+    if method is None or not own.runs["scenario"].isin(paper.scenarios()).any():
+        return ""
+    table, stem = released_comparison(own, method), f"{name}_released_phystwin"
+    write_text(folder / f"{stem}.csv", table.to_csv(index=False))
+    head = f"# Ours ({method}) beside the released PhysTwin, per scenario\n"
+    note = "m; mean over seeds (± standard deviation). The released values of the training frames are known for 11 scenarios.\n"
+    rows = []
+    for (task, metric), part in table.groupby(["task", "metric"], sort=True):
+        both = part.dropna(subset="ours")
+        lines = [[str(row.scenario), *_released_cells(row, MEASURES[str(metric)])] for row in part.itertuples()]
+        if len(both):
+            mean = both[["released", "ours", "difference"]].mean()
+            mean["ratio"], mean["spread"] = mean["ours"] / mean["released"], np.nan
+            lines.append([f"mean of {len(both)}", *_released_cells(mean, MEASURES[str(metric)])])
+        heading = f"## {str(task).capitalize()}, {MEASURES[str(metric)].heading}\n"
+        rows += [heading, "\n".join(tables.markdown(["Scenario", "Released", "Ours", "Difference", "Ratio"], lines)) + "\n"]
+    write_text(folder / f"{stem}.md", "\n".join([head, note, *rows]))
+    found = int(table.loc[table["ours"].notna(), "scenario"].nunique())
+    where = f"{found} of {len(paper.scenarios())} scenarios have finished" if found else "nothing has finished on its scenarios"
+    return f"## Beside the released PhysTwin\n\n[Per scenario]({stem}.md): {where}.\n"
+
+
+def _released_cells(row: object, measure: paper.Measure) -> list[str]:
+    released, ours, spread, difference, ratio = (
+        float(getattr(row, name)) for name in ("released", "ours", "spread", "difference", "ratio")
+    )
+    around = f" ± {number(spread, measure)}" if np.isfinite(spread) else ""
+    ratio_text = f"{ratio:.3f}" if np.isfinite(ratio) else number(np.nan, measure)
+    return [number(released, measure), number(ours, measure) + around, number(difference, measure, "+"), ratio_text]

@@ -1,0 +1,89 @@
+"""Pictures to a video that any browser plays: H.264 (libx264) in MP4, yuv420p, BT.709 colours, through PyAV."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+from typing import Self
+
+import av
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_atomically
+
+BT709 = 1
+"""Code of BT.709 (ITU-T H.273) for matrix, primaries and transfer alike."""
+LIMITED_RANGE = 1
+"""Code of studio levels (16 to 235), which every player expects."""
+LARGEST_RATE = 1000.0
+"""Hz."""
+WORST_QUALITY = 51
+
+
+class Video:
+    """Writes pictures one at a time: `with Video(path, rate) as video: video.add(picture)`.
+
+    The file appears at `path` when the block ends, and not at all if it fails. `quality` is the constant rate factor of x264: 0
+    (best) to 51, 6 more halve the file. Raises InputError for a bad rate or quality, and at the end for no pictures at all.
+    """
+
+    def __init__(self, path: Path, rate: float, quality: int = 20) -> None:
+        if not (math.isfinite(rate) and 0 < rate <= LARGEST_RATE):
+            raise InputError(path, f"the frame rate of a video must be above 0 and at most {LARGEST_RATE:g} Hz", rate)
+        if not 0 <= quality <= WORST_QUALITY:
+            raise InputError(path, f"the quality of a video must be 0 to {WORST_QUALITY}", quality)
+        self._path, self._rate, self._quality = path, Fraction(rate).limit_denominator(1001), quality
+        self._shape: tuple[int, ...] = ()
+        self._count = 0
+
+    def __enter__(self) -> Self:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._folder = tempfile.TemporaryDirectory(prefix=f".{self._path.name}.", dir=self._path.parent)
+        self._part = Path(self._folder.name) / self._path.name
+        return self
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a picture [H, W, 3] uint8 RGB; all have one size.
+
+        An odd width or height grows by one pixel, the edge repeated, because colours are stored at half resolution.
+        """
+        where, number = self._path, self._count
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+            rule = f"picture {number} of this video must be [H, W, 3] uint8"
+            raise InputError(where, rule, f"{picture.dtype.name} {picture.shape}")
+        if not number:
+            self._open(picture.shape)
+        if picture.shape != self._shape:
+            raise InputError(where, f"picture {number} of this video must have the size of the first, {self._shape}", picture.shape)
+        height, width = self._shape[:2]
+        rgb = av.VideoFrame.from_ndarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"), format="rgb24")
+        frame = rgb.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", threads=1)
+        self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if self._count:
+                self._container.mux(self._stream.encode(None))
+                self._container.close()
+            if kind is None:
+                if not self._count:
+                    raise InputError(self._path, "a video needs at least one picture")
+                write_atomically(self._path, self._part.replace)
+        finally:
+            self._folder.cleanup()
+
+    def _open(self, shape: tuple[int, ...]) -> None:
+        # The index goes to the front, so that a browser begins before it has everything.
+        self._container = av.open(self._part, "w", format="mp4", options={"movflags": "+faststart"})
+        stream = self._container.add_stream("libx264", rate=self._rate, options={"crf": str(self._quality)})
+        stream.height, stream.width = (side + side % 2 for side in shape[:2])
+        stream.pix_fmt = "yuv420p"
+        stream.colorspace = stream.color_primaries = stream.color_trc = BT709
+        stream.color_range = LIMITED_RANGE
+        # A job has one thread.
+        stream.codec_context.thread_count = 1
+        self._stream, self._shape = stream, shape

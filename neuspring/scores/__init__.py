@@ -1,0 +1,1 @@
+"""Numbers: metrics of points and pictures, statistics, the paper's values, conformance with the release."""

@@ -1,0 +1,97 @@
+"""LPIPS, the perceptual distance of two pictures (Zhang et al. 2018): AlexNet features under the linear heads v0.1.
+
+d(a, b) = sum over the five ReLUs l of the mean over pixels of w_l . (f_l(a) - f_l(b))^2, f_l of unit length over its channels.
+AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so torchvision is not needed. Its weights and
+the heads are files (`lpips_weights`); nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from neuspring.core.errors import InputError
+from neuspring.core.weights import read_tensors
+from neuspring.scores.lpips_weights import BACKBONE_ADDRESS, find_weights
+
+CHANNELS = (3, 64, 192, 384, 256, 256)
+"""Of the picture and after each convolution."""
+WINDOWS = (11, 5, 3, 3, 3)
+"""px, of each convolution."""
+STRIDES = (4, 1, 1, 1, 1)
+PADDINGS = (2, 2, 1, 1, 1)
+LAYERS = (0, 3, 6, 8, 10)
+"""Places of the convolutions in torchvision's `features`."""
+POOLED = (1, 2)
+"""Convolutions after a max-pooling of 3 px, stride 2."""
+SMALLEST = 31
+"""px: below it nothing is left after the second pooling."""
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+"""ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
+LEAST_NORM = 1e-10
+"""Added to the length of a feature before dividing by it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """The distance with its weights, all float32 on one device."""
+
+    kernels: list[torch.Tensor]
+    """Of each convolution [out, in, window, window]."""
+    biases: list[torch.Tensor]
+    heads: list[torch.Tensor]
+    """w_l [1, channels, 1, 1]."""
+
+    @classmethod
+    def load(cls, backbone: Path | None = None, heads: Path | None = None, device: str = "cpu", *, trusted: bool = False) -> Lpips:
+        """Read the weights, found as by `find_weights`. Raises InputError if they are absent or damaged."""
+        weights = find_weights(backbone, heads, trusted=trusted)
+        if isinstance(weights, str):
+            remedy = f"Get the backbone from {BACKBONE_ADDRESS}, the heads with `pip install --no-deps lpips`."
+            raise InputError("LPIPS", "its weights must be in torch hub's cache or be named", weights, remedy)
+        shapes = {
+            f"features.{layer}.weight": (after, before, window, window)
+            for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
+        }
+        biases = {f"features.{layer}.bias": (after,) for layer, after in zip(LAYERS, CHANNELS[1:], strict=True)}
+        tensors = read_tensors(weights.backbone, {**shapes, **biases}, device)
+        linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
+        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
+
+    def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """What follows each ReLU [B, channels, h, w], of normalised pictures [B, 3, H, W]."""
+        found = []
+        for k, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
+            if k in POOLED:
+                pictures = max_pool2d(pictures, 3, 2)
+            pictures = relu(conv2d(pictures, kernel, bias, STRIDES[k], PADDINGS[k]))
+            found.append(pictures)
+        return found
+
+    def __call__(self, a: torch.Tensor, b: torch.Tensor, *, released_range: bool = False) -> torch.Tensor:
+        """Distances [...] of pictures [..., 3, H, W] in [0, 1], at least 31 px wide and high; 0 for equal ones. Differentiable.
+
+        LPIPS is made for [-1, 1], to which pictures are mapped; `released_range` leaves them in [0, 1] (PhysTwin's quirk).
+        Raises InputError for bad shapes.
+        """
+        shapes = f"{tuple(a.shape)}, {tuple(b.shape)}"
+        if a.ndim < 3 or a.shape != b.shape or a.shape[-3] != 3:
+            raise InputError("LPIPS", "two pictures [..., 3, H, W] of the same shape are needed", shapes)
+        if min(a.shape[-2:]) < SMALLEST:
+            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST} x {SMALLEST} px", shapes)
+        pictures = torch.cat([p.reshape(-1, *p.shape[-3:]).to(self.heads[0]) for p in (a, b)])
+        if not released_range:
+            pictures = 2 * pictures - 1
+        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        distance = pictures.new_zeros(len(pictures) // 2)
+        # Full single precision, so that a GPU reports what a CPU does.
+        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+            for head, layer in zip(self.heads, self.features((pictures - shift) / scale), strict=True):
+                unit = layer / (torch.linalg.vector_norm(layer, dim=1, keepdim=True) + LEAST_NORM)
+                first, second = unit.chunk(2)
+                distance = distance + ((first - second).square() * head).sum(dim=1).mean(dim=(1, 2))
+        return distance.reshape(a.shape[:-3])

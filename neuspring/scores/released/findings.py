@@ -1,0 +1,179 @@
+"""What conformance checks find: our number, the published one, how far they may differ, and the verdict."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from neuspring.core.errors import InputError
+from neuspring.data.cases import released_cases
+from neuspring.scores.metrics import TASKS, UNITS, averages
+
+Outcome = Literal["passed", "failed", "measured", "skipped"]
+"""measured: nothing published to compare with."""
+MEAN = "mean"
+"""Stands for the scenario in findings about all of them."""
+SCORES = "released_phystwin_scores.csv"
+PUBLISHED_NAMES = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
+MEANS = ("MEAN22_REEVAL", "MEAN22_PAPER")
+"""Rows of means over the 22 scenarios: evaluated again with more digits, as printed in the paper."""
+TOLERANCES = {"chamfer": 1e-6, "track_error": 1e-6, "psnr": 0.02, "ssim": 5e-4, "lpips": 5e-4, "iou": 2e-3}
+"""m for distances: single precision and its order of summation. Pictures of the stand-in agree within 1e-6 dB with another drawing
+in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterisers lie between, none was at hand."""
+FRAME_WEIGHTED = ("psnr", "ssim", "lpips", "iou")
+"""The published means of pictures weigh frames equally, those of distances scenarios."""
+
+
+class Absent(Exception):
+    """A check cannot run, and why."""
+
+
+def require(root: Path, *paths: Path) -> None:
+    """Raise Absent for the first path that is not there."""
+    for path in paths:
+        if not path.exists():
+            raise Absent(f"{path.relative_to(root)} is not there")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One line of a check."""
+
+    check: int
+    scenario: str
+    """Or `MEAN`."""
+    quantity: str
+    unit: str = ""
+    task: str = ""
+    """reconstruction, future, or empty."""
+    ours: float | None = None
+    published: float | None = None
+    """The released or published number; 0 for distances from released positions."""
+    tolerance: float | None = None
+    outcome: Outcome = "measured"
+    note: str = ""
+    frames: int = 0
+    """That a score is the mean of."""
+    per_frame: np.ndarray | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def difference(self) -> float | None:
+        """Ours minus the published number."""
+        return None if self.ours is None or self.published is None else self.ours - self.published
+
+    def against(self, published: float, tolerance: float) -> Finding:
+        """Judged: passed or failed, by the tolerance."""
+        assert self.ours is not None
+        good = abs(self.ours - published) <= tolerance  # false for NaN
+        return replace(self, published=published, tolerance=tolerance, outcome="passed" if good else "failed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A published number."""
+
+    value: float
+    half_digit: float
+    """Half a unit of the last printed digit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Published:
+    """Scores of the released results as others published them, keyed by (scenario, task, metric); means under their rows' names."""
+
+    scores: Mapping[tuple[str, str, str], Reference]
+    scenarios: frozenset[str]
+    """Whose mean the means are."""
+
+    @classmethod
+    def load(cls) -> Published:
+        """The table that ships."""
+        text = resources.files("neuspring.data.tables").joinpath(SCORES).read_text(encoding="utf-8")
+        return cls.parse(text, frozenset(released_cases()))
+
+    @classmethod
+    def parse(cls, text: str, scenarios: frozenset[str]) -> Published:
+        """From CSV text with the columns scenario, split, metric and value."""
+        scores = {}
+        for row in csv.DictReader(text.splitlines()):
+            task, metric = (PUBLISHED_NAMES.get(row[name], row[name]) for name in ("split", "metric"))
+            if task not in TASKS or metric not in UNITS:
+                raise InputError(SCORES, "known splits and metrics are required", (row["split"], row["metric"]))
+            digits = len(row["value"].partition(".")[2])
+            scores[row["scenario"], task, metric] = Reference(value=float(row["value"]), half_digit=0.5 * 10.0**-digits)
+        return cls(scores=scores, scenarios=scenarios)
+
+    def means(self, task: str, metric: str) -> list[Reference]:
+        """Of a task and metric, the one with most digits first."""
+        keys = [(name, task, metric) for name in MEANS]
+        return [self.scores[key] for key in keys if key in self.scores]
+
+
+def of_scores(
+    check: int, scenario: str, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
+) -> list[Finding]:
+    """Findings for tidy scores of one scenario; `missing` says of a metric why it has none."""
+    found = {(row["task"], row["metric"]): row for row in scores.to_dict("records")}
+    findings = []
+    for metric in metrics:
+        base = Finding(check=check, scenario=scenario, quantity=metric, unit=UNITS[metric])
+        if metric in missing:
+            findings.append(replace(base, outcome="skipped", note=missing[metric]))
+            continue
+        for task in TASKS:
+            if (task, metric) not in found:
+                findings.append(replace(base, task=task, outcome="skipped", note="no frame has it"))
+                continue
+            row = found[task, metric]
+            scored = replace(base, task=task, ours=float(row["value"]), frames=int(row["frames"]))
+            findings.append(_judged(scored, published.scores.get((scenario, task, metric))))
+    return findings
+
+
+def _judged(score: Finding, reference: Reference | None) -> Finding:
+    if reference is None:
+        return score
+    return score.against(reference.value, max(TOLERANCES[score.quantity], reference.half_digit))
+
+
+def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]:
+    """Findings about means over scenarios; only the complete set can be held against the published ones."""
+    rows = [
+        {"check": f.check, "scenario": f.scenario, "seed": 0, "task": f.task, "metric": f.quantity, "value": f.ours}
+        | {"frames": f.frames}
+        for f in findings
+        if f.frames and f.ours is not None
+    ]
+    if not rows:
+        return []
+    table = pd.DataFrame(rows)
+    found = []
+    for row in averages(table, by=("check", "task", "metric")).to_dict("records"):
+        part = table[(table["check"] == row["check"]) & (table["task"] == row["task"]) & (table["metric"] == row["metric"])]
+        weighted = row["metric"] in FRAME_WEIGHTED
+        references = published.means(row["task"], row["metric"])
+        whole = frozenset(part["scenario"]) == published.scenarios
+        note = f"{'frame' if weighted else 'scenario'}-weighted over {len(part)} scenarios"
+        if references and not whole:
+            note += f"; published {references[0].value:g} over {len(published.scenarios)}"
+        elif len(references) > 1:
+            note += f"; paper: {references[1].value:g}"
+        mean = Finding(
+            check=row["check"],
+            scenario=MEAN,
+            quantity=row["metric"],
+            unit=UNITS[row["metric"]],
+            task=row["task"],
+            ours=float(row["frames" if weighted else "equal"]),
+            frames=int(part["frames"].sum()),
+            note=note,
+        )
+        found.append(_judged(mean, references[0] if references and whole else None))
+    return found

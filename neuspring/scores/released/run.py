@@ -1,0 +1,247 @@
+"""Conformance checks over scenarios, and their report: verify.md, verify.csv, and verify_frames.csv with distances per frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from neuspring.config.images import LpipsWeights
+from neuspring.core.artifacts import Observations
+from neuspring.core.device import resolve_device
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import write_text
+from neuspring.core.progress import Progress
+from neuspring.data.departure import Case
+from neuspring.data.phystwin import FINAL_DATA, SPLIT
+from neuspring.data.released import Released
+from neuspring.report.tables.summary import markdown
+from neuspring.scores.lpips import Lpips
+from neuspring.scores.lpips_weights import configured
+from neuspring.scores.released import images, physics
+from neuspring.scores.released.conformance import read_case
+from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, of_means, require
+
+CHECKS = {
+    2: "springs rebuilt from the searched parameters",
+    3: "scores of the released prediction",
+    4: "deprojection of the tracked pixels",
+    5: "scores of pictures of the released splats",
+    6: "replay of the released checkpoint",
+}
+OUTCOMES: tuple[Outcome, ...] = ("passed", "failed", "measured", "skipped")
+COLUMNS = (
+    *("check", "scenario", "task", "quantity", "unit", "ours", "published", "difference", "tolerance"),
+    *("outcome", "frames", "note"),
+)
+CASES = Path("data") / "different_types"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Everything that was found."""
+
+    findings: tuple[Finding, ...]
+    text: str
+
+    @property
+    def status(self) -> int:
+        """Exit status: 1 if a check failed, 2 if there was nothing to compare (skipped or measured alone), else 0."""
+        outcomes = Counter(finding.outcome for finding in self.findings)
+        return 1 if outcomes["failed"] else 0 if outcomes["passed"] else 2
+
+
+def verify_released(
+    root: Path,
+    output: Path,
+    *,
+    scenarios: Sequence[str] = (),
+    checks: Collection[int] = tuple(CHECKS),
+    device: str = "auto",
+    lpips: LpipsWeights | None = None,
+    published: Published | None = None,
+) -> Report:
+    """Check the released results below `root` (the folder that holds data, experiments, ...); write the report to folder `output`.
+
+    No scenarios: all that are there. A file that is not there skips a check of its scenario, a damaged one fails it; the others go
+    on, and the report is written after each. `published`: None for the numbers that ship. Raises InputError if there are no cases,
+    and for unknown scenarios, checks and devices.
+    """
+    present = _present(root)
+    if unknown := [name for name in scenarios if name not in present]:
+        raise InputError("--scenarios", f"must be folders of {root / CASES}: {', '.join(present)}", ", ".join(unknown))
+    if wrong := [check for check in checks if check not in CHECKS]:
+        raise InputError("--checks", f"must be of {', '.join(map(str, CHECKS))}", wrong)
+    device = resolve_device(device)
+    tools = _Tools(published or Published.load(), device, _metric(lpips or LpipsWeights(), device) if 5 in checks else "")
+    names, findings = list(dict.fromkeys(scenarios)) or present, list[Finding]()
+    progress = Progress("verify", len(names), every=0.0)
+    for done, name in enumerate(names, start=1):
+        case = Released(root=root, name=name)
+        seen = _observations(case)
+        for check in sorted(set(checks)):
+            findings += _guarded(case, check, seen, tools)
+        # After every scenario: all of them take hours on a CPU.
+        report = _report(findings, names[:done], tools)
+        _write(report, output)
+        progress.update(done, name)
+    return report
+
+
+@dataclass(frozen=True)
+class _Tools:
+    published: Published
+    device: str
+    lpips: Lpips | str
+
+
+def _report(findings: Sequence[Finding], names: Sequence[str], tools: _Tools) -> Report:
+    found = (*findings, *of_means(findings, tools.published))
+    return Report(findings=found, text=_text(found, names, tools.published, tools.device))
+
+
+def _metric(settings: LpipsWeights, device: str) -> Lpips | str:
+    weights = configured(settings)
+    # Their checksums have just been taken.
+    return weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
+
+
+def _present(root: Path) -> list[str]:
+    folder = root / CASES
+    if not folder.is_dir():
+        raise InputError(folder, "the released data must be there", "no such folder", "Name the folder that holds `data`.")
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if not names:
+        raise InputError(folder, "at least one case is required", "an empty folder")
+    return names
+
+
+class _Refused(Exception):
+    """The reader refuses the processed case."""
+
+
+def _observations(case: Released) -> Observations | Absent | _Refused:
+    """What the reader makes of the processed case, or why it makes nothing of it."""
+    try:
+        require(case.root, case.folder / FINAL_DATA, case.folder / SPLIT)
+    except Absent as reason:
+        return reason
+    inspected = Case(case.folder, case.root)
+    seen = read_case(inspected)
+    return seen if seen is not None else _Refused(inspected.found[-1].message)
+
+
+def _guarded(case: Released, check: int, seen: Observations | Absent | _Refused, tools: _Tools) -> list[Finding]:
+    """The findings of one check; one skipped or failed finding where it cannot be carried out."""
+
+    def ended(outcome: Outcome, reason: Exception) -> list[Finding]:
+        return [Finding(check=check, scenario=case.name, quantity=CHECKS[check], outcome=outcome, note=str(reason))]
+
+    try:
+        if isinstance(seen, Exception):
+            raise seen
+        return _check(check)(case, seen, tools)
+    except Absent as reason:
+        return ended("skipped", reason)
+    except (_Refused, InputError, NumericalFailure) as error:
+        return ended("failed", error)
+
+
+def _check(number: int) -> Callable[[Released, Observations, _Tools], list[Finding]]:
+    return {
+        2: lambda case, seen, tools: physics.topology(case, seen),
+        3: lambda case, seen, tools: physics.evaluator(case, seen, tools.published),
+        4: lambda case, seen, tools: images.deprojection(case, seen),
+        5: lambda case, seen, tools: images.renderer(case, seen, tools.lpips, tools.device, tools.published),
+        6: lambda case, seen, tools: physics.simulator(case, seen, tools.device),
+    }[number]
+
+
+def _write(report: Report, output: Path) -> None:
+    rows = [[getattr(finding, name) for name in COLUMNS] for finding in report.findings]
+    write_text(output / "verify.csv", pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(index=False))
+    traces = [
+        {"check": f.check, "scenario": f.scenario, "quantity": f.quantity, "frame": frame, "value": value, "unit": f.unit}
+        for f in report.findings
+        if f.per_frame is not None
+        for frame, value in enumerate(f.per_frame)
+    ]
+    frames = pd.DataFrame(traces, columns=["check", "scenario", "quantity", "frame", "value", "unit"])
+    write_text(output / "verify_frames.csv", frames.to_csv(index=False))
+    write_text(output / "verify.md", report.text)
+
+
+def _text(findings: Sequence[Finding], names: Sequence[str], published: Published, device: str) -> str:
+    """The report in Markdown: counts, means, every check, and what was skipped and why."""
+    there, missing = published.scenarios & set(names), sorted(published.scenarios - set(names))
+    of = f"{len(there)} of the {len(published.scenarios)} that means were published over"
+    # A few that are missing are worth their names; a few that are there are in the tables.
+    without = f" (without {', '.join(missing)})" if 0 < len(missing) < len(there) else ""
+    lines = [
+        "# Conformance with the released PhysTwin",
+        "",
+        f"Scenarios: {len(names)}, {of}{without}. Device: {device}.",
+        "Measured: there is no published number to compare with.",
+        "",
+        *_counts(findings),
+    ]
+    done = [finding for finding in findings if finding.outcome != "skipped"]
+    if means := [finding for finding in done if finding.scenario == MEAN]:
+        lines += ["", "## Means over scenarios", "", *_table(means)]
+    for check, title in CHECKS.items():
+        if own := [finding for finding in done if finding.check == check and finding.scenario != MEAN]:
+            lines += ["", f"## {check}: {title}", "", *_table(own), *(_conventions(own) if check == 4 else [])]
+    if reasons := _reasons(findings):
+        lines += ["", "## Skipped", "", *reasons]
+    return "\n".join([*lines, "", _verdict(findings), ""])
+
+
+def _counts(findings: Sequence[Finding]) -> list[str]:
+    rows = []
+    for check, title in CHECKS.items():
+        outcomes = Counter(finding.outcome for finding in findings if finding.check == check)
+        if outcomes:
+            rows.append([f"{check}: {title}", *(str(outcomes[name]) for name in OUTCOMES)])
+    return markdown(["Check", *(name.capitalize() for name in OUTCOMES)], rows)
+
+
+def _table(findings: Sequence[Finding]) -> list[str]:
+    header = ["Scenario", "Quantity", "Ours", "Published", "Difference", "Tolerance", "Unit", "Outcome", "Note"]
+    rows = []
+    for f in findings:
+        numbers = [_number(value) for value in (f.ours, f.published, f.difference, f.tolerance)]
+        quantity = f"{f.task} {f.quantity}".strip()
+        rows.append([f.scenario, quantity, *numbers, f.unit, f.outcome, f.note.replace("|", "/").replace("\n", " ")])
+    return markdown(header, rows)
+
+
+def _conventions(findings: Sequence[Finding]) -> list[str]:
+    """How many scenarios follow which convention."""
+    counts = Counter(finding.note for finding in findings if finding.note)
+    return ["", *(f"- {note}: {count} of {counts.total()} scenarios" for note, count in sorted(counts.items()))]
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:d}" if isinstance(value, int) else f"{value:.6g}"
+
+
+def _reasons(findings: Sequence[Finding]) -> list[str]:
+    """One line per check and reason, with the scenarios that it holds for."""
+    groups: dict[tuple[int, str], list[str]] = {}
+    for f in findings:
+        if f.outcome == "skipped":
+            what = "" if f.quantity == CHECKS[f.check] else f"{f.task} {f.quantity}: ".lstrip()
+            groups.setdefault((f.check, what + f.note.replace(f.scenario, "<case>")), []).append(f.scenario)
+    return [f"- {check}: {reason} ({len(names)}: {', '.join(names)})" for (check, reason), names in sorted(groups.items())]
+
+
+def _verdict(findings: Sequence[Finding]) -> str:
+    outcomes = Counter(finding.outcome for finding in findings)
+    counts = ", ".join(f"{outcomes[name]} {name}" for name in OUTCOMES)
+    failed = sorted({f"{f.scenario} ({f.check})" for f in findings if f.outcome == "failed"})
+    if failed:
+        return f"{counts}. Failed: {', '.join(failed)}."
+    return f"{counts}." if outcomes["passed"] else f"{counts}. Nothing could be compared."

@@ -1,0 +1,61 @@
+"""Studies: which methods stand in the rows of which of the paper's tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import StringConstraints
+
+from neuspring.config import parse, read_yaml
+from neuspring.config.types import STRICT, Name
+from neuspring.core.artifacts import SAFE_NAME
+from neuspring.core.errors import InputError
+from neuspring.scores import paper
+
+Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
+TAKEN = ("summary", "scores", "runs", "averages", "differences", "held", "transfers", "perception", "pictures")
+"""Files that other commands write into the folder of tables."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A row of studies.yaml: a table of methods that stand beside each other."""
+
+    __pydantic_config__ = STRICT
+    title: Text
+    reference: str | None
+    """A table of the paper, as paper_tables.csv names it; null: the paper gives no numbers."""
+    baseline: str
+    """Label of the row that the others are compared with, on the same scenarios and seeds."""
+    rows: dict[Text, Name]
+    """Label, as in the paper, to a row of the method table. Labels beyond the paper's are shown without its values."""
+
+    def __post_init__(self) -> None:
+        if self.baseline not in self.rows:
+            raise ValueError(f"baseline: must be a label of rows ({', '.join(self.rows)}), received {self.baseline!r}")
+        if len(set(self.rows.values())) != len(self.rows):
+            raise ValueError(f"rows: methods must differ, received {list(self.rows.values())}")
+        if self.reference is None:
+            return
+        if self.reference not in paper.tables():
+            raise ValueError(f"reference: must be null or one of {', '.join(paper.tables())}, received {self.reference!r}")
+        missing = [label for label in dict.fromkeys(label for label, _, _ in self.values) if label not in self.rows]
+        if missing:
+            raise ValueError(f"rows: the paper's {self.reference} also has {missing}; labels must be spelt as there")
+
+    @property
+    def values(self) -> paper.Values:
+        """What the paper prints; empty without a reference."""
+        return paper.table(self.reference) if self.reference else {}
+
+
+def read_studies(path: Path) -> dict[str, Study]:
+    """The table of studies: name -> Study. Raises InputError."""
+    studies = {name: parse(Study, row, f"{path}, study {name}") for name, row in read_yaml(path).items()}
+    for name in studies:
+        if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:
+            rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
+            raise InputError(f"{path}, study {name}", rule, repr(name), "Rename it.")
+    return studies

@@ -1,0 +1,1 @@
+"""The paper: topology, neural spring field, search, fit, prediction."""

@@ -1,0 +1,382 @@
+"""First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
+
+An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training
+span) one optimiser step is made with the gradient through those frames; the state is detached there and goes on while
+parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the
+training frames, to which the start counts too; test frames are never read. A non-finite loss or gradient restores the
+parameters of the epoch's start, halves the learning rates and is reported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from neuspring import config
+from neuspring.config import Kind
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.progress import Progress
+from neuspring.physics import stability
+from neuspring.physics.autograd import simulate_frame
+from neuspring.physics.solver import FrameSolver, Parameters
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.parameters import TwinParameters
+
+LOWEST_RATE = 0.01
+"""Where the cosine schedule ends, as a fraction of the learning rate."""
+MAX_ROLLBACKS = 5
+RELEASED_CHECKPOINT_EPOCHS = 20
+
+
+class NonFinite(ArithmeticError):
+    """A loss or gradient is not finite; says where."""
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """Everything that a fit is made from."""
+
+    observations: Observations
+    twin: Twin
+    fit: config.Fit
+    simulation: config.Simulation
+    losses: config.Losses
+    quirks: config.ReleasedQuirks
+    device: str = "cpu"
+    kind: Kind = "springs"
+    seed: int = 0
+    """Of the field's first weights."""
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate)."""
+
+    twin: Twin
+    history: pd.DataFrame
+    best_epoch: int
+    """The epoch whose end is the result; -1 is the start."""
+    best_loss: float
+    """What selected it: training loss or tail loss, m^2."""
+    rollbacks: list[str]
+    attempts: int
+    """1, plus one for every time the fit continued from a checkpoint."""
+    earlier_seconds: float
+    """Wall time of the attempts that this one continued, up to their last checkpoint."""
+    collision_overflow: int
+
+
+@dataclass
+class _State:
+    """Everything that a continued fit needs, and nothing else."""
+
+    epoch: int
+    values: dict[str, np.ndarray]
+    moments: dict[str, np.ndarray]
+    rate: float
+    history: list[dict[str, Any]]
+    rollbacks: list[str]
+    best_epoch: int
+    best_loss: float
+    best_values: dict[str, np.ndarray]
+    best_substeps: int
+    substeps: int
+    overflow: int = 0
+    attempts: int = 1
+    seconds: float = 0.0
+
+    def save(self, path: Path, key: str, seconds: float) -> None:
+        arrays = {f"values.{k}": v for k, v in self.values.items()} | {f"best.{k}": v for k, v in self.best_values.items()}
+        arrays |= {f"moments.{k}": v for k, v in self.moments.items()}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("values", "moments", "best_values")}
+        Checkpoint(arrays, plain | {"seconds": seconds}).save(path, key)
+
+    @classmethod
+    def load(cls, path: Path | None, key: str) -> _State | None:
+        found = Checkpoint.load(path, key, "the fit")
+        if found is None:
+            return None
+        arrays = found.arrays
+
+        def part(prefix: str) -> dict[str, np.ndarray]:
+            return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+
+        print(f"continuing the fit after epoch {found.values['epoch']}")
+        plain = found.values | {"attempts": found.values["attempts"] + 1}
+        return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **plain)
+
+
+class TwinFit:
+    """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
+
+    def __init__(self, problem: FitProblem) -> None:
+        self.problem = problem
+        observations, settings = problem.observations, problem.fit
+        self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
+        self.loss = FrameLoss.of(
+            observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators
+        )
+        end = observations.scenario.train_end
+        self.hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        held_back = round(settings.tail_fraction * (end - 1)) if settings.selection == "tail" else 0
+        if settings.selection == "tail" and end < 3:
+            raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
+        # At least one frame to train on and one to select by.
+        self.head_end = end - min(max(held_back, int(settings.selection == "tail")), end - 2)
+        self.horizon = settings.horizon or self.head_end - 1
+        self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
+        velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
+        self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
+        self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas)
+        self.twin = problem.twin
+        self._solver: FrameSolver | None = None
+        self._overflow = 0
+        self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
+        """The last spectrum that was computed, and for which stiffness and dashpots."""
+
+    @property
+    def one_step(self) -> bool:
+        """Whether an epoch is a single optimiser step, so that its losses belong to the values before it."""
+        return self.horizon >= self.head_end - 1
+
+    def solver(self) -> FrameSolver:
+        """The solver for the present number of substeps."""
+        if self._solver is None:
+            topology = self.twin.topology
+            counts = (len(topology.nodes), len(topology.controllers))
+            self._solver = FrameSolver(topology.springs, *counts, self.twin.simulation, device=self.problem.device)
+        return self._solver
+
+    @property
+    def collision_overflow(self) -> int:
+        """Collision candidates that did not fit the list, summed over all solvers so far."""
+        return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
+
+    def use_substeps(self, count: int) -> None:
+        """Integrate with `count` substeps per frame from now on."""
+        if count != self.twin.simulation.substeps:
+            self.twin = replace(self.twin, simulation=replace(self.twin.simulation, substeps=count))
+            self._overflow, self._solver = self.collision_overflow, None
+
+    def settled(self) -> Parameters:
+        """The present parameters, packed, after seeing that they can be integrated.
+
+        More substeps are taken where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
+        `max_substeps`) and the bound is passed.
+        """
+        packed = self.parameters.pack(self.twin.simulation.substep)
+        springs = packed.springs.detach().double().cpu().numpy()
+        if not np.isfinite(springs).all():
+            raise NonFinite("a spring's stiffness, rest length or dashpot is not finite")
+        count = self._needed_substeps(springs[:, 0] * springs[:, 1], springs[:, 2])
+        if count <= self.twin.simulation.substeps:
+            return packed
+        self.use_substeps(count)
+        return self.parameters.pack(self.twin.simulation.substep)
+
+    def _needed_substeps(self, stiffness: np.ndarray, dashpot: np.ndarray) -> int:
+        """Substeps per frame for stiffness Y / l0 [S] and dashpots [S]. Raises NonFinite."""
+        chosen, simulation = self.problem.simulation, self.twin.simulation
+        # Half of the safety margin is kept for the parameters' way to the next look.
+        enough = stability.LIMIT * (1 + chosen.safety) / 2
+        if self._known is not None:
+            # K and C grow at most as much as their fastest growing spring (sums of positive semidefinite terms).
+            known, k, c = self._known
+            grown = stability.Spectrum(known.stiffness * _growth(stiffness, k), known.damping * _growth(dashpot, c), known.node)
+            if grown.load(simulation.substep) < enough:
+                return simulation.substeps
+        topology = self.twin.topology
+        spectrum = stability.rest_spectrum(topology.springs, topology.nodes, topology.controllers, stiffness, dashpot)
+        self._known = (spectrum, stiffness, dashpot)
+        if spectrum.load(simulation.substep) < enough:
+            return simulation.substeps
+        count = stability.smallest_safe_substeps(spectrum, simulation.frame_time, chosen.safety)
+        may_grow = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
+        if may_grow and count <= chosen.max_substeps:
+            return count
+        if spectrum.load(simulation.substep) >= stability.LIMIT:
+            raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
+        return simulation.substeps
+
+    def start_epoch(self, epoch: int, rate: float) -> None:
+        """Set what an epoch trains, and the learning rates: the settings' times `rate` (halved by rollbacks)."""
+        settings = self.problem.fit
+        self.parameters.homogeneous = epoch < settings.homogeneous_epochs
+        factor = rate * min((epoch + 1) / (settings.warmup_epochs + 1), 1.0)
+        if settings.schedule == "cosine":
+            factor *= LOWEST_RATE + (1 - LOWEST_RATE) * (1 + math.cos(math.pi * epoch / settings.epochs)) / 2
+        for group in self.optimiser.param_groups:
+            group["lr"] = factor * group["base_rate"]
+
+    def epoch(self) -> dict[str, float]:
+        """One pass over the frames that are trained on; raises NonFinite.
+
+        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and, if
+        frames are held back and the epoch is one step, their `tail_loss` before it.
+        """
+        x, v = self.rest, self.velocity
+        total, largest, row = 0.0, 0.0, {}
+        for start in range(1, self.head_end, self.horizon):
+            window = range(start, min(start + self.horizon, self.head_end))
+            self.optimiser.zero_grad(set_to_none=True)
+            packed = self.settled()
+            x, v, mean = self._simulate(x, v, window, packed)
+            if not bool(torch.isfinite(mean)):
+                raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
+            objective = mean + self.parameters.penalty()
+            if objective.requires_grad:
+                objective.backward()  # type: ignore[no-untyped-call]
+            total += float(mean.detach()) * len(window)
+            x, v = x.detach(), v.detach()
+            if self.one_step and self.head_end < len(self.hands):
+                with torch.no_grad():
+                    row["tail_loss"] = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+            largest = max(largest, self._step(window))
+        return row | {"loss": total / (self.head_end - 1), "gradient_norm": largest}
+
+    def tail_loss(self) -> float:
+        """Mean loss of the held-back frames, m^2, in a rollout from rest with the present values. Raises NonFinite."""
+        with torch.no_grad():
+            packed = self.settled()
+            x, v = self.rest, self.velocity
+            for frame in range(1, self.head_end):
+                x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
+            loss = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+        if not math.isfinite(loss):
+            raise NonFinite("the loss of the held-back frames is not finite")
+        return loss
+
+    def _simulate(
+        self, x: torch.Tensor, v: torch.Tensor, window: range, packed: Parameters
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """State after the frames of `window`, and their mean loss."""
+        losses = []
+        for frame in window:
+            x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
+            losses.append(self.loss(frame, x))
+        return x, v, torch.stack(losses).mean()
+
+    def _step(self, window: range) -> float:
+        tensors = [tensor for tensor in self.parameters.parameters() if tensor.grad is not None]
+        norm = torch.nn.utils.get_total_norm([tensor.grad for tensor in tensors])  # type: ignore[misc]
+        if not bool(torch.isfinite(norm)):
+            raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
+        limit = self.problem.fit.clip_gradient_norm
+        if limit:
+            torch.nn.utils.clip_grads_with_norm_(tensors, limit, norm)
+        self.optimiser.step()
+        return float(norm)
+
+    def moments(self) -> dict[str, np.ndarray]:
+        """Adam's state as arrays; empty before the first step."""
+        state = self.optimiser.state_dict()["state"]
+        return {f"{index}.{name}": value.cpu().numpy().copy() for index, slots in state.items() for name, value in slots.items()}
+
+    def restore(self, values: dict[str, np.ndarray], moments: dict[str, np.ndarray]) -> None:
+        """Set parameters and Adam's state."""
+        self.parameters.restore(values)
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in moments.items():
+            index, _, slot = name.partition(".")
+            state.setdefault(int(index), {})[slot] = torch.from_numpy(value.copy())
+        stored = self.optimiser.state_dict()
+        stored["state"] = state
+        self.optimiser.load_state_dict(stored)
+
+
+def fit(
+    problem: FitProblem,
+    *,
+    partial: Path | None = None,
+    key: str = "",
+    on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
+) -> FitResult:
+    """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
+
+    `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. Raises
+    NumericalFailure if no epoch could be completed.
+    """
+    clock = time.perf_counter()
+    run = TwinFit(problem)
+    state = _State.load(partial, key)
+    if state is None:
+        initial = run.parameters.copy()
+        substeps = problem.twin.simulation.substeps
+        state = _State(0, initial, {}, 1.0, [], [], -1, math.inf, initial, substeps, substeps)
+        if problem.fit.selection == "tail" and not run.one_step:
+            # A start that cannot be simulated does not win; if no epoch can be completed either, that is said below.
+            with contextlib.suppress(NonFinite):
+                state.best_loss = run.tail_loss()
+    earlier, overflow = state.seconds, state.overflow
+    run.use_substeps(state.substeps)
+    run.restore(state.values, state.moments)
+    progress = Progress(f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}", problem.fit.epochs)
+    while state.epoch < problem.fit.epochs and len(state.rollbacks) < MAX_ROLLBACKS:
+        _advance(run, state, problem)
+        state.overflow = overflow + run.collision_overflow
+        last = state.history[-1]
+        progress.update(state.epoch, f"loss {last['loss']:.3e} m^2" if not last["rolled_back"] else "rolled back")
+        on_epoch(state.history)
+        if partial is not None and state.epoch % problem.fit.checkpoint_every == 0:
+            state.save(partial, key, earlier + time.perf_counter() - clock)
+    if not math.isfinite(state.best_loss):
+        raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
+    run.parameters.restore(state.best_values)
+    run.parameters.homogeneous = False
+    run.use_substeps(state.best_substeps)
+    best = run.parameters.as_twin(run.twin)
+    outcome = (state.best_epoch, state.best_loss, state.rollbacks, state.attempts, earlier, state.overflow)
+    return FitResult(best, pd.DataFrame(state.history), *outcome)
+
+
+def _growth(values: np.ndarray, reference: np.ndarray) -> float:
+    """The largest ratio of `values` to `reference` [S], both >= 0; infinite where something grew from nothing."""
+    ratio = np.divide(values, reference, out=np.where(values > 0, np.inf, 0.0), where=reference > 0)
+    return float(ratio.max(initial=0.0))
+
+
+def _advance(run: TwinFit, state: _State, problem: FitProblem) -> None:
+    """One epoch, or its rollback, recorded in `state`. Accepted values can always be integrated with `state.substeps`."""
+    row: dict[str, Any] = {"epoch": state.epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
+    run.start_epoch(state.epoch, state.rate)
+    row["learning_rate"] = run.optimiser.param_groups[0]["lr"]
+    try:
+        before = (state.values, state.substeps)
+        found = run.epoch()
+        run.settled()
+        if problem.fit.selection == "tail" and not run.one_step:
+            found["tail_loss"] = run.tail_loss()
+        state.values, state.moments, state.substeps = run.parameters.copy(), run.moments(), run.twin.simulation.substeps
+        row |= found
+        loss = found["tail_loss" if problem.fit.selection == "tail" else "loss"]
+        if _eligible(state.epoch, problem) and loss < state.best_loss:
+            state.best_loss = loss
+            state.best_epoch = state.epoch - run.one_step
+            state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
+    except NonFinite as failure:
+        state.rollbacks.append(f"epoch {state.epoch}: {failure}")
+        print(f"rolled back: {state.rollbacks[-1]}; the learning rates are halved")
+        state.rate /= 2
+        run.use_substeps(state.substeps)
+        run.restore(state.values, state.moments)
+        row["rolled_back"] = True
+    state.history.append(row)
+    state.epoch += 1
+
+
+def _eligible(epoch: int, problem: FitProblem) -> bool:
+    """Whether an epoch may become the best: all of them, or with the released quirk every 20th and the last."""
+    last = problem.fit.epochs - 1
+    return not problem.quirks.sparse_checkpoints or epoch % RELEASED_CHECKPOINT_EPOCHS == 0 or epoch == last

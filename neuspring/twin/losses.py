@@ -1,0 +1,101 @@
+"""Training losses (those of the released PhysTwin code), differentiable in the predicted nodes.
+
+Chamfer: mean over visible observed points of the squared Euclidean distance to the nearest surface node (assignment held
+fixed). Track: smooth-L1 (beta = 1 m) between node i and track i where the motion is valid, mean over points and axes.
+Acceleration: 0.01 x smooth-L1 between consecutive velocity changes, mean over nodes and axes; search only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch.nn.functional import smooth_l1_loss
+
+from neuspring.config import Losses
+from neuspring.core.artifacts import Observations
+
+CHUNK_ENTRIES = 1 << 22
+"""Distances computed at once in the nearest-node search; bounds memory."""
+
+
+def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
+    """Index [P] of the nearest node (Euclidean, lowest index on ties) for points [P, 3] among nodes [M, 3]."""
+    rows = max(1, CHUNK_ENTRIES // max(1, len(nodes)))
+    found = []
+    for chunk in points.split(rows):
+        squared = (chunk[:, None] - nodes[None]).square().sum(dim=2)
+        found.append(squared.argmin(dim=1))
+    return torch.cat(found) if found else torch.zeros(0, dtype=torch.long, device=points.device)
+
+
+def chamfer(
+    nodes: torch.Tensor, target: torch.Tensor, visible: torch.Tensor, surface: int, count: int | None = None
+) -> torch.Tensor:
+    """Squared Chamfer loss [m^2] from visible targets [P, 3] to the first `surface` nodes. 0 if nothing is visible.
+
+    `count` replaces the number of visible points as divisor (released quirk 4).
+    """
+    seen = target[visible]
+    if len(seen) == 0:
+        return nodes.sum() * 0.0
+    with torch.no_grad():
+        index = nearest(seen, nodes[:surface])
+    return (nodes[index] - seen).square().sum() / (len(seen) if count is None else max(count, 1))
+
+
+def track(nodes: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, count: int | None = None) -> torch.Tensor:
+    """Smooth-L1 track loss [m^2 below 1 m] between node i and target i where `valid` [P]. 0 if nothing is valid."""
+    total = smooth_l1_loss(nodes[: len(target)][valid], target[valid], reduction="sum", beta=1.0)
+    return total / (3 * max(int(valid.sum()) if count is None else count, 1))
+
+
+def acceleration(change: torch.Tensor, previous: torch.Tensor) -> torch.Tensor:
+    """Unweighted smoothness of motion: smooth-L1 between a frame's velocity change [N, 3] and that of the frame before."""
+    return smooth_l1_loss(change, previous, reduction="mean", beta=1.0)
+
+
+@dataclass(frozen=True)
+class FrameLoss:
+    """The observations of a scenario as tensors, and the loss of each training frame.
+
+    `frozen_counts` divides every frame by the valid counts of frame 1 (released quirk 4).
+    """
+
+    points: torch.Tensor
+    visible: torch.Tensor
+    motion_valid: torch.Tensor
+    surface: int
+    weights: Losses
+    frozen_counts: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        observations: Observations,
+        weights: Losses,
+        device: str,
+        dtype: torch.dtype = torch.float32,
+        *,
+        frozen_counts: bool = False,
+    ) -> FrameLoss:
+        """Keep training frames only: losses never see the future."""
+        end = observations.scenario.train_end
+        points = torch.tensor(observations.object_points[:end], dtype=dtype, device=device)
+        visible = torch.tensor(observations.object_visibility[:end], device=device)
+        valid = torch.tensor(observations.object_motion_valid[:end], device=device)
+        return cls(points, visible, valid, observations.surface_count, weights, frozen_counts)
+
+    def terms(self, frame: int, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(chamfer, track) of a frame >= 1, weighted. Frame t uses visibility[t] but motion_valid[t - 1]."""
+        seen = moved = None
+        if self.frozen_counts:
+            seen, moved = int(self.visible[1].sum()), int(self.motion_valid[0].sum())
+        target = self.points[frame]
+        near = self.weights.chamfer * chamfer(nodes, target, self.visible[frame], self.surface, seen)
+        return near, self.weights.track * track(nodes, target, self.motion_valid[frame - 1], moved)
+
+    def __call__(self, frame: int, nodes: torch.Tensor) -> torch.Tensor:
+        """Chamfer + track of a frame."""
+        near, moved = self.terms(frame, nodes)
+        return near + moved

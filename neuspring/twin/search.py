@@ -1,0 +1,359 @@
+"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
+
+Variables are normalised to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
+whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
+evaluated candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform
+topology, and the regions are freed around the best candidate found. Every candidate is kept in a trace, from which a killed
+search continues, or a finished one with a larger budget: CMA-ES is replayed with the recorded costs.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import cma
+import numpy as np
+import pandas as pd
+import torch
+
+from neuspring import config
+from neuspring.core.artifacts import Material, Observations, Simulation, Twin
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import write_atomically
+from neuspring.core.progress import Progress
+from neuspring.physics import stability
+from neuspring.twin.losses import FrameLoss, acceleration
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import Diverged, frames, solver_for
+from neuspring.twin.topology import isolated, piecewise_topology, regions
+
+INTEGERS = ("object_neighbours", "controller_neighbours")
+REGIONAL = ("object_radius", "object_neighbours")
+"""Variables of which every region has its own."""
+PENALTY = 1e6
+"""Cost of a candidate that diverges or cannot be integrated; far above any loss in square metres."""
+UNSTABLE = "unstable"
+RELEASED_FRAME_TIME = 667 * 5e-5
+RELEASED_SUBSTEPS = 667
+
+
+@dataclass(frozen=True)
+class SearchProblem:
+    """Everything that a candidate is judged with."""
+
+    observations: Observations
+    search: config.Search
+    simulation: config.Simulation
+    losses: config.Losses
+    quirks: config.ReleasedQuirks
+    device: str = "cpu"
+    clusters: int = 1
+    labels: np.ndarray = field(init=False)
+    """Region of each node [N]."""
+    velocity: np.ndarray = field(init=False)
+    """Velocity of each node in frame 0 [N, 3], m/s."""
+
+    def __post_init__(self) -> None:
+        nodes = self.observations.canonical[: len(self.observations.nodes)]
+        object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
+        object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables: those of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one region)."""
+        names: list[str] = []
+        for f in fields(config.SearchRanges):
+            regional = f.name in REGIONAL and self.clusters > 1
+            names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
+        return tuple(names)
+
+    def decode(self, normalised: np.ndarray) -> dict[str, float]:
+        """Physical values of normalised variables [2K + 10]; neighbour counts are truncated to integers."""
+        values = {}
+        for name, u in zip(self.variables, normalised, strict=True):
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
+            if self._logarithmic(base):
+                values[name] = float(low * (high / low) ** float(u))
+            else:
+                value = low + float(u) * (high - low)
+                values[name] = float(int(value)) if base in INTEGERS else value
+        return values
+
+    def encode(self) -> np.ndarray:
+        """Normalised variables [2K + 10] of the starting values."""
+        normalised = []
+        for name in self.variables:
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
+            value = getattr(self.search.start, base)
+            logarithmic = self._logarithmic(base)
+            normalised.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
+        return np.array(normalised)
+
+    def of_regions(self, values: dict[str, float], name: str) -> list[float]:
+        """A regional variable's value in each region."""
+        return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
+
+    def _logarithmic(self, name: str) -> bool:
+        return name == "stiffness" and self.search.stiffness_scale == "log"
+
+
+def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
+    """The scenario's simulation with a given number of substeps per frame."""
+    scenario, chosen = problem.observations.scenario, problem.simulation
+    return Simulation(
+        frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
+        substeps=substeps,
+        up=scenario.up,
+        gravity=chosen.gravity,
+        ground=scenario.ground,
+        self_collision=scenario.self_collision,
+        collision_capacity=chosen.collision_capacity,
+        controller_velocity=chosen.controller_velocity,
+        initial_velocity=chosen.initial_velocity,
+    )
+
+
+def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
+    """The twin with its substep count settled: 667 with the quirk, the configured count, or the smallest safe one.
+
+    Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
+    """
+    chosen = problem.simulation
+    if problem.quirks.frame_time_667 or chosen.substeps != "auto":
+        count = RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(chosen.substeps)
+        settled = replace(twin, simulation=replace(twin.simulation, substeps=count))
+        stability.check(settled)
+        return settled
+    count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, chosen.safety)
+    if count > chosen.max_substeps:
+        raise NumericalFailure(f"needs {count} substeps per frame, more than max_substeps = {chosen.max_substeps}")
+    return replace(twin, simulation=replace(twin.simulation, substeps=count))
+
+
+def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
+    """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
+    observations, rule = problem.observations, problem.search.isolated_nodes
+    topology = piecewise_topology(
+        observations.nodes,
+        observations.controller_points[0],
+        problem.labels,
+        problem.of_regions(values, "object_radius"),
+        [int(n) for n in problem.of_regions(values, "object_neighbours")],
+        values["controller_radius"],
+        int(values["controller_neighbours"]),
+        repair=rule == "repair",
+        rest_shape=observations.rest_shape,
+    )
+    count = len(topology.springs)
+    if count == 0:
+        raise NumericalFailure("no node has a spring")
+    lonely = isolated(len(topology.nodes), topology.springs)
+    if rule == "penalise" and len(lonely):
+        raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
+    material = Material(
+        stiffness=np.full(count, values["stiffness"]),
+        dashpot=np.full(count, values["dashpot"]),
+        drag=values["drag"],
+        ground_elasticity=values["ground_elasticity"],
+        ground_friction=values["ground_friction"],
+        contact_elasticity=values["contact_elasticity"],
+        contact_friction=values["contact_friction"],
+        contact_distance=values["contact_distance"],
+    )
+    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
+
+
+def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, int]:
+    """Mean training loss over frames 1 .. train_end - 1, acceleration term included, and the collision list's overflow.
+
+    Raises Diverged.
+    """
+    hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
+    before = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
+    previous: torch.Tensor | None = None
+    total = 0.0
+    solver = solver_for(twin, problem.device)
+    for frame, x, v in frames(twin, solver, hands, problem.velocity):
+        total += float(loss(frame, x))
+        change = v - before
+        if previous is not None:
+            total += problem.losses.acceleration * float(acceleration(change, previous))
+        before, previous = v, change
+    return total / (len(hands) - 1), solver.collision_overflow
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """The best twin found, its variables and cost, and the trace: one row per candidate."""
+
+    twin: Twin
+    values: dict[str, float]
+    cost: float
+    trace: pd.DataFrame
+    attempts: int
+    """1, plus one for every time the search continued from its record."""
+    earlier_seconds: float
+    """Wall time of the attempts that this one continued, up to their last complete generation."""
+
+
+def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
+    """Run the search within its budget of rollouts.
+
+    `record` is where the trace is kept, written after every generation; a file with the same `key` there is continued from,
+    whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
+    """
+    clock = time.perf_counter()
+    trace, attempts, earlier = _recorded(record, key)
+    known = len(trace)
+    proposals = _Proposals(problem, seed)
+    loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
+    budget = problem.search.rollouts
+    progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
+    done = 0
+    # The last generation may be cut short, so that searches of any population size use exactly the same budget.
+    while done < budget:
+        population = proposals.ask()[: budget - done]
+        if not _replays(trace[done : done + len(population)], population, problem.variables):
+            print(f"{record}: does not replay on this machine; the search continues afresh from rollout {done}")
+            trace, known = trace[:done], done
+            if not done:
+                attempts, earlier = 1, 0.0
+        for normalised in population[max(len(trace) - done, 0) :]:
+            trace.append(_evaluate(problem, normalised, loss, len(trace), proposals.generation))
+            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
+        done += len(population)
+        proposals.tell([row["cost"] for row in trace[done - len(population) : done]])
+        if record is not None and len(trace) > known:
+            _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
+    table = pd.DataFrame(trace[:budget])
+    best = table.iloc[int(table["cost"].to_numpy().argmin())]
+    if best["cost"] >= PENALTY:
+        if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
+            rule = f"at least one of {len(table)} candidates must be stable with this count"
+            raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
+        raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
+    values = {name: float(best[name]) for name in problem.variables}
+    if problem.quirks.integer_damping:
+        values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
+    return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+
+
+class _Proposals:
+    """The candidates that CMA-ES asks for, in all 2K + 10 normalised variables.
+
+    In the first `tied_rollouts` it moves in the 12 variables of the uniform topology; then it starts again in all of them, from
+    the best candidate so far. Free from the start, K regions are too many variables for a few hundred rollouts: on cables the
+    piecewise search then ended above the uniform one on training frames, although its space contains the other's.
+    """
+
+    def __init__(self, problem: SearchProblem, seed: int) -> None:
+        self._problem, self._seed = problem, seed
+        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
+        self._columns = np.arange(len(problem.variables))
+        """Which of the searched variables each variable takes its value from."""
+        searched = problem
+        if self._tied:
+            searched = replace(problem, clusters=1)
+            self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
+        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
+        self._asked: list[np.ndarray] = []
+        self._best = (np.inf, problem.encode())
+        self._done = 0
+        self.generation = -1
+
+    def ask(self) -> list[np.ndarray]:
+        """The next generation; the last one with tied regions may be cut short."""
+        if self._tied and self._done == self._tied:
+            self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
+            self._columns = np.arange(len(self._problem.variables))
+        self._asked = self._strategy.ask()
+        if self._done < self._tied:
+            self._asked = self._asked[: self._tied - self._done]
+        self.generation += 1
+        return [np.asarray(searched)[self._columns] for searched in self._asked]
+
+    def tell(self, costs: list[float]) -> None:
+        """Costs of the first candidates asked for last; CMA-ES learns from whole generations only."""
+        least = int(np.argmin(costs))
+        if costs[least] < self._best[0]:
+            self._best = (costs[least], np.asarray(self._asked[least])[self._columns])
+        self._done += len(costs)
+        if len(costs) == self._strategy.popsize:
+            self._strategy.tell(self._asked, costs)
+
+
+def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
+    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
+    options = {
+        "bounds": [0, 1],
+        "seed": seed + 1,
+        "verbose": -9,
+        "maxiter": np.inf,
+        "tolfun": 0,
+        "tolx": 0,
+        "tolstagnation": np.inf,
+    }
+    return cma.CMAEvolutionStrategy(start, sigma, options)
+
+
+def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
+    start = time.perf_counter()
+    values = problem.decode(normalised)
+    row: dict[str, Any] = {
+        "rollout": index,
+        "generation": generation,
+        "cost": PENALTY,
+        "reason": "",
+        "springs": 0,
+        "substeps": 0,
+        "collision_overflow": 0,
+    }
+    try:
+        twin = candidate(problem, values)
+        row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
+        value, row["collision_overflow"] = cost(problem, twin, loss)
+        row["cost"] = min(value, PENALTY)
+    except (Diverged, NumericalFailure) as failure:
+        row["reason"] = str(failure)
+    except stability.Unstable as failure:
+        # A fixed substep count that this candidate is too stiff for: penalised, like divergence.
+        row["reason"] = f"{UNSTABLE}: {failure}"
+    row["seconds"] = time.perf_counter() - start
+    return row | values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalised, strict=True)}
+
+
+def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
+    table = pd.DataFrame(trace)
+    table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
+    write_atomically(path, lambda p: table.to_parquet(p))
+
+
+def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
+    """(candidates, attempts, seconds) of a recorded search with this key; (nothing, 1, 0) if there is none."""
+    fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
+    if path is None or not path.is_file():
+        return fresh
+    try:
+        table = pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        print(f"{path}: unreadable ({error}); the search starts afresh")
+        return fresh
+    if table.attrs.get("key") != key:
+        print(f"{path}: made with other inputs or settings; the search starts afresh")
+        return fresh
+    print(f"continuing the search after {len(table)} rollouts")
+    records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+    return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
+
+
+def _replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
+    """Whether recorded candidates are those that CMA-ES asks for now."""
+    return all(
+        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), asked)
+        for row, asked in zip(rows, population, strict=False)
+    )

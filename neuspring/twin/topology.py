@@ -1,0 +1,187 @@
+"""From points to a spring graph (as the released PhysTwin code makes it), uniform or piecewise (the paper's piecewise topology).
+
+Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. The spring
+set is the union of all answers: a pair is kept if either side asks for it. In a piecewise topology each region of nodes has
+its own radius and number of neighbours; a node asks among all nodes, with its own region's values, so regions stay joined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from neuspring.config import Clusters
+from neuspring.core.artifacts import NO_REST_SHAPE, Topology, canonical_shape
+from neuspring.core.errors import InputError
+
+MIN_LENGTH = 1e-4
+"""Shorter object springs are not made, m."""
+REPAIR_SPRINGS = 3
+"""Springs given to a node that has none: the fewest that can hold a point in space."""
+
+
+def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
+    """Region of each node [N], 0 .. count - 1, by agglomerative clustering of nodes [N, 3], m.
+
+    Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter (unless
+    distances tie, as on a lattice).
+    Raises InputError if there are fewer nodes than regions, or than the connectivity graph needs.
+    """
+    if count < 1:
+        raise InputError("search.clusters", "at least one region is required", count)
+    if count == 1:
+        return np.zeros(len(nodes), np.int32)
+    least = max(count, settings.connectivity + 1)
+    if len(nodes) < least:
+        rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
+        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbours.")
+    # Here, since it takes longer to import than most commands that need a topology take to run.
+    from sklearn.cluster import AgglomerativeClustering
+    from sklearn.neighbors import kneighbors_graph
+
+    points = np.asarray(nodes, np.float64)
+    graph = None
+    if settings.connectivity:
+        asked = kneighbors_graph(points, settings.connectivity)
+        graph = asked.maximum(asked.T)
+    found = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
+    # Micrometres: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
+    centroids = np.round([points[found == label].mean(axis=0) for label in range(count)], 6)
+    number = np.empty(count, np.int32)
+    number[np.lexsort(centroids.T[::-1])] = np.arange(count)
+    labels: np.ndarray = number[found]
+    return labels
+
+
+def join(nodes: np.ndarray, springs: np.ndarray, lonely: np.ndarray) -> np.ndarray:
+    """The springs [S, 2], and behind them springs from each of the nodes `lonely` to its nearest nodes."""
+    if not len(lonely):
+        return springs
+    tree = cKDTree(nodes)
+    # Nodes at the same place, the lonely node among them, are no partners.
+    same = max(tree.query_ball_point(nodes[lonely], MIN_LENGTH, return_length=True))
+    k = min(REPAIR_SPRINGS + same, len(nodes))
+    distance, partner = tree.query(nodes[lonely], k=k)
+    usable = distance.reshape(len(lonely), k) > MIN_LENGTH
+    row, column = np.nonzero(usable & (usable.cumsum(axis=1) <= REPAIR_SPRINGS))
+    added = np.stack([lonely[row], partner.reshape(len(lonely), k)[row, column]], axis=1)
+    return _first_of_each(np.concatenate([springs, added]), len(nodes))
+
+
+def isolated(count: int, springs: np.ndarray) -> np.ndarray:
+    """Indices of nodes below `count` that no spring holds."""
+    return np.flatnonzero(np.bincount(springs.ravel(), minlength=count)[:count] == 0)
+
+
+def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Springs between object nodes, [S, 2], in the order in which they are first asked for.
+
+    Node i asks for its `neighbours[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
+    """
+    count = len(nodes)
+    k = int(min(neighbours.max(), count))
+    distance, partner = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=float(radius.max()))
+    distance, partner = distance.reshape(count, k), partner.reshape(count, k)
+    rank = np.arange(k)
+    # The first hit is the node itself (or an exact duplicate, which the length rule would refuse anyway).
+    asked = (rank > 0) & (rank < neighbours[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
+    first, column = np.nonzero(asked)
+    pairs = np.stack([first, partner[first, column]], axis=1)
+    return _first_of_each(pairs, count)
+
+
+def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Keep the first occurrence of every unordered pair."""
+    ordered = np.sort(pairs, axis=1)
+    _, index = np.unique(ordered[:, 0] * count + ordered[:, 1], return_index=True)
+    kept: np.ndarray = pairs[np.sort(index)]
+    return kept
+
+
+def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbours: int) -> np.ndarray:
+    """Springs from controllers to object nodes, [S, 2] as (N + controller, node)."""
+    k = min(neighbours, len(nodes))
+    distance, partner = cKDTree(nodes).query(controllers, k=k, distance_upper_bound=radius)
+    distance, partner = distance.reshape(len(controllers), k), partner.reshape(len(controllers), k)
+    controller, column = np.nonzero(distance < radius)
+    return np.stack([len(nodes) + controller, partner[controller, column]], axis=1)
+
+
+def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """Distance of the ends of each spring [S], m, in double precision."""
+    ends = points.astype(np.float64)[springs.reshape(-1, 2)]
+    found: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    return found
+
+
+def build(
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    springs: np.ndarray,
+    labels: np.ndarray | None = None,
+    rest_shape: np.ndarray = NO_REST_SHAPE,
+) -> Topology:
+    """A Topology whose rest lengths are the distances in the rest shape [N + C, 3], m, or in frame 0 (rounded to float32)."""
+    lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
+    if (lengths <= 0).any():
+        pair = springs[int(np.argmin(lengths))].tolist()
+        raise InputError(
+            "topology",
+            "a controller may not coincide with an object node",
+            f"zero-length spring {pair}",
+            "Move or drop that point.",
+        )
+    return Topology(
+        nodes=nodes,
+        controllers=controllers,
+        springs=springs.reshape(-1, 2).astype(np.int32),
+        rest_lengths=lengths,
+        labels=np.zeros(len(nodes), np.int32) if labels is None else labels,
+        rest_shape=rest_shape,
+    )
+
+
+def piecewise_topology(
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    labels: np.ndarray,
+    object_radius: Sequence[float],
+    object_neighbours: Sequence[int],
+    controller_radius: float,
+    controller_neighbours: int,
+    *,
+    repair: bool = False,
+    rest_shape: np.ndarray = NO_REST_SHAPE,
+) -> Topology:
+    """A radius [m] and a neighbour count (self included) per region; `labels` [N] says which region a node belongs to.
+
+    Neighbours are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
+    any spring, controllers' included, to their nearest nodes. Raises InputError if a controller coincides with a node.
+    """
+    canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
+    points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
+    inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbours)[labels])
+    outer = controller_springs(points, hands, controller_radius, controller_neighbours)
+    if repair:
+        inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
+    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]), labels, rest_shape)
+
+
+def uniform_topology(
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    object_radius: float,
+    object_neighbours: int,
+    controller_radius: float,
+    controller_neighbours: int,
+) -> Topology:
+    """One radius [m] and one neighbour count (self included) for the whole object.
+
+    Raises InputError if a controller coincides with a node.
+    """
+    one = np.zeros(len(nodes), np.int32)
+    return piecewise_topology(
+        nodes, controllers, one, [object_radius], [object_neighbours], controller_radius, controller_neighbours
+    )

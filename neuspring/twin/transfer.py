@@ -1,0 +1,52 @@
+"""A twin fitted on one recording, moved to another recording of the same object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.errors import InputError
+from neuspring.physics import stability
+from neuspring.twin.topology import distances
+
+
+def rebase(
+    twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
+) -> Twin:
+    """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its rest shape.
+
+    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape,
+    which is frame 0 unless the observations say otherwise. With `keep_lengths` it keeps the length itself: for trained ones,
+    which belong to the body and not to a first frame. Up, ground and, unless `keep_frame_time`, the frame time follow the
+    recording; more substeps are taken if the new distances need them. Raises InputError if the node or controller counts
+    differ, or a spring would have no length.
+    """
+    topology, scenario = twin.topology, observations.scenario
+    nodes, hands = observations.nodes, observations.controller_points[0]
+    for name, old, new in (("nodes", topology.nodes, nodes), ("controllers", topology.controllers, hands)):
+        if len(old) != len(new):
+            rule = f"a twin moves only to a recording of the same object with as many {name}: {len(old)}"
+            raise InputError(f"transfer to {scenario.name}", rule, len(new), "Sample both alike (mocap.rings).")
+    ratio = distances(observations.canonical, topology.springs) / distances(topology.canonical, topology.springs)
+    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else ratio)
+    if not (lengths > 0).all():
+        pair = topology.springs[int(np.argmin(lengths))].tolist()
+        raise InputError(
+            f"transfer to {scenario.name}", "the ends of a spring may not coincide in the rest shape", f"spring {pair}"
+        )
+    simulation = replace(
+        twin.simulation,
+        frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
+        up=scenario.up,
+        ground=scenario.ground,
+        self_collision=scenario.self_collision,
+    )
+    moved = Twin(
+        topology=replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape),
+        material=twin.material,
+        simulation=simulation,
+    )
+    count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
+    return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps)))

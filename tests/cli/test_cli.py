@@ -1,0 +1,114 @@
+"""The command line: exit status and messages."""
+
+import json
+
+import pytest
+
+from neuspring import config
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Observations
+from neuspring.core.device import resolve_device
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.experiments.tracking import log as tracking
+from tests.support.phystwin_case import write_case
+
+
+def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
+    settings = tmp_path / "small.yaml"
+    settings.write_text("toy: {frames: 5}\n")
+    output = tmp_path / "observations.npz"
+    arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/config.yaml,{settings}"]
+    assert main([*arguments, "--output", str(output)]) == 0
+    assert Observations.load(output).scenario.frame_count == 5
+
+
+TINY = {
+    "toy": {"frames": 5},
+    "search": {"rollouts": 2, "start": {"object_radius": 0.045, "stiffness": 1e4}},
+    "fit": {"epochs": 1, "field": {"channels": 2, "hidden": 4}},
+}
+
+
+def observed(folder):
+    """Observations of a tiny scene."""
+    row = {"scenario": "tiny", "source": "toy", "category": "rope", "path": "rope/lift/smooth"}
+    row |= {"self_collision": False, "ground": True}
+    path = folder / "observations.npz"
+    assert main(["observe", "--row", json.dumps(row), "--settings", json.dumps(TINY), "--output", str(path)]) == 0
+    return path
+
+
+def test_regions_and_fields_by_hand(tmp_path):
+    """Options reach the stages; without them a search is uniform, and a fit trains single springs."""
+    common = ["--observations", str(observed(tmp_path)), "--settings", json.dumps(TINY), "--device", "cpu"]
+    for name, options, kind, regions in (("plain", [], [], 1), ("ours", ["--clusters", "2"], ["--kind", "field"], 2)):
+        found, fitted = tmp_path / name / "search.json", tmp_path / name / "fit.json"
+        assert main(["search", *common, *options, "--seed", "3", "--output", str(found)]) == 0
+        assert main(["fit", *common, *kind, "--search", str(found), "--output", str(fitted)]) == 0
+        search, fit = StageRecord.load(found), StageRecord.load(fitted)
+        assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
+        assert ("object_radius.1" in search.facts) == (regions == 2)
+        assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
+
+
+@pytest.mark.parametrize("clusters", ["0", "1000"])
+def test_a_number_of_regions_that_cannot_be_is_bad_input(clusters, tmp_path, capsys):
+    arguments = ["--observations", str(observed(tmp_path)), "--clusters", clusters, "--output", str(tmp_path / "search.json")]
+    assert main(["search", *arguments, "--device", "cpu"]) == 2
+    assert "search.clusters" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fit", "--kind", "network", "--observations", "x.npz", "--search", "x.json", "--output", "y.json"],
+        ["search", "--clusters", "two", "--observations", "x.npz", "--output", "y.json"],
+    ],
+)
+def test_words_that_are_no_option_end_with_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert arguments[1] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["observe", "--scenario", "nothing", "--output", "x.npz"], "--scenario: must be a row of config/scenarios.tsv"),
+        (["observe", "--row", "{", "--output", "x.npz"], "--row: must be JSON"),
+        (["observe", "--row", "[]", "--output", "x.npz"], "--row: must be a JSON object; received list"),
+        (["observe", "--row", "{}", "--output", "x.npz"], "scenario: required, but missing"),
+        (["observe", "--scenario", "x", "--settings", '{"toy": {"framez": 3}}', "--output", "x.npz"], "toy.framez: unknown key"),
+        (["observe", "--scenario", "x", "--settings", "no.yaml", "--output", "x.npz"], "no.yaml: this file must be readable"),
+        (["search", "--observations", "no.npz", "--output", "x.json"], "no.npz: this file must be of kind observations"),
+        (["check-data", "no-such-folder"], "no-such-folder"),
+    ],
+)
+def test_bad_input_ends_with_status_2_and_says_why(arguments, message, capsys):
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_check_data_tells_errors_by_its_status(tmp_path, capsys):
+    case = write_case(tmp_path, "single_push_sloth_small")
+    assert main(["check-data", str(case)]) == 0
+    (case / "split.json").write_text(json.dumps({"frame_len": 5, "train": [0, 500], "test": [500, 900]}))
+    assert main(["check-data", str(case)]) == 2
+    assert "split.json" in capsys.readouterr().out
+
+
+def test_sync_reports_a_damaged_record(tmp_path, capsys):
+    tracking.init(tmp_path, config.Tracking())
+    record = tmp_path / "scene" / "method" / "0" / "run.json"
+    record.parent.mkdir(parents=True)
+    record.write_text("{}")
+    assert main(["sync", "--results", str(tmp_path)]) == 1
+    assert "damaged: 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:x", "cuda:-1", "CUDA:0", "cuda:99"])
+def test_a_device_that_is_not_there_is_an_error_not_a_fallback(device):
+    with pytest.raises(InputError, match="device"):
+        resolve_device(device)

@@ -1,0 +1,161 @@
+"""The configuration is strict: what is wrong is named with its path, nothing is cast, nothing is ignored."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neuspring.config import Config, parse, plain
+from neuspring.core import artifacts
+from neuspring.core.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+
+MINIMAL = "scenarios: [rope]\nmethods: [ours]\n"
+
+
+def load(text: str) -> Config:
+    return parse(Config, yaml.safe_load(MINIMAL + text), "config.yaml")
+
+
+def refused(text: str) -> str:
+    with pytest.raises(InputError) as caught:
+        load(text)
+    message = str(caught.value)
+    assert message.startswith("config.yaml: ")
+    return message
+
+
+# Defaults -------------------------------------------------------------------------------------------------------------
+
+
+def test_defaults_are_valid() -> None:
+    made = load("")
+    assert (made.scenarios, made.methods, made.seeds) == (("rope",), ("ours",), (0,))
+    assert made.simulation.substeps == "auto"
+    assert not any(dataclasses.asdict(made.released_quirks).values())
+
+
+def test_plain_settings_are_read_back() -> None:
+    """The whole default configuration, through plain values and YAML text, is itself."""
+    made = load("")
+    assert parse(Config, yaml.safe_load(yaml.safe_dump(plain(made))), "again") == made
+
+
+def test_values_reach_their_place() -> None:
+    made = load("simulation: {substeps: 40, gravity: 9}\nfit: {learning_rate: 1.0e-2, horizon: 0}\nseeds: [3, 1]\n")
+    assert made.simulation.substeps == 40
+    assert made.simulation.gravity == 9.0
+    assert (made.fit.learning_rate, made.fit.horizon, made.seeds) == (0.01, 0, (3, 1))
+
+
+# Mistakes -------------------------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "unknown key": ("fit: {learning_rat: 0.1}", "fit.learning_rat: unknown key"),
+    "unknown top key": ("sede: 1", "sede: unknown key"),
+    "number as text": (
+        "fit: {learning_rate: 5e-5}",
+        "fit.learning_rate",
+        "'5e-5' (YAML reads a number such as 5e-5 as text: write 5.0e-5)",
+    ),
+    "integer as text": ("fit: {epochs: '3'}", "fit.epochs", "received '3'"),
+    "float for a count": ("fit: {epochs: 2.5}", "fit.epochs", "received 2.5"),
+    "whole float for a count": ("fit: {epochs: 2.0}", "fit.epochs", "received 2.0"),
+    "truth for a count": ("fit: {epochs: true}", "fit.epochs", "received True"),
+    "number for a truth": ("tracking: {enabled: 1}", "tracking.enabled", "received 1"),
+    "nothing for a number": ("fit: {learning_rate: }", "fit.learning_rate", "received None"),
+    "zero rate": ("fit: {learning_rate: 0}", "fit.learning_rate", "greater than 0"),
+    "infinite rate": ("fit: {learning_rate: .inf}", "fit.learning_rate", "finite"),
+    "nan weight": ("losses: {track: .nan}", "losses.track", "finite"),
+    "negative weight": ("losses: {track: -1}", "losses.track", "greater than or equal to 0"),
+    "negative horizon": ("fit: {horizon: -1}", "fit.horizon", "received -1"),
+    "nan gravity": ("simulation: {gravity: .nan}", "simulation.gravity", "finite"),
+    "safety": ("simulation: {safety: 1.0}", "simulation.safety", "less than or equal to 0.95"),
+    "substeps word": ("simulation: {substeps: many}", "simulation.substeps", "'auto'"),
+    "no substeps": ("simulation: {substeps: 0}", "simulation.substeps", "received 0"),
+    "occlusion": ("toy: {occlusion: 1}", "toy.occlusion", "less than 1"),
+    "reversed range": (
+        "search: {ranges: {drag: [5, 1]}}",
+        "search.ranges",
+        "drag: 0 <= low < high is required, received [5.0, 1.0]",
+    ),
+    "negative range": ("search: {ranges: {drag: [-5, 1]}}", "drag: 0 <= low < high is required"),
+    "infinite range": ("search: {ranges: {drag: [0, .inf]}}", "search.ranges.drag", "finite"),
+    "range of one": ("search: {ranges: {drag: [5]}}", "search.ranges.drag"),
+    "always tied": ("search: {rollouts: 9, tied_rollouts: 9}", "tied_rollouts must be below rollouts (9), received 9"),
+    "start outside": ("search: {start: {drag: 50}}", "start.drag = 50.0 lies outside ranges.drag = [0.0, 20.0]"),
+    "clamp reversed": ("fit: {stiffness_range: [5, 1]}", "stiffness_range", "received [5.0, 1.0]"),
+    "betas": ("fit: {betas: [0.9, 1.5]}", "fit.betas", "less than 1"),
+    "log scale from zero": (
+        "search: {stiffness_scale: log}",
+        "stiffness_scale: log needs a positive lower bound of ranges.stiffness, received [0.0, 100000.0]",
+    ),
+    "linkage": ("search: {clusters: {linkage: nearest}}", "search.clusters.linkage", "received 'nearest'"),
+    "connectivity": ("search: {clusters: {connectivity: -1}}", "search.clusters.connectivity", "received -1"),
+    "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
+    "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
+    "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
+    "unknown field key": ("fit: {field: {layers: 3}}", "fit.field.layers: unknown key"),
+    "nothing to feed the network": (
+        "fit: {field: {triplane: false, fourier: feature}}",
+        "field.fourier: coordinates is required without the tri-plane, received feature",
+    ),
+    "rest length bound": ("fit: {rest_length_bound: 1}", "fit.rest_length_bound", "less than 1"),
+    "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
+    "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
+    "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),
+    "a password on command lines": (
+        "tracking: {uri: 'http://me:secret@host:5000'}",
+        "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",
+        "***@host",
+    ),
+    "device": ("device: gpu", "device", "received 'gpu'"),
+    "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
+    "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
+    "a mapping for a list": ("seeds: {a: 1}", "seeds"),
+    "a date": ("results: 2026-01-01", "values must be plain YAML"),
+}
+
+
+def test_the_results_folder_has_one_spelling() -> None:
+    assert load("results: ./out//a/").results == "out/a"
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(name: str) -> None:
+    text, *parts = MISTAKES[name]
+    message = refused(text)
+    for part in parts:
+        assert part in message
+
+
+def test_all_problems_are_listed_at_once() -> None:
+    message = refused("fit: {epochs: x, horizon: -1}\ntoy: {frames: 2}\n")
+    for path in ("fit.epochs", "fit.horizon", "toy.frames"):
+        assert path in message
+    assert "See config/README.md" in message
+
+
+@pytest.mark.parametrize("name", ["../up", "a b", "", "a/b", ".hidden", "-x", "a;rm", "é", "a\n", "x" * 81, "$HOME", "a*"])
+def test_unsafe_names(name: str) -> None:
+    """Names become folders and command-line words."""
+    for key in ("scenarios", "methods"):
+        with pytest.raises(InputError, match=f"{key}.0"):
+            parse(Config, yaml.safe_load(MINIMAL) | {key: [name]}, "config.yaml")
+    assert not artifacts.SAFE_NAME.fullmatch(name)
+
+
+@given(st.text(max_size=90))
+def test_configuration_and_artifacts_agree_on_names(name: str) -> None:
+    try:
+        parse(Config, {"scenarios": [name], "methods": ["ours"]}, "config.yaml")
+        accepted = True
+    except InputError:
+        accepted = False
+    assert accepted == bool(artifacts.SAFE_NAME.fullmatch(name))

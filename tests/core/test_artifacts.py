@@ -1,0 +1,352 @@
+"""Artefacts: what is saved is what is loaded, what is wrong is named, what is interrupted leaves the old file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from neuspring.core import artifacts
+from neuspring.core.artifacts import Artifact, Material, Observations, Scenario, Simulation, Topology, Trajectory, Twin
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from tests.support.scenarios import observations, scenario
+
+
+def topology(**changes: Any) -> Topology:
+    values: dict[str, Any] = {
+        "nodes": np.random.default_rng(0).random((4, 3)),
+        "controllers": np.ones((1, 3)),
+        "springs": np.array([[0, 1], [1, 2], [4, 3]]),
+        "rest_lengths": np.array([0.1, 0.2, 0.3]),
+        "labels": np.array([0, 0, 1, 1]),
+    }
+    return Topology(**(values | changes))
+
+
+def material(**changes: Any) -> Material:
+    values: dict[str, Any] = {"stiffness": np.array([1.0, 2.0, np.pi]), "dashpot": np.zeros(3), "drag": 0.1}
+    values |= dict.fromkeys(artifacts.SCALARS[1:], 0.3)
+    return Material(**(values | changes))
+
+
+def twin() -> Twin:
+    return Twin(topology=topology(), material=material(), simulation=Simulation(frame_time=1 / 30, substeps=7, up="-z"))
+
+
+def trajectory(**changes: Any) -> Trajectory:
+    return Trajectory(**({"positions": np.random.default_rng(1).random((3, 4, 3)), "frame_count": 3} | changes))
+
+
+MAKERS: dict[str, Any] = {
+    "scenario": lambda: scenario(provenance={"file": "a.pkl", "digest": "0f"}, ground=False, up="-z"),
+    "observations": lambda: observations(tracks=np.where(np.arange(10).reshape(5, 2, 1) % 3, 1 / 3, np.nan).repeat(3, axis=2)),
+    "topology": topology,
+    "material": material,
+    "twin": twin,
+    "trajectory": trajectory,
+    "diverged trajectory": lambda: trajectory(frame_count=9, diverged_frame=3, reason="node 0 left", collision_overflow=2),
+}
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Equal, bit for bit, field by field."""
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, Artifact):
+            assert_same(x, y)
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype == field.metadata["dtype"]
+            assert x.shape == y.shape
+            assert x.tobytes() == y.tobytes()
+        else:
+            assert x == y
+            assert type(x) is type(y)
+
+
+# Round trips ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_round_trip(name: str, tmp_path: Path) -> None:
+    made, path = MAKERS[name](), tmp_path / "new folder" / "it.npz"
+    made.save(path)
+    assert_same(type(made).load(path), made)
+    assert os.listdir(path.parent) == ["it.npz"]
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_there_is_no_pickle_inside(name: str, tmp_path: Path) -> None:
+    made, path = MAKERS[name](), tmp_path / "it.npz"
+    made.save(path)
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    assert not any(array.dtype.hasobject for array in arrays.values())
+    meta = json.loads(arrays["meta"].tobytes())
+    assert (meta["kind"], meta["format"]) == (made.kind, artifacts.FORMAT_VERSION)
+
+
+def test_saving_twice_gives_the_same_arrays(tmp_path: Path) -> None:
+    twin().save(tmp_path / "a.npz")
+    Twin.load(tmp_path / "a.npz").save(tmp_path / "b.npz")
+    assert_same(Twin.load(tmp_path / "b.npz"), twin())
+
+
+def test_arrays_are_copied_cast_and_frozen() -> None:
+    nodes = np.random.default_rng(0).random((4, 3))
+    made = topology(nodes=nodes)
+    nodes[:] = 0
+    assert made.nodes.any()
+    assert made.nodes.dtype == np.float32
+    with pytest.raises(ValueError, match="read-only"):
+        made.nodes[0] = 0
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        made.nodes = nodes  # type: ignore[misc]
+
+
+# Validation: the message names the field, the rule and the value ------------------------------------------------------
+
+BAD_ARRAYS = {
+    "dimensions": (lambda: topology(nodes=np.zeros(4)), r"topology\.nodes: the shape must be \[N, 3\] float32; received \(4,\)"),
+    "axis": (lambda: topology(nodes=np.zeros((4, 2))), r"topology\.nodes: .*axis 1 must have 3 entries; received \(4, 2\)"),
+    "agreement": (lambda: topology(rest_lengths=np.ones(2)), r"topology\.rest_lengths: .*axis 0 must have 3 entries"),
+    "dtype": (lambda: topology(springs=np.zeros((3, 2))), r"topology\.springs: the dtype must be int32; received float64"),
+    "not bool": (
+        lambda: observations(object_visibility=np.ones((5, 3), int)),
+        r"observations\.object_visibility: .*bool; received int64",
+    ),
+    "not numbers": (lambda: topology(nodes=np.ones((4, 3), bool)), r"topology\.nodes: the dtype must be float32; received bool"),
+    "text": (lambda: topology(labels=np.array(list("abcd"))), r"topology\.labels: the dtype must be int32"),
+    "nan": (
+        lambda: topology(nodes=np.full((4, 3), np.nan)),
+        r"topology\.nodes: every entry must be finite; received nan at index \(0",
+    ),
+    "inf": (lambda: material(stiffness=np.array([1, np.inf, 1])), r"material\.stiffness: .*received inf at index \(1,\)"),
+    "too large": (lambda: trajectory(positions=np.full((3, 4, 3), 1e300)), r"trajectory\.positions: every entry must be finite"),
+    "integers that do not fit": (lambda: topology(labels=np.full(4, 2**40)), r"topology\.labels"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+@pytest.mark.parametrize("name", BAD_ARRAYS)
+def test_wrong_arrays_are_named(name: str) -> None:
+    make, message = BAD_ARRAYS[name]
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+BAD_FIELDS = {
+    "scenario name": (lambda: scenario(name="../etc"), r"scenario\.name.*'\.\./etc'"),
+    "scenario name with newline": (lambda: scenario(name="a\n"), r"scenario\.name"),
+    "split": (lambda: scenario(train_end=9), r"scenario scene, split: 1 < train_end <= frame_count = 5.*train_end = 9"),
+    "no training": (lambda: scenario(train_end=1), r"split"),
+    "frame rate": (lambda: scenario(frame_rate=0.0), r"frame_rate: a positive number.*received 0"),
+    "infinite frame rate": (lambda: scenario(frame_rate=float("inf")), r"frame_rate"),
+    "up": (lambda: scenario(up="y"), r"up: must be '\+z' or '-z'; received 'y'"),
+    "frames": (
+        lambda: observations(scenario=scenario(frame_count=6)),
+        r"the scenario declares 6 frames; received arrays of 5 frames",
+    ),
+    "no points": (lambda: observations(points=0), r"at least one tracked object point"),
+    "no hand": (lambda: observations(controller_points=np.zeros((5, 0, 3))), r"at least one controller point.*Without a hand"),
+    "hidden at rest": (lambda: observations(object_visibility=np.zeros((5, 3), bool)), r"visible in frame 0.*3 of 3 are not"),
+    "index": (lambda: topology(springs=np.array([[0, 1], [1, 2], [5, 3]])), r"topology\.springs: indices must lie in \[0, 5\)"),
+    "negative index": (lambda: topology(springs=np.array([[-1, 1], [1, 2], [4, 3]])), r"indices must lie in"),
+    "order": (lambda: topology(springs=np.array([[0, 1], [4, 2], [1, 3]])), r"object springs must come before controller springs"),
+    "two hands": (
+        lambda: topology(controllers=np.ones((2, 3)), springs=np.array([[0, 1], [1, 2], [4, 5]])),
+        "may not join two controllers",
+    ),
+    "zero length": (lambda: topology(rest_lengths=np.array([0.1, 0.0, 0.3])), r"received 0\.0 m for spring 1 between \[1, 2\]"),
+    "negative stiffness": (
+        lambda: material(stiffness=np.array([1.0, -2, 1])),
+        r"material\.stiffness: must not be negative; received -2",
+    ),
+    "negative dashpot": (lambda: material(dashpot=np.array([1.0, -2, 1])), r"material\.dashpot"),
+    "drag": (lambda: material(drag=-1.0), r"drag >= 0"),
+    "nan friction": (lambda: material(ground_friction=float("nan")), r"material\.ground_friction: must be finite"),
+    "distance": (lambda: material(contact_distance=0.0), r"contact_distance > 0"),
+    "substeps": (lambda: Simulation(frame_time=0.1, substeps=0), r"simulation: .*substeps >= 1"),
+    "frame time": (lambda: Simulation(frame_time=0.0, substeps=1), r"frame_time > 0"),
+    "nan frame time": (lambda: Simulation(frame_time=float("nan"), substeps=1), r"frame_time > 0"),
+    "infinite frame time": (lambda: Simulation(frame_time=float("inf"), substeps=1), r"frame_time"),
+    "gravity": (lambda: Simulation(frame_time=0.1, substeps=1, gravity=float("nan")), r"finite gravity"),
+    "simulation up": (lambda: Simulation(frame_time=0.1, substeps=1, up="z"), r"up"),  # type: ignore[arg-type]
+    "one value per spring": (
+        lambda: Twin(
+            topology=topology(), material=material(stiffness=np.ones(2), dashpot=np.ones(2)), simulation=twin().simulation
+        ),
+        r"one stiffness per spring \(3\); received 2",
+    ),
+    "frames of a trajectory": (lambda: trajectory(frame_count=4), r"trajectory\.positions: 4 frames are expected; received 3"),
+    "frames of a diverged one": (lambda: trajectory(frame_count=9, diverged_frame=4), r"4 frames are expected; received 3"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FIELDS)
+def test_broken_rules_are_named(name: str) -> None:
+    make, message = BAD_FIELDS[name]
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_drifted_contact_scalars_are_accepted() -> None:
+    """Released checkpoints hold values just outside the clamps (quirk 5): clamped on use, not refused."""
+    assert material(ground_elasticity=-0.0103, contact_friction=2.0112).contact_friction == 2.0112
+
+
+def test_canonical_nodes() -> None:
+    given = observations()
+    np.testing.assert_array_equal(given.nodes[:, 0], [0, 1, 2, 0, 0])
+    assert given.surface_count == 4
+    assert topology().object_spring_count == 2
+
+
+# Reading other files --------------------------------------------------------------------------------------------------
+
+
+def rewrite(path: Path, **changes: Any) -> None:
+    """Change the meta text of a stored artefact."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    meta = json.loads(arrays["meta"].tobytes()) | changes
+    arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    np.savez(path, **arrays)
+
+
+def refuses(kind: type[Artifact], path: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        kind.load(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    refuses(Twin, tmp_path / "no.npz", "must be of kind twin; received no such file. Run the step that makes it first")
+    refuses(Twin, tmp_path, "no such file")
+
+
+def test_another_kind_or_version(tmp_path: Path) -> None:
+    path = tmp_path / "it.npz"
+    twin().save(path)
+    refuses(Trajectory, path, "must be of kind trajectory; received twin")
+    rewrite(path, format=99)
+    refuses(Twin, path, r"reads format 1; received 99\. Re-run")
+
+
+def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "old.npz"
+    topology().save(path)
+    with np.load(path) as stored:
+        np.savez(path, **{name: stored[name] for name in stored.files if name != "rest_shape"})
+    assert_same(Topology.load(path), topology())
+
+
+def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
+    made = topology()
+    points = len(made.nodes) + len(made.controllers)
+    assert len(topology(rest_shape=np.ones((points, 3))).canonical) == points
+    with pytest.raises(InputError, match=rf"topology\.rest_shape: one position per node and controller \({points}\)"):
+        topology(rest_shape=np.ones((points - 1, 3)))
+
+
+def test_missing_fields(tmp_path: Path) -> None:
+    path = tmp_path / "it.npz"
+    trajectory().save(path)
+    rewrite(path, fields={})
+    refuses(Trajectory, path, "every field of kind trajectory; received KeyError: 'frame_count'")
+    trajectory().save(path)
+    with np.load(path) as stored:
+        meta = stored["meta"]
+    np.savez(path, meta=meta)
+    refuses(Trajectory, path, "every field of kind trajectory.*positions")
+
+
+def damaged(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    refuses(Twin, path, r"must be readable, of kind twin.*Delete it and re-run its step")
+
+
+def test_truncated_files(tmp_path: Path) -> None:
+    path = tmp_path / "it.npz"
+    twin().save(path)
+    whole = path.read_bytes()
+    for length in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        damaged(path, whole[:length])
+
+
+def test_foreign_files(tmp_path: Path) -> None:
+    """Text, an npy, an npz without meta, an npz whose meta is no mapping, and a pickle."""
+    path = tmp_path / "it.npz"
+    damaged(path, b"hello")
+    for write in (
+        lambda f: np.save(f, np.zeros(3)),
+        lambda f: np.savez(f, a=np.zeros(3)),
+        lambda f: np.savez(f, meta=np.frombuffer(b"[1]", np.uint8)),
+        lambda f: np.savez(f, meta=np.frombuffer(b"\xff", np.uint8)),
+        lambda f: np.savez(f, meta=np.array([{}], dtype=object)),
+    ):
+        with path.open("wb") as stream:
+            write(stream)
+        damaged(path, path.read_bytes())
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_flipped_byte_is_refused_or_harmless(data: st.DataObject, tmp_path: Path) -> None:
+    path = tmp_path / "it.npz"
+    trajectory().save(path)
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(content) - 1))
+    content[at] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content)
+    try:
+        found = Trajectory.load(path)
+    except InputError:
+        return
+    assert_same(found, trajectory())
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "it.npz"
+    trajectory().save(path)
+    before = path.read_bytes()
+
+    def fail(stream: Any, **_: Any) -> None:
+        stream.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(KeyboardInterrupt):
+        trajectory(frame_count=9, diverged_frame=3).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["it.npz"]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    """Under a regular file, because root may write anywhere else."""
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"file/sub: this folder must be writable.*Choose another results folder"):
+        trajectory().save(tmp_path / "file" / "sub" / "it.npz")
+
+
+def test_text_is_written_atomically(tmp_path: Path) -> None:
+    write_text(tmp_path / "a" / "it.json", "Größe")
+    assert (tmp_path / "a" / "it.json").read_text(encoding="utf-8") == "Größe"
+    assert os.listdir(tmp_path / "a") == ["it.json"]
+
+
+def test_every_kind_has_a_name_of_its_own() -> None:
+    kinds = [Scenario, Observations, Topology, Material, Twin, Trajectory]
+    assert len({kind.kind for kind in kinds}) == len(kinds)

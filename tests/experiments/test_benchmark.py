@@ -1,0 +1,398 @@
+"""The tables of methods, searches and scenarios, and what is checked of a benchmark before any job."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from neuspring import config
+from neuspring.config import Config, Method, SearchRow, parse
+from neuspring.core.errors import InputError
+from neuspring.experiments import benchmark as tables
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.tuning.space import Plan
+from neuspring.scores.studies import read_studies
+
+ROOT = Path(__file__).parents[2]
+
+
+def load(text: str) -> Config:
+    return parse(Config, yaml.safe_load("scenarios: [rope]\nmethods: [ours]\n" + text), "config.yaml")
+
+
+# Methods --------------------------------------------------------------------------------------------------------------
+
+METHODS = """
+full: {search: uniform, fit: springs, description: both stages}
+coarse: {search: uniform, fit: null, description: search only}
+long:
+  search: uniform
+  fit: springs
+  description: through all frames
+  settings: {horizon: 0, epochs: 7}
+ours: {search: pieces, fit: field, description: x, settings: {output_bound: 1.5, field: {triplane: false}}}
+"""
+SEARCHES = """
+uniform: {clusters: 1, description: one region}
+pieces:
+  clusters: 5
+  description: five regions
+  settings: {rollouts: 33, clusters: {linkage: single}}
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_methods(tmp_path: Path) -> None:
+    found = tables.read_methods(write(tmp_path / "methods.yaml", METHODS))
+    assert list(found) == ["full", "coarse", "long", "ours"]
+    assert [method.fit for method in found.values()] == ["springs", None, "springs", "field"]
+    made = load("fit: {epochs: 3, learning_rate: 0.5}")
+    merged = tables.fit_of(made, found["long"], "long")
+    assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
+    assert tables.fit_of(made, found["full"], "full") == made.fit
+    assert made.fit.epochs == 3
+    ours = tables.fit_of(load("fit: {epochs: 3, field: {hidden: 8}}"), found["ours"], "ours")
+    assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
+
+
+def test_searches(tmp_path: Path) -> None:
+    found = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
+    assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
+    made = load("search: {rollouts: 44, sigma: 0.25, clusters: {connectivity: 4}}")
+    merged = tables.search_of(made, found["pieces"], "pieces")
+    assert (merged.rollouts, merged.sigma) == (33, 0.25)
+    assert (merged.clusters.linkage, merged.clusters.connectivity) == ("single", 4)
+    assert tables.search_of(made, found["uniform"], "uniform") == made.search
+
+
+BAD_SEARCHES = {
+    "no regions": ("a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
+    "missing": ("a: {description: x}", "search a.*clusters: required, but missing"),
+    "unknown": ("a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
+    "not a mapping": ("a: 3", "search a"),
+    "empty": ("", "must hold a YAML mapping; received NoneType"),
+}
+
+
+@pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"ranges": {"drag": [2, 1]}}])
+def test_bad_search_settings(settings: dict[str, Any]) -> None:
+    row = SearchRow(clusters=2, description="x", settings=settings)
+    with pytest.raises(InputError, match="search pieces, settings: "):
+        tables.search_of(load(""), row, "pieces")
+
+
+BAD_METHODS = {
+    "search": ("a: {search: ../up, fit: null, description: x}", r"method a.*search.*received '\.\./up'"),
+    "fit": ("a: {search: uniform, fit: network, description: x}", "method a.*fit.*'springs' or 'field', received 'network'"),
+    "missing": ("a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
+    "unknown": ("a: {search: uniform, fit: null, description: x, lr: 1}", "method a.*lr: unknown key"),
+    "not a mapping": ("a: 3", "method a"),
+    "empty": ("", "must hold a YAML mapping; received NoneType"),
+    "list": ("[a]", "must hold a YAML mapping; received list"),
+    "not YAML": ("a: [", "must be YAML"),
+}
+
+
+BAD_ROWS = [(tables.read_searches, *case) for case in BAD_SEARCHES.values()]
+BAD_ROWS += [(tables.read_methods, *case) for case in BAD_METHODS.values()]
+
+
+@pytest.mark.parametrize(("read", "text", "message"), BAD_ROWS, ids=[*map("search: {}".format, BAD_SEARCHES), *BAD_METHODS])
+def test_bad_tables_of_searches_and_methods(read: Callable[[Path], Any], text: str, message: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "rows.yaml", text)
+    with pytest.raises(InputError, match="(?s)" + message) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("settings", [{"horizont": 0}, {"epochs": "7"}, {"fit": {}}])
+def test_bad_method_settings(settings: dict[str, Any]) -> None:
+    method = Method(search="uniform", fit=None, description="x", settings=settings)
+    with pytest.raises(InputError, match="method long, settings: "):
+        tables.fit_of(load(""), method, "long")
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    """Missing, a folder, and not UTF-8."""
+    latin = tmp_path / "latin"
+    latin.write_bytes("# Größe\n".encode("latin-1"))
+    for read in (tables.read_methods, tables.read_searches, tables.read_scenarios):
+        for path in (tmp_path / "missing", tmp_path, latin):
+            with pytest.raises(InputError, match="must be readable") as caught:
+                read(path)
+            assert str(path) in str(caught.value)
+
+
+# Scenarios ------------------------------------------------------------------------------------------------------------
+
+HEADER = "scenario\tsource\tcategory\tpath\tself_collision\tground\n"
+ROW = "rope\ttoy\ttoy\trope\tfalse\ttrue\n"
+
+
+def test_scenarios(tmp_path: Path) -> None:
+    path = write(tmp_path / "scenarios.tsv", f"# a comment\n{HEADER}\n{ROW}# more\ncloth\tphystwin\tcloth\ta/b c\ttrue\tfalse\n")
+    rows = tables.read_scenarios(path)
+    assert list(rows) == ["rope", "cloth"]
+    assert (rows["rope"].ground, rows["rope"].self_collision, rows["cloth"].self_collision) == (True, False, True)
+    assert rows["cloth"].path == "a/b c"
+
+
+BAD_TABLES = {
+    "empty": ("", "the header must be"),
+    "header": ("name\tsource\n", r"the header must be the tab-separated columns \['scenario', 'source'"),
+    "spaces": (HEADER.replace("\t", " "), "the header must be"),
+    "cells": (HEADER + "rope\ttoy\n", "row 'rope': 6 tab-separated cells are required; received 2"),
+    "flag": (HEADER + ROW.replace("false", "no"), "row 'rope', self_collision: must be true or false; received no"),
+    "source": (HEADER + ROW.replace("\ttoy\ttoy", "\tweb\ttoy"), "(?s)row 'rope'.*source.*received 'web'"),
+    "name": (HEADER + "../" + ROW, r"(?s)row '\.\./rope'.*scenario"),
+    "twice": (HEADER + ROW + ROW, "row 'rope': scenario names must differ"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
+    text, message = BAD_TABLES[name]
+    path = write(tmp_path / "scenarios.tsv", text)
+    with pytest.raises(InputError, match=message) as caught:
+        tables.read_scenarios(path)
+    assert str(path) in str(caught.value)
+
+
+# A benchmark: the configuration with its tables -----------------------------------------------------------------------
+
+
+def benchmark(root: Path, **values: Any) -> Benchmark:
+    write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n")
+    write(root / "methods.yaml", METHODS)
+    write(root / "searches.yaml", SEARCHES)
+    write(root / "studies.yaml", "both: {title: t, reference: null, baseline: Plain, rows: {Plain: full, Later: not_there}}")
+    tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml", "search_table": "searches.yaml"}
+    tables["study_table"] = "studies.yaml"
+    return Benchmark.of({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
+
+
+def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
+    made = benchmark(tmp_path, methods=["long", "full"])
+    assert (list(made.scenarios), list(made.methods)) == (["rope"], ["long", "full"])
+    assert list(made.searches) == ["uniform"], "shared by both, and no other"
+    assert list(benchmark(tmp_path, methods=["ours", "coarse"]).searches) == ["pieces", "uniform"]
+    assert made.methods_of("both") == ("full",), "a row whose method does not exist is no error"
+    assert made.data_path("rope") is None
+    (tmp_path / "cable.csv").touch()
+    found = benchmark(tmp_path, scenarios=["cable"], data_root=str(tmp_path))
+    assert found.data_path("cable") == tmp_path / "cable.csv"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"scenarios": []}, "configuration, scenarios: at least one entry is required"),
+        ({"methods": []}, "configuration, methods: at least one entry is required"),
+        ({"seeds": []}, "configuration, seeds: at least one entry is required"),
+        ({"methods": ["ful"]}, r"every entry must be a row of methods\.yaml; received 'ful' \(did you mean 'full'\?\)"),
+        ({"scenarios": ["nothing"]}, r"every entry must be a row of scenarios\.tsv; received 'nothing'.*Known: rope, cable"),
+        ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
+        ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
+        ({"method_table": "missing.yaml"}, "must be readable"),
+        ({"search_table": "missing.yaml"}, "must be readable"),
+        ({"device": "gpu"}, "device"),
+        ({"transfers": {"rope": []}}, r"transfers\.rope: at least one other scenario is required.*received \[\]"),
+        ({"transfers": {"rope": ["rope"]}}, r"transfers\.rope: at least one other scenario"),
+        ({"transfers": {"rope": ["cable", "cable"]}}, r"transfers\.rope: .* each once"),
+        (
+            {"transfers": {"rope": ["cable"]}},
+            "cable must be of the same object as rope: source toy, category toy; received source mocap",
+        ),
+    ],
+)
+def test_a_benchmark_is_checked_before_any_job(values: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        benchmark(tmp_path, **values)
+
+
+@pytest.mark.parametrize("settings", ["{horizont: 0}", "{betas: [2, 2]}"])
+def test_settings_of_chosen_methods_are_checked_too(settings: str, tmp_path: Path) -> None:
+    text = f"full: {{search: uniform, fit: springs, description: x, settings: {settings}}}\n"
+    write(tmp_path / "bad.yaml", text)
+    with pytest.raises(InputError, match="method full, settings"):
+        benchmark(tmp_path, method_table="bad.yaml")
+
+
+def test_the_search_of_a_chosen_method_must_be_known(tmp_path: Path) -> None:
+    write(tmp_path / "bad.yaml", "full: {search: unifrom, fit: springs, description: x}\n")
+    message = r"every entry must be a row of searches\.yaml; received 'unifrom' \(did you mean 'uniform'\?\)"
+    with pytest.raises(InputError, match=message):
+        benchmark(tmp_path, method_table="bad.yaml")
+
+
+def test_settings_of_chosen_searches_are_checked_too(tmp_path: Path) -> None:
+    text = "uniform: {clusters: 1, description: x, settings: {rollout: 3}}\npieces: {clusters: 5, description: x}\n"
+    write(tmp_path / "bad.yaml", text)
+    with pytest.raises(InputError, match="search uniform, settings"):
+        benchmark(tmp_path, search_table="bad.yaml")
+    assert benchmark(tmp_path, search_table="bad.yaml", methods=["ours"]).methods, "rows that nobody names are not"
+
+
+def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
+    """A search's own bounds count, and a method without a second stage has no clamp."""
+    narrow = {"fit": {"stiffness_range": [0.0, 5e4]}}
+    with pytest.raises(
+        InputError, match=r"method full, fit\.stiffness_range: must hold .*0\.0 to 100000\.0.*; received \[0\.0, 50000\.0\]"
+    ):
+        benchmark(tmp_path, **narrow)
+    with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
+        benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
+    benchmark(tmp_path, methods=["coarse"], **narrow)
+    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [0.0, 4.0e+4]}}}\n"
+    write(tmp_path / "soft.yaml", text)
+    benchmark(tmp_path, search_table="soft.yaml", **narrow)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{description: x}", "either search or model is required, received search None and model None"),
+        ("{model: static, search: uniform, description: x}", "either search or model is required"),
+        (
+            "{model: gs_dynamics, fit: field, carry_over: true, description: x}",
+            "fit, carry_over: these belong to methods",
+        ),
+        ("{model: gs_dynamics, appearance: {}, description: x}", "only spring_gaus draws with splats of its own"),
+        ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none, received \['epochs'\]"),
+        ("{model: spring_gauss, description: x}", "model: .*'spring_gaus'"),
+        ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
+        (
+            "{model: spring_gaus, settings: {full_neighbours: 30}, description: x}",
+            "method bad, settings: .*full_neighbours: at most",
+        ),
+        ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
+        ("{model: gs_dynamics, settings: {min_visible: 5000}, description: x}", "method bad, settings: .*min_visible: at most"),
+        ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
+    ],
+)
+def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
+    write(tmp_path / "bad.yaml", f"bad: {row}\n")
+    with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
+        benchmark(tmp_path, method_table="bad.yaml", methods=["bad"])
+
+
+def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
+    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_ignore_hands"]
+    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": names}
+    values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
+    made = Benchmark.of(values, ROOT)
+    assert made.pictured == {"spring_gaus", "spring_gaus_ignore_hands"}
+    assert made.applies("spring_gaus", "synthetic_single_lift_rope")
+    assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
+    assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
+    left_out = ("toy_rope_lift_smooth",)
+    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_ignore_hands": left_out}
+    # The same splats are made once; who trains on points draws with those of all methods.
+    assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_ignore_hands": "spring_gaus"}
+    assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
+    blind = Benchmark.of(values | {"images": {"enabled": False}}, ROOT)
+    assert blind.whole_left_out["spring_gaus"] == tuple(values["scenarios"])
+
+
+def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) -> None:
+    rows = "".join(f"{name}\tmocap\tcable\tcable.csv\tfalse\ttrue\n" for name in ("one", "other"))
+    write(tmp_path / "cables.tsv", HEADER + rows)
+    (tmp_path / "cable.csv").touch()
+    chosen = {"scenarios": ["one"], "transfers": {"one": ["other"]}, "data_root": str(tmp_path), "scenario_table": "cables.tsv"}
+    with pytest.raises(InputError, match=r"mocap\.rings: must be set where twins are transferred"):
+        benchmark(tmp_path, **chosen, mocap={"rings": None})
+    assert benchmark(tmp_path, **chosen, mocap={"rings": 20}).transfers == {"one": ("other",)}
+
+
+def test_the_tables_of_the_project_are_valid_together() -> None:
+    """Every row of the method table, with the search that it names."""
+    root = ROOT
+    methods = tuple(tables.read_methods(root / "config" / "methods.yaml"))
+    values = config.read_yaml(root / "config" / "config.yaml")
+    made = Benchmark.of(values | {"methods": list(methods)}, root)
+    for name, method in made.methods.items():
+        if method.search:
+            tables.fit_of(made.config, method, name)
+            tables.search_of(made.config, made.searches[method.search], method.search)
+    for name in methods:
+        if name.startswith("clusters_"):
+            assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))
+
+
+@pytest.mark.parametrize(
+    "overlays",
+    [
+        [],
+        ["clusters"],
+        ["baselines"],
+        ["mocap", "baselines"],
+        ["mocap"],
+        ["mocap", "clusters"],
+        ["mocap", "mocap_first_frame"],
+        ["mocap", "mocap_free"],
+        ["mocap", "mocap_fine"],
+        ["mocap", "mocap_eval"],
+        ["mocap", "mocap_pieces"],
+        ["mocap", "mocap_field"],
+        ["mocap", "mocap_prediction"],
+        ["mocap", "one_seed"],
+        ["benchmark"],
+        ["benchmark", "tune"],
+        ["toy", "paper"],
+        ["toy", "tune"],
+        ["mocap", "paper"],
+        ["synthetic", "paper"],
+    ],
+)
+def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
+    values = {}
+    for name in ["config", *overlays]:
+        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
+    for row in tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values():
+        (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / row.path).touch()
+    benchmark = Benchmark.of(values | {"data_root": str(tmp_path)}, ROOT)
+    assert benchmark.compared_with in benchmark.methods
+    assert set(benchmark.fits) <= set(tables.read_methods(ROOT / "config" / "methods.yaml"))
+    if benchmark.config.tune:
+        assert Plan.of(benchmark.config, benchmark.config.tune, ROOT)
+
+
+def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
+    whole, paper = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("benchmark", "paper"))
+    assert {name: whole[name] for name in paper} == paper
+    studies = read_studies(ROOT / "config" / "studies.yaml")
+    assert list(studies) == paper["studies"]
+    known = set(tables.read_methods(ROOT / "config" / "methods.yaml"))
+    named = {method for study in studies.values() for method in study.rows.values()}
+    assert named & known <= set(paper["methods"])
+    rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values()
+    assert {row.scenario for row in rows if row.source == "phystwin"} == set(whole["scenarios"])
+
+
+def test_every_method_that_is_shipped_is_valid():
+    methods = tables.read_methods(ROOT / "config" / "methods.yaml")
+    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": list(methods)}
+    benchmark = Benchmark.of(values, ROOT)
+    # Rows that differ in the prediction alone, or in the name, share the fit.
+    shared = {name: owner for name, owner in benchmark.fit_of_method.items() if name != owner}
+    assert shared == {
+        "phystwin": "baseline",
+        "clusters_1": "model_b",
+        "clusters_5": "neuspring",
+        "baseline_carry_over": "baseline",
+        "model_b_carry_over": "model_b",
+        "plus_carry_over": "neuspring",
+        "plus_average": "neuspring",
+        "neuspring_plus_carry_over": "neuspring_plus",
+        "neuspring_plus_average": "neuspring_plus",
+    }

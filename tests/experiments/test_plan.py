@@ -1,0 +1,214 @@
+"""Expected cost of a run, from recorded times; what a cluster is asked for."""
+
+from types import SimpleNamespace
+
+import pytest
+from snakemake.resources import Resource
+
+from neuspring import config
+from neuspring.config.gpus import Gpus
+from neuspring.config.tuning import Tune
+from neuspring.core.errors import InputError
+from neuspring.core.job_records import Attempt, JobRecord
+from neuspring.experiments import needs, plan
+from neuspring.experiments.benchmark import Benchmark
+from tests.support.project import ROOT, config_with
+
+
+def record(rule, scenario, seconds, work=1.0, outcome="ok", devices=(), memory=0.0):
+    attempt = Attempt(
+        started="2026-01-01T00:00:00+00:00", seconds=seconds, outcome=outcome, devices=list(devices), peak_memory_mb=memory
+    )
+    return JobRecord(rule=rule, name=f"{rule}/{scenario}", log="", attempts=[attempt], scenario=scenario, work=work)
+
+
+def job(rule, scenario="rope", kind="cpu", work=1.0):
+    return plan.Planned(rule=rule, scenario=scenario, kind=kind, work=work)
+
+
+def test_times_scale_with_work_and_come_from_the_same_scenario_first():
+    records = [record("fit", "rope", 20, 100), record("fit", "cloth", 90, 100), record("fit", "toy", 40, 100)]
+    history = plan.History.of_records(records)
+    for scenario, seconds in {"rope": 0.2, "cloth": 0.9, "unknown": 0.4}.items():
+        found = plan.rate(job("fit", scenario), history, {})
+        assert found == plan.Rate(seconds=seconds, source="this results folder")
+
+
+def test_attempts_that_failed_say_nothing_of_time_but_of_memory():
+    history = plan.History.of_records([record("fit", "rope", 3, outcome="transient", memory=900.0)])
+    assert plan.rate(job("fit"), history, {}) is None
+    assert history.memory == {("fit", "cpu", ""): 900.0, ("fit", "cpu", "rope"): 900.0}
+
+
+def test_what_is_not_recorded_comes_from_the_shipped_times_and_says_so():
+    shipped = {("fit", "cpu"): plan.Rate(seconds=2.0, source="a demo")}
+    assert plan.rate(job("fit"), plan.History(), shipped) == plan.Rate(seconds=2.0, source="a demo")
+    found = plan.rate(job("fit", kind="gpu"), plan.History(), shipped)
+    assert found == plan.Rate(seconds=2.0, source="a demo, for want of a record on a GPU")
+    assert plan.rate(job("unheard_of"), plan.History(), shipped) is None
+
+
+def test_the_plan_counts_hours_slots_and_what_is_unknown():
+    history = plan.History.of_records([record("fit", "rope", 36, 10, devices=["0"]), record("observe", "rope", 36)])
+    jobs = [job("fit", kind="gpu", work=1000.0)] * 80 + [job("observe")] * 10 + [job("unheard_of")]
+    text = plan.report(jobs, history, {"gpu": 8, "cpu": 0})
+    assert "Expected: 91 jobs, 80.0 GPU-hours and 0.1 CPU-hours." in text
+    assert "fit: 80 jobs, 80.00 GPU-hours" in text
+    assert "with 8 GPU slots: at least 10.0 h" in text
+    assert "not counted: unheard_of" in text
+    assert plan.report([], history, {}) == ""
+
+
+def test_every_rule_that_takes_long_has_a_shipped_time():
+    rates = plan.shipped_rates()
+    assert {"capture", "segment", "track", "lift", "observe", "search", "fit", "rollout", "score"} <= {rule for rule, _ in rates}
+    assert {("search", "gpu"), ("fit", "gpu")} <= set(rates)
+    assert all(rate.seconds > 0 and rate.source for rate in rates.values())
+
+
+@pytest.fixture
+def benchmark(tmp_path):
+    changes = {"results": str(tmp_path), "methods": ["baseline"], "search": {"rollouts": 100}, "fit": {"epochs": 30}}
+    return Benchmark.of(config_with(changes), ROOT)
+
+
+def test_work_is_rollouts_or_epochs_times_training_frames(benchmark):
+    wanted = needs.Needs(benchmark, "cpu")
+    names = SimpleNamespace(scenario=benchmark.config.scenarios[0], search="uniform", method="baseline")
+    # 8 frames, of which 70 % are for training.
+    assert (wanted.search(names), wanted.fit(names), wanted.scenario(names)) == (100 * 6, 30 * 6, 8)
+
+
+def test_lengths_of_released_and_synthetic_scenes_are_known(tmp_path):
+    data = {"data_root": str(tmp_path)}
+    (tmp_path / "data/different_types/weird_package").mkdir(parents=True)
+    names = ["weird_package", "synthetic_weird_package"]
+    chosen = Benchmark.of(config_with(data | {"scenarios": names, "synthetic": {"frames": 30}}), ROOT)
+    wanted = needs.Needs(chosen, "cpu")
+    assert [wanted.frames(name) for name in names] == [39, 30]
+
+
+def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(benchmark, tmp_path):
+    wanted = needs.Needs(benchmark, "cpu")
+    memory, minutes = wanted.memory("fit", 8000), wanted.minutes("fit", 480, lambda _: 6000)
+    assert [memory(None, attempt) for attempt in (1, 2)] == [8000, 16000]
+    assert [minutes(None, attempt) for attempt in (1, 2)] == [480, 960]
+    record("fit", "rope", 125, 1000, memory=2000.0).save(tmp_path)
+    wanted = needs.Needs(benchmark, "cpu")
+    memory, minutes = wanted.memory("fit", 8000), wanted.minutes("fit", 480, lambda _: 4800)
+    rope, cloth = SimpleNamespace(scenario="rope"), SimpleNamespace(scenario="cloth")
+    # 0.125 s per unit: 600 s, times three. A second attempt is not held to what may have been too little.
+    assert [memory(rope, attempt) for attempt in (1, 2, 3)] == [3000, 16000, 24000]
+    assert [minutes(rope, attempt) for attempt in (1, 2)] == [30, 960]
+    # Of another scenario no more is known than that it may need as much.
+    assert [memory(cloth, 1), minutes(cloth, 1)] == [8000, 480]
+    record("fit", "sloth", 125, 1000, memory=20000.0).save(tmp_path)
+    memory = needs.Needs(benchmark, "cpu").memory("fit", 8000)
+    assert [memory(cloth, 1), memory(rope, 1)] == [30000, 3000]
+    # A job on the CPU says nothing of one on a GPU.
+    on_gpu = needs.Needs(benchmark, "gpu")
+    assert [on_gpu.memory("fit", 8000)(rope, 1), on_gpu.minutes("fit", 480, lambda _: 4800)(rope, 1)] == [8000, 480]
+
+
+@pytest.mark.parametrize(
+    ("visible", "settings", "device", "limit", "expected"),
+    [
+        ("0,1,2", {}, "auto", None, (("0", "1", "2"), 3)),
+        ("0,1,2", {"devices": [1, 2], "jobs_per_gpu": 2}, "cuda", None, (("1", "2"), 4)),
+        ("0,1,2", {"jobs_per_gpu": 2}, "cuda", 5, (("0", "1", "2"), 5)),
+        ("", {}, "auto", None, ((), 0)),
+        ("0,1", {}, "cpu", None, ((), 0)),
+    ],
+)
+def test_gpu_slots_are_those_that_the_user_allows(monkeypatch, visible, settings, device, limit, expected):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    chosen = config.parse(config.Config, {"gpus": settings}, "test").gpus
+    pool = needs.gpu_pool(chosen, device)
+    assert (pool, needs.gpu_slots(pool, chosen.jobs_per_gpu, limit) if pool else 0) == expected
+
+
+@pytest.mark.parametrize(
+    ("visible", "settings", "device", "limit", "message"),
+    [
+        ("0,1", {"devices": [1, 2]}, "cuda", None, "every device must be one that this run may use; received 2; allowed: 0, 1"),
+        ("", {}, "cuda", None, "device: cuda needs a GPU that this run may use, and there is none"),
+        ("0,1", {"jobs_per_gpu": 2}, "cuda", 5, r"there are 4 GPU slots \(2 GPUs, gpus.jobs_per_gpu 2\); received 5"),
+        ("0,1", {}, "cuda", 0, "jobs on a GPU need one; received 0"),
+    ],
+)
+def test_asking_for_more_than_there_is_ends_the_run_before_it_begins(monkeypatch, visible, settings, device, limit, message):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    chosen = config.parse(config.Config, {"gpus": settings}, "test").gpus
+    with pytest.raises(InputError, match=message):
+        needs.gpu_slots(needs.gpu_pool(chosen, device), chosen.jobs_per_gpu, limit)
+
+
+def test_a_plan_for_gpus_can_be_made_where_there_is_none(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert needs.gpu_pool(Gpus(), "cuda", plan_only=True) == ()
+
+
+def test_resources_set_for_a_rule_beyond_the_gpus_there_are_are_refused():
+    wishes = {"fit": {"gpu": Resource("gpu", 3)}, "search": {"mem_mb": Resource("mem_mb", 9000)}}
+    needs.check_gpus(wishes, ("0", "1", "2"))
+    with pytest.raises(InputError, match=r"--set-resources fit:gpu: .* there are 2 \(0, 1\); received 3"):
+        needs.check_gpus(wishes, ("0", "1"))
+
+
+def test_workers_on_several_machines_need_a_database_that_locks_across_them():
+    space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    study = {"study": "rate", "method": "baseline", "workers": 2, "space": space}
+    tune = config.parse(Tune, study, "test")
+    needs.check_storage(tune, cluster=False)
+    with pytest.raises(InputError, match="workers on several machines need storage"):
+        needs.check_storage(tune, cluster=True)
+    needs.check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
+    needs.check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
+
+
+def test_only_takes_a_part_by_scenario_category_method_and_seed():
+    names = ["toy_rope_lift_smooth", "toy_rope_shake_smooth", "toy_cloth_lift_smooth"]
+    all_of_it = {"scenarios": names, "methods": ["baseline", "clusters_2", "clusters_3"], "seeds": [0, 1, 2]}
+
+    def chosen(only):
+        part = Benchmark.of(config_with(all_of_it | {"only": only}), ROOT).config
+        return part.scenarios, part.methods, part.seeds
+
+    assert chosen("category=rope method=clusters_* seed=0,2") == (tuple(names[:2]), ("clusters_2", "clusters_3"), (0, 2))
+    assert chosen("scenario=*_lift_* category=cloth")[0] == ("toy_cloth_lift_smooth",)
+    assert chosen("")[0] == tuple(names)
+
+
+def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
+    part = {
+        "methods": ["search_only", "baseline"],
+        "seeds": [0, 1],
+        "compare_with": "baseline",
+        "only": "method=search_only seed=1",
+    }
+    made = Benchmark.of(config_with(part), ROOT)
+    assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
+    assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
+
+
+@pytest.mark.parametrize(
+    ("only", "message"),
+    [
+        ("category=ropes", "category 'ropes' matches none of the configuration's; received rope"),
+        ("method=neuspring", "method 'neuspring' matches none"),
+        ("colour=red", "terms scenario="),
+        ("seed", "terms scenario="),
+    ],
+)
+def test_a_part_that_is_not_there_is_explained(only, message):
+    with pytest.raises(InputError, match=message):
+        Benchmark.of(config_with({"only": only}), ROOT)
+
+
+def test_a_job_that_went_on_after_a_kill_took_as_long_as_all_its_attempts():
+    times = {"ok": 50.0, "killed": 900.0}
+    attempts = [
+        Attempt(started="2026-01-01T00:00:00+00:00", seconds=times[outcome], outcome=outcome) for outcome in ("ok", "killed", "ok")
+    ]
+    history = plan.History.of_records([JobRecord(rule="fit", name="fit/a", log="", attempts=attempts, scenario="rope", work=10.0)])
+    assert plan.rate(job("fit"), history, {}) == plan.Rate(seconds=95.0, source="this results folder")

@@ -1,0 +1,436 @@
+"""The MLflow index: complete, never doubled, never fatal, rebuilt from the files."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuspring.config import Tracking
+from neuspring.core.errors import InputError
+from neuspring.core.job_records import Attempt, JobRecord
+from neuspring.experiments.tracking import log as tracking
+from neuspring.experiments.tracking import query as tracking_query
+from neuspring.experiments.tracking import store as tracking_store
+from neuspring.experiments.tracking.payload import RunRecord, _system_metrics
+from tests.support import loggers
+from tests.support.stores import STEPS, write_run
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS = Tracking()
+STARTED_MS, ENDED_MS = 1795255200000, 1795255530000
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A migrated database. Making one takes seconds, copying it does not; its only experiment is not the one under test."""
+    results = tmp_path_factory.mktemp("template")
+    assert tracking.init(results, Tracking(experiment="template"))["outcome"] == "ready"
+    return results / "mlflow.db"
+
+
+@pytest.fixture
+def results(tmp_path: Path, template: Path) -> Path:
+    folder = tmp_path / "results"
+    folder.mkdir()
+    shutil.copy(template, folder / "mlflow.db")
+    return folder
+
+
+def client_of(results: Path) -> Any:
+    from mlflow import MlflowClient
+
+    return MlflowClient(tracking_uri=tracking.default_uri(results))
+
+
+def runs_of(results: Path) -> list[Any]:
+    client = client_of(results)
+    return list(client.search_runs([client.get_experiment_by_name(SETTINGS.experiment).experiment_id]))
+
+
+def artifacts_of(results: Path, run: Any) -> set[str]:
+    client = client_of(results)
+    top = [item.path for item in client.list_artifacts(run.info.run_id)]
+    return {item.path for name in top for item in client.list_artifacts(run.info.run_id, name)} | set(top)
+
+
+def python(code: str, *arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """Start a process that can import neuspring."""
+    environment = {name: value for name, value in os.environ.items() if name not in tracking_store.ENVIRONMENT}
+    environment["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, **options)
+
+
+def output(process: subprocess.Popen[str]) -> list[str]:
+    text, _ = process.communicate(timeout=240)
+    assert process.returncode == 0
+    return text.splitlines()
+
+
+def test_a_run_is_logged_completely_and_once(results: Path) -> None:
+    record = write_run(results)
+    assert tracking.log_run(record, results, SETTINGS) == "logged"
+    assert tracking.log_run(record, results, SETTINGS) == "already logged"
+    assert tracking.sync(results, SETTINGS) == {"already logged": ["rope/ours/0"]}, "also: run.json copies are not records"
+
+    (run,) = runs_of(results)
+    assert (run.info.run_name, run.info.status) == ("rope/ours/0", "FINISHED")
+    assert (run.info.start_time, run.info.end_time) == (STARTED_MS, ENDED_MS)
+    expected = {"scenario": "rope", "category": "toy", "source": "toy", "method": "ours", "seed": "0", "attempt": "1"}
+    expected |= {"status": "ok", "reason": "", "commit": "abc123", "data_digest": "d1", "device": "cpu", "logged": "complete"}
+    expected |= {"variant.search": "uniform", "variant.fit": "springs", "variant.clusters": "4", "variant.frozen": "False"}
+    expected |= {"run_key": json.loads(record.read_text())["run_key"]}
+    assert expected.items() <= run.data.tags.items()
+    assert "superseded_by" not in run.data.tags
+    assert len(run.data.params) == 122
+    assert (run.data.params["fit.p7"], run.data.params["fit.betas"], len(run.data.params["long"])) == ("7", "[0.9, 0.99]", 500)
+
+    metrics = run.data.metrics
+    assert metrics["future.track_error"] == 0.0125 and metrics["future.chamfer"] == 0.005 and metrics["seconds.fit"] == 12.5
+    assert metrics["train.chamfer"] != metrics["train.chamfer"], "a gap stays a gap"
+    client = client_of(results)
+    assert sorted(m.step for m in client.get_metric_history(run.info.run_id, "fit.loss")) == list(range(STEPS))
+    assert {m.step: m.value for m in client.get_metric_history(run.info.run_id, "search.best")} == {0: 3.0, 1: 2.0}
+    assert artifacts_of(results, run) == {"run.json", "twin", "twin/twin.npz", "search", "search/coarse.npz"}
+    assert (results / "mlartifacts").is_dir()
+
+
+def write_job(results: Path, name: str, *attempts: Attempt) -> None:
+    JobRecord(rule=name.partition("/")[0], name=name, log=f"logs/{name}.log", attempts=list(attempts)).save(results)
+
+
+def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) -> None:
+    """A job is found from the record of its stage, also where another method's fit, or splats of all methods, are shared."""
+    records = ["../../search-uniform/0/search.json", "../../owner/0/fit.json", "../../appearance/0/appearance.json", "rollout.json"]
+    for name in records:
+        path = results / "rope" / "ours" / "0" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    samples: list[list[float | None]] = [[0.5, 90.0, 400.0, 50.0, 900.0], [2.6, 110.0, 500.0, None, None]]
+    used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilisation": 50.0}
+    first = Attempt(started="2026-11-21T09:00:00+00:00", outcome="transient", peak_memory_mb=9999.0)
+    write_job(results, "search/rope/uniform/0", first, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", **used))
+    for name in ("fit/rope/owner/0", "appearance/rope/appearance/0", "score/rope/ours/0", "render/rope/ours/0"):
+        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=64.0))
+    artifacts = {"records": records}
+    assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
+
+    (run,) = runs_of(results)
+    found = {name.removeprefix("system/"): value for name, value in run.data.metrics.items() if name.startswith("system/")}
+    peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
+    whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
+    last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
+    assert found == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, "no rollout: it has no job record"
+    history = client_of(results).get_metric_history(run.info.run_id, "system/search.memory_mb")
+    begin = STARTED_MS - 30 * 60_000
+    assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
+
+    (results / "jobs" / "fit" / "rope" / "owner" / "0.json").write_text("{")
+    with pytest.raises(InputError, match=r"0\.json"):
+        tracking.log_run(write_run(results, artifacts=artifacts, run_key="ab" * 32), results, SETTINGS)
+
+
+def test_the_jobs_of_a_baseline_are_found_by_the_rules_that_made_them(results: Path) -> None:
+    records = ["train.json", "rollout.json", "../../appearance-ours/0/appearance.json"]
+    for name in records:
+        path = results / "rope" / "ours" / "0" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    for memory, name in enumerate(("train/rope/ours/0", "predict/rope/ours/0", "appearance/rope/appearance-ours/0"), 1):
+        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=float(memory)))
+    record = RunRecord.load(write_run(results, artifacts={"records": records}, variant={"model": "spring_gaus"}))
+    points = _system_metrics(record, results / "rope" / "ours" / "0" / "run.json", results)
+    assert {point.name: point.value for point in points if point.name.endswith("memory_mb")} == {
+        "system/train.peak_memory_mb": 1.0,
+        "system/rollout.peak_memory_mb": 2.0,
+        "system/appearance.peak_memory_mb": 3.0,
+    }
+
+
+def test_batches_stay_within_the_limits_of_the_api(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mlflow import MlflowClient
+
+    sizes: list[tuple[int, int]] = []
+    log_batch = MlflowClient.log_batch
+
+    def spy(self: Any, run_id: str, metrics: Any = (), params: Any = ()) -> None:
+        sizes.append((len(metrics), len(params)))
+        log_batch(self, run_id, metrics, params)
+
+    monkeypatch.setattr(MlflowClient, "log_batch", spy)
+    assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
+    assert sizes == [(0, 100), (0, 22), (1000, 0), (STEPS + 7 - 1000, 0)], "7: scores, a timing, the search's history"
+
+
+def test_a_failed_run_is_logged_as_failed(results: Path) -> None:
+    record = write_run(results, status="failed", reason="diverged at frame 3", scores_file=None, histories={}, artifacts={})
+    assert tracking.log_run(record, results, SETTINGS) == "logged"
+    assert tracking.log_run(record, results, SETTINGS) == "already logged"
+    (run,) = runs_of(results)
+    assert (run.info.status, run.data.tags["reason"], run.data.tags["status"]) == ("FAILED", "diverged at frame 3", "failed")
+    assert set(run.data.metrics) == {"seconds.fit"}
+
+
+def test_a_killed_logger_leaves_one_closed_and_one_complete_run(results: Path, tmp_path: Path) -> None:
+    record, mark = write_run(results), tmp_path / "uploading"
+    code = """
+import sys, time
+from pathlib import Path
+from neuspring.experiments.tracking import log as tracking
+from neuspring.config import Tracking
+from mlflow import MlflowClient
+
+def hang(*_):
+    Path(sys.argv[3]).touch()
+    time.sleep(60)
+
+MlflowClient.log_artifact = hang
+tracking.log_run(Path(sys.argv[1]), Path(sys.argv[2]), Tracking())
+"""
+    logger = python(code, record, results, mark)
+    deadline = time.monotonic() + 30
+    while not mark.exists():
+        assert time.monotonic() < deadline and logger.poll() is None
+        time.sleep(0.05)
+    (alive,) = runs_of(results)
+    client = client_of(results)
+    assert not tracking._close_if_free(client, alive, tracking_store.lock_path(results, alive.data.tags["run_key"]))
+    logger.send_signal(signal.SIGKILL)
+    logger.wait()
+
+    assert tracking.sync(results, SETTINGS) == {"closed": ["rope/ours/0"], "logged": ["rope/ours/0"]}
+    states = {run.info.status: run.data.tags for run in runs_of(results)}
+    assert set(states) == {"KILLED", "FINISHED"} and len(runs_of(results)) == 2
+    assert states["KILLED"]["superseded"] == "true" and "logged" not in states["KILLED"]
+    assert states["FINISHED"]["logged"] == "complete"
+    assert tracking.sync(results, SETTINGS) == {"already logged": ["rope/ours/0"]}
+
+
+@pytest.mark.parametrize("status", ["RUNNING", "FINISHED"])
+def test_log_run_closes_leftovers_of_its_record(results: Path, status: str) -> None:
+    """FINISHED without the last tag: killed between the two last requests."""
+    record = write_run(results)
+    tracking.init(results, SETTINGS)
+    client = client_of(results)
+    experiment = client.get_experiment_by_name(SETTINGS.experiment).experiment_id
+    leftover = client.create_run(experiment, tags={"run_key": json.loads(record.read_text())["run_key"]}).info.run_id
+    stranger = client.create_run(experiment, run_name="not of NeuSpring").info.run_id
+    if status != "RUNNING":
+        client.set_terminated(leftover, status)
+    assert tracking.log_run(record, results, SETTINGS) == "logged"
+    assert client.get_run(leftover).info.status == "KILLED"
+    assert client.get_run(leftover).data.tags["superseded"] == "true"
+    assert tracking.sync(results, SETTINGS) == {"already logged": ["rope/ours/0"]}
+    assert client.get_run(stranger).info.status == "RUNNING"
+
+
+def test_sync_leaves_runs_of_other_results_folders_alone(results: Path, tmp_path: Path) -> None:
+    shared = Tracking(uri=tracking.default_uri(results))
+    other = tmp_path / "other"
+    tracking.init(results, shared)
+    client = client_of(results)
+    experiment = client.get_experiment_by_name(SETTINGS.experiment).experiment_id
+    running = client.create_run(experiment, tags={"run_key": "0123456789abcdef"}).info.run_id
+    assert tracking.sync(other, shared) == {}
+    assert client.get_run(running).info.status == "RUNNING"
+
+
+def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    away = Tracking(uri=f"http://secret@127.0.0.1:{port}")
+    records = [write_run(results, seed=seed) for seed in range(3)]
+    start = time.monotonic()
+    outcome = tracking.log_run(records[0], results, away)
+    assert outcome.startswith("unreachable: ")
+    assert tracking.init(results, away)["outcome"].startswith("unreachable: ")
+    ((word, names),) = tracking.sync(results, away).items()
+    assert word.startswith("unreachable: ") and len(names) == 3
+    assert time.monotonic() - start < 15
+    text = capsys.readouterr().err
+    assert "warning: tracking: unreachable" in text and "secret" not in text + outcome
+
+    said = records[0].with_name("mlflow.txt")
+    said.write_text(f"{outcome}\n")
+    assert tracking.sync(results, SETTINGS) == {"logged": [f"rope/ours/{seed}" for seed in range(3)]}
+    assert said.read_text() == "logged\n", "the workflow must not count the run as waiting for ever"
+    assert not records[1].with_name("mlflow.txt").exists()
+
+
+@pytest.mark.parametrize("damage", ["text", "postgres"])
+def test_a_damaged_database_or_absent_host_fails_at_once(results: Path, damage: str) -> None:
+    """MLflow itself would retry these for about two minutes."""
+    settings = SETTINGS
+    if damage == "text":
+        (results / "mlflow.db").write_text("not a database " * 100)
+    else:
+        settings = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
+    start = time.monotonic()
+    assert tracking.log_run(write_run(results), results, settings).startswith("unreachable: ")
+    assert tracking.init(results, settings)["outcome"].startswith("unreachable: ")
+    assert "secret" not in tracking.init(results, settings)["uri"]
+    assert time.monotonic() - start < 10
+
+
+def test_a_server_that_fails_midway_leaves_nothing_double(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mlflow import MlflowClient
+
+    record = write_run(results)
+    with monkeypatch.context() as patched:
+        patched.setattr(MlflowClient, "log_artifact", lambda *_: (_ for _ in ()).throw(OSError("No space left on device")))
+        assert tracking.log_run(record, results, SETTINGS) == "unreachable: No space left on device"
+    assert tracking.log_run(record, results, SETTINGS) == "logged"
+    assert sorted(run.info.status for run in runs_of(results)) == ["FINISHED", "KILLED"]
+
+
+def test_processes_that_log_the_same_records_at_once_double_none(results: Path, tmp_path: Path) -> None:
+    records = [write_run(results, scenario=f"s{i}") for i in range(8)]
+    assert loggers.start([records] * 4, results, SETTINGS, tmp_path).wait(300) == 0, (tmp_path / "stderr").read_text()
+    words = [word for _, word, _ in loggers.outcomes(tmp_path)]
+    assert sorted(words) == ["already logged"] * 24 + ["logged"] * 8
+    runs = runs_of(results)
+    assert len(runs) == 8 and {run.data.tags["scenario"] for run in runs} == {f"s{i}" for i in range(8)}
+    assert {run.info.status for run in runs} == {"FINISHED"}
+
+
+def test_results_that_another_commit_made_again_are_one_run_of_both(results: Path) -> None:
+    assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
+    again = write_run(results, commit="def456-dirty", ended="2026-11-21T12:00:00+00:00")
+    for _ in range(2):
+        assert tracking.log_run(again, results, SETTINGS) == "already logged"
+    (run,) = tracking_query.logged_runs(results, SETTINGS)
+    assert run.commits == {"abc123": ENDED_MS, "def456-dirty": STARTED_MS + 2 * 3600_000}
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_newest_record_supersedes_whatever_the_order(results: Path, order: tuple[int, int]) -> None:
+    versions: list[dict[str, Any]] = [
+        {"run_key": "aa" * 32, "ended": "2026-11-21T11:00:00+00:00"},
+        {"run_key": "bb" * 32, "ended": "2026-11-21T12:00:00+00:00"},
+    ]
+    write_run(results, scenario="other")
+    tracking.sync(results, SETTINGS)
+    for i in order:
+        assert tracking.log_run(write_run(results, **versions[i]), results, SETTINGS) == "logged"
+    pointers = {run.data.tags["run_key"][:2]: run.data.tags.get("superseded_by") for run in runs_of(results)}
+    assert pointers.pop("aa") == "bb" * 32
+    assert list(pointers.values()) == [None, None], "neither the newest nor another scenario's run"
+
+    # The settings change back: the older content is on disk again, made anew, and already in MLflow.
+    record = write_run(results, **versions[0] | {"ended": "2026-11-21T13:00:00+00:00"})
+    assert tracking.log_run(record, results, SETTINGS) == "already logged"
+    pointers = {run.data.tags["run_key"][:2]: run.data.tags.get("superseded_by") for run in runs_of(results)}
+    assert (pointers["aa"], pointers["bb"]) == (None, "aa" * 32)
+
+
+def test_damaged_records_are_input_errors(results: Path) -> None:
+    good = json.loads(write_run(results).read_text())
+
+    def message(**changes: Any) -> str:
+        record = write_run(results, **changes)
+        with pytest.raises(InputError) as caught:
+            tracking.log_run(record, results, SETTINGS)
+        return str(caught.value)
+
+    assert "run_key" in message(run_key="../../etc")
+    assert "status" in message(status="fine") and "seed" in message(seed="0")
+    assert "format 1" in message(format=2)
+    assert "no such file" in message(artifacts={"twin": ["gone.npz"]})
+    assert "different file names" in message(artifacts={"twin": ["twin.npz", "../0/twin.npz"]})
+    assert "Parquet" in message(histories={"fit": "twin.npz"}) and "columns step" in message(histories={"fit": "scores.parquet"})
+    assert "names of" in message(params={"a=b": 1})
+    path = results / "rope" / "ours" / "0" / "run.json"
+    del good["started"]
+    for text in ("{", "[]", json.dumps(good)):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"run\.json"):
+            tracking.log_run(path, results, SETTINGS)
+    with pytest.raises(InputError, match="readable"):
+        tracking.log_run(results / "none" / "run.json", results, SETTINGS)
+
+    write_run(results, seed=1)
+    lines: list[str] = []
+    assert tracking.sync(results, SETTINGS, lines.append) == {"damaged": ["rope/ours/0"], "logged": ["rope/ours/1"]}
+    assert lines == ["rope/ours/0: damaged", "rope/ours/1: logged"]
+    assert len(runs_of(results)) == 1, "nothing was sent of the damaged ones"
+
+
+def test_init_twice_and_by_two_processes_at_once(tmp_path: Path) -> None:
+    code = """
+import sys
+from pathlib import Path
+from neuspring.experiments.tracking import log as tracking
+from neuspring.config import Tracking
+print(tracking.init(Path(sys.argv[1]), Tracking()))
+"""
+    (tmp_path / "mlflow.db.part").write_text("left by a killed init")
+    first, second = (output(process) for process in [python(code, tmp_path) for _ in range(2)])
+    assert first == second and "'outcome': 'ready'" in first[0]
+    assert str(tracking.init(tmp_path, SETTINGS)) == first[0]
+    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
+    assert not (tmp_path / "mlflow.db.part").exists()
+
+
+def test_init_upgrades_an_older_database(tmp_path: Path) -> None:
+    from alembic import command
+    from mlflow.store.tracking.dbmodels.initial_models import Base
+
+    utils: Any = importlib.import_module("mlflow.store.db.utils")
+    engine = utils.create_sqlalchemy_engine(tracking.default_uri(tmp_path))
+    Base.metadata.create_all(engine)
+    settings = utils._get_alembic_config(str(engine.url))
+    with engine.begin() as connection:
+        settings.attributes["connection"] = connection
+        command.upgrade(settings, "451aebb31d03")  # MLflow 1.0
+    engine.dispose()
+    assert tracking.init(tmp_path, SETTINGS)["outcome"] == "ready"
+    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
+
+
+def test_a_moved_results_folder_is_refused_with_a_way_out(results: Path, tmp_path: Path) -> None:
+    """Its index would write artifacts to the old place."""
+    tracking.log_run(write_run(results), results, SETTINGS)
+    moved = results.rename(tmp_path / "moved")
+    ((word, _),) = tracking.sync(moved, SETTINGS).items()
+    assert word.startswith("unreachable: ") and "has moved" in word
+    assert not results.exists()
+
+
+def test_disabled_touches_nothing(tmp_path: Path) -> None:
+    off = Tracking(enabled=False)
+    record = write_run(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert tracking.init(tmp_path, off)["outcome"] == "disabled"
+    assert tracking.log_run(record, tmp_path, off) == "disabled"
+    assert tracking.sync(tmp_path, off) == {"disabled": ["rope/ours/0"]}
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_mlflow_is_imported_late_with_telemetry_off(results: Path) -> None:
+    code = """
+import os, sys
+from pathlib import Path
+os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = "7"
+from neuspring.experiments.tracking import log as tracking
+from neuspring.config import Tracking
+assert not {"mlflow", "pandas", "filelock"} & set(sys.modules)
+tracking.init(Path(sys.argv[1]), Tracking())
+import mlflow.telemetry.client
+print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"],
+      mlflow.telemetry.client.get_telemetry_client())
+"""
+    process = python(code, results, stderr=subprocess.PIPE)
+    text, errors = process.communicate(timeout=240)
+    assert (text.split(), errors) == (["true", "true", "7", "None"], "")

@@ -1,0 +1,449 @@
+"""The report says what is on disk, whatever state that is in, and needs nothing else to be read."""
+
+import html
+import re
+import shutil
+from collections import Counter
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from neuspring import config
+from neuspring.core.errors import InputError
+from neuspring.core.job_records import read_jobs
+from neuspring.report.page import Options, studies, timeline, write
+from neuspring.report.page.prose import render
+from neuspring.report.page.words import duration, hours, signed
+from neuspring.scores import paper
+from neuspring.scores.studies import Study
+from tests.support import report_tree
+from tests.support.browser import Browser, chromium
+
+WRITTEN = "2026-01-05T12:00:00+00:00"
+ABLATION = Study(
+    title="Pieces", reference=None, baseline="Baseline", rows={"Baseline": "baseline", "Ours": "neuspring", "Later": "later"}
+)
+SYSTEMS = Study(
+    title="Systems",
+    reference="table1_comparison",
+    baseline="PhysTwin",
+    rows={"Spring-Gaus": "spring_gaus", "GS-Dynamics": "gs_dynamics", "PhysTwin": "baseline", "NeuSpring": "neuspring"},
+)
+FILM_WIDTHS = """Promise.all([...document.querySelectorAll("video")].map(
+  (film) => film.videoWidth || new Promise((done) => (film.onloadedmetadata = () => done(film.videoWidth)))
+))"""
+VOID = {"meta", "img", "br", "input", "link", "hr"}
+
+
+def report(results: Path, **options) -> str:
+    """The page of a results folder, as text."""
+    values = {"studies": {"pieces": ABLATION, "systems": SYSTEMS}} | options
+    return write(results, results / "report.html", Options(**values), WRITTEN).read_text()
+
+
+def section(page: str, key: str) -> str:
+    """The text of a section, without tags; what cells and lines hold is separated by spaces."""
+    found = re.search(rf'<section id="{key}">(.*?)</section>', page, re.DOTALL)
+    assert found, key
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", found[1])).split())
+
+
+def damage(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory) -> Path:
+    """Two scenarios, two methods, two seeds, with pictures, films, jobs, a tuning study and judged perception."""
+    results = report_tree.make(tmp_path_factory.mktemp("report") / "results")
+    report_tree.write_jobs(results, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1], again=3, never=7)
+    tune = results / "tune" / "rates"
+    tune.mkdir(parents=True)
+    first = next(results.glob("*/*/0/plots/motion.png"))
+    for name in ("history.png", "slices.png"):
+        shutil.copy(first, tune / name)
+    table = "| setting | value |\n|---|---|\n| learning_rate | 0.001 |\n"
+    (tune / "summary.md").write_text(f"# Rates\n\nBest trial 3.\n\n{table}\n![Losses of trials](history.png)\n<b>raw</b>\n")
+    (results / "tables").mkdir()
+    (results / "tables" / "perception.md").write_text("# Perception against the truth\n\n|a|b|\n|-|-|\n|1|2|\n")
+    (results / "tables" / "scores.csv").write_text("scenario\n")
+    return results
+
+
+@pytest.fixture(scope="module")
+def page(full) -> str:
+    return report(full)
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    return report_tree.make(tmp_path / "results", pictures=False)
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory) -> Path:
+    """Eight methods on one scenario."""
+    methods = ["baseline", "neuspring", *(f"m{index}" for index in range(6))]
+    return report_tree.make(tmp_path_factory.mktemp("report") / "results", ["rope"], methods, [0], pictures=False)
+
+
+class Strict(HTMLParser):
+    """Fails where tags do not close, ids repeat, or a picture has no words."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: Counter[str] = Counter()
+        self.targets: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.ids[values.get("id")] += 1
+        self.targets += [value for name, value in attrs if name in ("src", "href", "xlink:href", "poster", "srcset", "data")]
+        assert tag != "img" or values.get("alt")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        self.handle_endtag(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, (tag, self.open[-3:])
+        self.open.pop()
+
+
+def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
+    parser = Strict()
+    parser.feed(page)
+    assert not parser.open
+    assert [name for name, count in parser.ids.items() if name and count > 1] == []
+    inside = [target for target in parser.targets if target.startswith("#")]
+    assert {target[1:] for target in inside} <= set(parser.ids)
+    others = [target for target in parser.targets if not target.startswith(("#", "data:"))]
+    # Links to files beside the page, which are there.
+    assert others and all((full / target).exists() for target in others)
+    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/)", page)
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_browser_without_network_shows_all_of_it(page, full, width):
+    with Browser() as browser:
+        browser.open(full / "report.html", width)
+        found = browser.check()
+        assert found["width"] == width
+        assert found["needed"] == width, found["outside"]
+        assert found["outside"] == []
+        assert (found["broken"], found["silent"]) == ([], 0)
+        assert (found["errors"], found["loaded"], found["asked"]) == ([], [], [])
+        # One seed of two scenarios and two methods, two films each.
+        assert browser.run(FILM_WIDTHS) == [48] * 8
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+def test_the_browser_would_notice(tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(
+        "<!doctype html><main><p style='width: 2000px'>wide</p><img alt='broken' src='data:image/png;base64,AA'>"
+        "<img src='http://localhost:9/absent.png'><script>nothing()</script></main>"
+    )
+    with Browser() as browser:
+        browser.open(page, 390)
+        found = browser.check()
+    assert found["needed"] > 390
+    assert found["outside"]
+    assert (found["broken"], found["silent"]) == (["broken", ""], 1)
+    assert found["asked"] == ["http://localhost:9/absent.png"]
+    assert any("nothing is not defined" in error for error in found["errors"])
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+def test_a_click_sorts_a_table_and_words_filter_it(many):
+    report(many)
+    table = "document.querySelector('#scores table.sortable')"
+    rows = f"[...{table}.tBodies[0].rows]"
+    values = f"{rows}.map((row) => +row.cells[1].dataset.value)"
+    names = f"{rows}.filter((row) => !row.hidden).map((row) => row.cells[0].textContent)"
+    with Browser() as browser:
+        browser.open(many / "report.html", 1280)
+        for order in (1, -1):
+            browser.run(f"{table}.querySelectorAll('th button')[1].click()")
+            found = browser.run(values)
+            assert found == sorted(found)[::order]
+            assert len(set(found)) == 8
+        browser.run(
+            "(box => { box.value = 'NEU'; box.dispatchEvent(new Event('input')) })(document.querySelector('#scores input'))"
+        )
+        assert browser.run(names) == ["neuspring"]
+
+
+def test_the_verdict_comes_first_and_does_not_claim_other_data_for_the_papers(page):
+    assert re.findall(r"<h2>(.*?)</h2>", page)[0] == "Did it reproduce?"
+    text = section(page, "verdict")
+    assert "systems: Systems" in text
+    assert "Cannot be said: these are not the paper's data." in text
+    assert "runs finished 8 of 8 0 missing" in text
+    assert "The data are not PhysTwin's: synthetic (2 scenarios)" in text
+
+
+@pytest.mark.parametrize(
+    ("counts", "words", "tone"),
+    [
+        ({"within": 20, "better": 4}, "Reproduced: all 24 cells", "good"),
+        ({"within": 20, "worse": 4}, "20 of 24 cells within the interval or better, 4 worse, 0 open.", "warn"),
+        ({"within": 4, "worse": 20}, "4 of 24 cells", "bad"),
+        ({"within": 12, "not run": 12}, "12 of 24 cells within the interval or better, 0 worse, 12 open.", "warn"),
+        ({"not run": 24}, "Not run yet.", "mute"),
+        ({"other data": 12, "not run": 12}, "Cannot be said: these are not the paper's data.", "mute"),
+    ],
+)
+def test_an_answer_claims_no_more_than_its_cells(counts, words, tone):
+    answer, given = studies._answer(Counter(counts), 24)
+    assert answer.startswith(words)
+    assert given == tone
+
+
+def test_all_of_the_papers_scenarios_are_answered(tmp_path):
+    scenarios = sorted(paper.scenarios())
+    results = report_tree.make(tmp_path / "results", scenarios, seeds=[0], source="phystwin", pictures=False, curves=False)
+    page = report(results)
+    assert "The data are PhysTwin's: phystwin (22 scenarios)." in section(page, "verdict")
+    assert re.search(r"\d+ of 48 cells within the interval or better, \d+ worse, \d+ open", section(page, "verdict"))
+    text = section(page, "studies")
+    # In words, not in colour alone.
+    assert "✓ within" in text or "▲ better" in text or "▼ worse" in text
+    assert "paper 0.041 ○ not run" in text
+
+
+def test_an_empty_folder_says_so(tmp_path):
+    text = report(tmp_path)
+    assert f"Nothing to report yet: {tmp_path.name} holds no run" in section(text, "verdict")
+    with pytest.raises(InputError, match="must exist"):
+        write(tmp_path / "absent", tmp_path / "report.html", Options())
+
+
+def test_runs_that_were_asked_for_and_are_not_there_are_missing(small):
+    page = report(small, scenarios=["rope", "cloth", "zebra"], methods=["baseline", "neuspring", "later"], seeds=[0, 1])
+    assert "runs finished 8 of 18 10 missing" in section(page, "verdict")
+    assert "Without any finished run, and not counted: later." in section(page, "scores")
+    assert "zebra – – –" in section(page, "failures")
+    assert "rope ✓ 2 ✓ 2 –" in section(page, "failures")
+    assert "observe ✓" not in section(page, "workflow")
+    assert "2 of 3" in section(page, "workflow")
+
+
+def test_what_began_without_a_result_is_found(tmp_path):
+    report_tree.save_job(tmp_path, "fit/rope/baseline/3", [report_tree.attempt(0, 5, outcome="permanent")])
+    page = report(tmp_path)
+    assert "runs finished 0 of 1 1 missing" in section(page, "verdict")
+    assert "No run has finished" in section(page, "scores")
+    assert "fit/rope/baseline/3" in section(page, "failures")
+
+
+def test_damaged_files_are_listed_and_stop_nothing(tmp_path):
+    results = report_tree.make(tmp_path / "results", seeds=(0, 1, 2))
+    report_tree.write_jobs(results, ["rope"], ["baseline"], [0])
+    broken = [
+        *("rope/baseline/0/run.json", "rope/baseline/1/scores.parquet", "cloth/neuspring/0/history.parquet"),
+        *("cloth/neuspring/0/trajectory.npz", "cloth/neuspring/0/plots/motion.png", "jobs/fit/rope/baseline/0.json"),
+        *("cloth/baseline/0/fit.json",),
+    ]
+    for name in broken:
+        damage(results / name)
+    (results / "rope/neuspring/2/run.json").write_text('{"format": 1, "status": "ok"}')
+    text = section(report(results), "failures")
+    for name in broken:
+        # The records that name them stand for parquet and npz files.
+        place = name.replace("scores.parquet", "run.json").replace("trajectory.npz", "rollout.json")
+        assert place in text, name
+    assert "rope/neuspring/2/run.json" in text
+    assert "Runs: 9 of 12 finished, 0 missing" in text
+
+
+def test_failed_jobs_come_with_cause_message_attempts_and_log(page):
+    text = section(page, "failures")
+    assert "Causes: out of GPU memory (1)." in text
+    assert "out of GPU memory ✗ permanent CUDA error: out of memory 1" in text
+    assert "2 jobs that succeeded after another attempt" in text
+    assert re.search(r'href="logs/fit/cloth/neuspring/\d\.log"', page)
+
+
+def test_failed_runs_give_their_reason_as_text(small):
+    seen = report_tree._observations("rope", "synthetic", 30)
+    changes = {"status": "failed", "reason": "rollout: <script>alert(1)</script> diverged in frame 3"}
+    report_tree.write_run(small, seen, "baseline", 0, {}, **changes)
+    page = report(small)
+    assert "<script>alert" not in page
+    assert "rope baseline 0 rollout: <script>alert(1)</script> diverged in frame 3" in section(page, "failures")
+    assert "rope 1 of 2 ✗ 1 ✓ 2" in section(page, "failures")
+    assert "failed runs 1 numerical" in section(page, "verdict")
+
+
+def test_how_pictures_were_scored_is_said(small):
+    facts = {
+        "backend": "warp",
+        "masks": "given",
+        "views": ["0"],
+        "lpips": "no AlexNet weights",
+        "quirks": [],
+        "unseen_surface": 0.25,
+    }
+    seen = report_tree._observations("rope", "synthetic", 30)
+    for method in ("baseline", "neuspring"):
+        report_tree.write_run(small, seen, method, 0, {"images.png": b""}, images=facts, notes=["fit: 1 epoch rolled back"])
+    text = section(report(small), "scores")
+    assert "Cameras scored: 0; masks: given; rasteriser: warp" in text
+    assert "LPIPS not computed: no AlexNet weights" in text
+    assert "2 runs with notes rope / baseline / seed 0: fit: 1 epoch rolled back" in text
+
+
+def test_a_job_without_an_end_is_not_called_failed(small):
+    report_tree.save_job(small, "fit/rope/baseline/0", [report_tree.attempt(0, 0, outcome="running")])
+    text = section(report(small), "failures")
+    assert "1 job without an end" in text
+    assert "Failed jobs" not in text
+
+
+def test_gpu_hours_count_every_attempt_of_every_job(small):
+    jobs = {"fit/rope/baseline/0": [(0, 1800.0, "transient"), (1900, 3600.0, "ok")], "search/rope/uniform/0": [(0, 900.0, "ok")]}
+    for name, attempts in jobs.items():
+        made = [report_tree.attempt(start, s, outcome=how, devices=["0", "1"]) for start, s, how in attempts]
+        report_tree.save_job(small, name, made)
+    report_tree.save_job(small, "score/rope/baseline/0", [report_tree.attempt(0, 3600, devices=[], device_names=[])])
+    page = report(small)
+    assert "GPU-hours so far 3.5 job records" in section(page, "verdict")
+    text = section(page, "work")
+    assert "fit 1 0 1 90.0 min 90.0 min 3.0" in text
+    assert "search uniform 1" in text
+
+
+def test_without_job_records_times_come_from_the_runs_and_shared_stages_count_once(tmp_path):
+    results = report_tree.make(tmp_path / "results", ["rope"], ["baseline", "model_b"], [0], pictures=False)
+    for path in results.glob("rope/*/0/run.json"):
+        path.write_text(
+            re.sub(
+                r'"timings": \{[^}]*\}',
+                '"timings": {"search": 3600.0, "fit": 1800.0, "rollout": 0.0, "score": 9.0}',
+                path.read_text(),
+            )
+        )
+    page = report(results)
+    # One search for both methods, two fits.
+    assert "GPU-hours so far 2.0 run records" in section(page, "verdict")
+    assert "There are no job records" in section(page, "work")
+    assert "search shared 1" in section(page, "work")
+
+
+def test_pauses_are_cut_out_and_no_two_bars_of_a_lane_overlap(small):
+    starts = [0, 0, 100, 300, 100_000]
+    for index, start in enumerate(starts):
+        job = [report_tree.attempt(start, 200, devices=["0"])]
+        report_tree.save_job(small, f"fit/rope/baseline/{index}", job)
+    found = timeline.bars(read_jobs(small))
+    ((_, length),) = timeline.pauses(found)
+    assert 99_400 < length < 99_500
+    lanes = timeline.laned(found)
+    assert [name for name, _ in lanes] == ["GPU 0.1", "GPU 0.2", "GPU 0.3"]
+    assert all(before.end <= after.start + 1 for _, bars in lanes for before, after in pairwise(bars))
+    assert sum(len(bars) for _, bars in lanes) == len(starts)
+    assert "Dotted: 1 pauses cut out." in section(report(small), "work")
+
+
+def test_curves_have_a_panel_per_scenario_and_are_told_in_words(page):
+    labels = re.findall(r'<svg [^>]*role="img" aria-label="([^"]*)"', page)
+    for title in ("Track error over time", "Search: best cost", "Fit: loss"):
+        assert [label for label in labels if label.startswith(f"{title}, rope: ")]
+        assert [label for label in labels if label.startswith(f"{title}, cloth: ")]
+    assert "currentColor" in page
+
+
+def test_the_same_folder_makes_the_same_page_but_for_its_date(full, page):
+    again = write(full, full / "report.html", Options(studies={"pieces": ABLATION, "systems": SYSTEMS})).read_text()
+    different = [line for line in again.splitlines() if line not in set(page.splitlines())]
+    assert len(different) == 1
+    assert "Written" in different[0]
+
+
+def test_a_page_keeps_to_its_size_and_says_what_it_leaves_out(full):
+    none = report(full, megabytes=0.0)
+    size = len(none.encode())
+    assert size < 2_000_000
+    assert 'href="cloth/baseline/0/video.mp4"' in none
+    some = report(full, megabytes=(size + 30_000) / 1e6)
+    assert size < len(some.encode()) < size + 40_000
+    assert "not embedded, to keep this page small" in section(some, "pictures")
+    silent = report(full, video_megabytes=0.0)
+    assert "data:video" not in silent
+    assert "data:image/webp" in silent
+
+
+def test_big_pictures_are_made_smaller(full, page):
+    widths = [int(width) for width in re.findall(r'<img src="data:image/webp[^>]* width="(\d+)"', page)]
+    assert widths
+    assert max(widths) <= 1200 < 1300
+
+
+def test_tuning_studies_and_judged_perception_are_shown(page):
+    text = section(page, "tuning")
+    assert "Best trial 3." in text
+    assert "learning_rate 0.001" in text
+    # The picture that the summary names is not shown twice.
+    assert page.count('alt="Losses of trials"') == 1
+    assert page.count('alt="slices, study rates"') == 1
+    assert "history, study rates" not in page
+    assert "Perception against the truth" in section(page, "perception")
+
+
+def test_markdown_brings_no_markup_of_its_own():
+    made = str(render("<script>alert(1)</script> [x](javascript:alert(1)) ![p](https://host/p.png)", lambda _: ""))
+    assert "<script>" not in made
+    assert "href" not in made
+    assert "<img" not in made
+
+
+def test_settings_that_differ_come_first_and_all_follow(small):
+    settings = config.Config(scenarios=("rope",), methods=("baseline",), seeds=(0,), search=config.Search(rollouts=44))
+    page = report(small, settings=settings)
+    text = section(page, "setup")
+    assert "search.rollouts 220 44" in text
+    assert text.index("search.rollouts 220 44") < text.index("Full configuration")
+    assert "fit.epochs 200" not in text
+    assert "1 scenario, 1 method, seeds 0" in page
+
+
+def test_settings_are_read_from_the_runs_where_none_are_given(page):
+    text = section(page, "setup")
+    assert "fit.epochs 200 5" in text
+    assert "search.rollouts 220 30" in text
+
+
+def test_runs_of_several_commits_are_pointed_out(small):
+    assert "All runs were made by commit 0123456789ab." in section(report(small), "setup")
+    seen = report_tree._observations("rope", "synthetic", 30)
+    report_tree.write_run(small, seen, "baseline", 0, {}, commit="fedcba9876543210-dirty")
+    text = section(report(small), "setup")
+    assert "Runs were made by 2 states of the code" in text
+    assert "fedcba987654-dirty (1 run)" in text
+
+
+def test_of_many_methods_six_are_drawn_and_the_page_says_which(many):
+    assert "6 of 8 methods are drawn: baseline, neuspring, m0, m1, m2, m3." in section(report(many), "curves")
+    assert "1 of 8 methods are drawn: m5." in section(report(many, shown=["m5"]), "curves")
+    with pytest.raises(InputError, match="must be among the methods"):
+        report(many, shown=["other"])
+
+
+def test_the_workflow_is_drawn_with_what_is_there(page):
+    (label,) = re.findall(r'aria-label="Steps of the workflow\. ([^"]*)"', page)
+    assert "observe: 2 done, 0 failed" in label
+    assert "score: 8 done, 0 failed" in label
+    assert "capture" not in label
+
+
+def test_numbers_read_well():
+    assert (duration(12.34), duration(600.0), duration(7200.0)) == ("12.3 s", "10.0 min", "2.0 h")
+    assert (hours(0), hours(20), hours(1800), hours(7200), hours(1e6)) == ("0", "< 0.01", "0.50", "2.0", "278")
+    assert (signed(1.26, 1), signed(-1.26, 1), signed(-0.01, 1)) == ("+1.3", "−1.3", "0.0")

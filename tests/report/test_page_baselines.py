@@ -1,0 +1,176 @@
+"""The report shows methods without a search: their steps, settings, curves, times and splats."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.core.artifacts import Observations
+from neuspring.core.records import StageRecord
+from neuspring.report.page import dag
+from neuspring.report.page.sources import Choice
+from neuspring.scores.studies import Study
+from tests.report.test_page import report, section
+from tests.support import report_tree
+
+SYSTEMS = Study(title="Systems", reference=None, baseline="Ours", rows={"SG": "spring_gaus", "Ours": "baseline"})
+
+
+def write_baseline(results: Path, scenario: str, method: str, model: str, *, trained: bool = True, splats: str = "") -> None:
+    """A finished run of a baseline's model as the workflow leaves it."""
+    seen = Observations.load(results / scenario / "observations.npz")
+    folder = results / scenario / method / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = {"rollout": {"model": model}}
+    records = ["rollout.json"]
+    if trained:
+        own = config.plain(config.Config())["baselines"][model]
+        settings["train"] = {"model": model, **own, "seed": 0} | ({"anchors": 77} if model == "spring_gaus" else {})
+        report_tree._history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
+        StageRecord(stage="train", status="ok", settings=settings["train"]).save(folder / "train.json")
+        records.insert(0, "train.json")
+    images = []
+    if splats:
+        place = results / scenario / splats / "0"
+        place.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(place / "appearance.png"), np.full((40, 60, 3), 90, np.uint8))
+        StageRecord(stage="appearance", status="ok").save(place / "appearance.json")
+        records.append(f"../../{splats}/0/appearance.json")
+        images.append(f"../../{splats}/0/appearance.png")
+    report_tree.write_run(
+        results,
+        seen,
+        method,
+        0,
+        {},
+        variant={"model": model, "ignore_hands": True},
+        settings=settings,
+        histories={"train": "history.parquet"} if trained else {},
+        timings=dict.fromkeys((Path(name).stem for name in records), 60.0) | {"score": 1.0},
+        peak_memory_mb={},
+        artifacts={"records": records, "plots": [], "images": images},
+    )
+    (folder / "fit.json").unlink()
+    StageRecord(stage="rollout", status="ok", settings=settings["rollout"]).save(folder / "rollout.json")
+    if trained:
+        report_tree._history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> Path:
+    """One twin method and three baselines on one scenario, two of them with splats."""
+    folder = report_tree.make(tmp_path_factory.mktemp("report") / "results", ["rope"], ["baseline"], [0], pictures=False)
+    write_baseline(folder, "rope", "spring_gaus", "spring_gaus", splats="appearance-spring_gaus")
+    write_baseline(folder, "rope", "gs_dynamics", "gs_dynamics", splats="appearance")
+    write_baseline(folder, "rope", "static", "static", trained=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(results) -> str:
+    return report(results, studies={"systems": SYSTEMS})
+
+
+def drawn(page: str) -> dict[str, str]:
+    """Step -> what its box says."""
+    words = page.partition('aria-label="Steps of the workflow. ')[2].partition('"')[0]
+    return dict(part.split(": ", 1) for part in words.split("; "))
+
+
+def test_steps_of_baselines_are_drawn_and_their_rollouts_are_their_own(page):
+    boxes = drawn(page)
+    assert boxes["train"].startswith("2 done") and boxes["predict"].startswith("3 done")
+    assert boxes["rollout"].startswith("1 done") and boxes["appearance"].startswith("2 done")
+
+
+def test_without_baselines_there_are_no_such_steps(tmp_path):
+    folder = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0], pictures=False, curves=False)
+    boxes = drawn(report(folder))
+    assert "train" not in boxes and "predict" not in boxes and boxes["rollout"].startswith("1 done")
+
+
+def test_a_prediction_without_training_follows_the_observations():
+    count = dag.Count(finished=1, failed=0, jobs_failed=0, expected=None)
+    assert dag._before("predict", {"observe": count, "predict": count}) == ["observe"]
+    assert dag._before("predict", {"observe": count, "train": count}) == ["train"]
+    places = [step.place for step in dag.STEPS.values()]
+    assert len(set(places)) == len(places)
+
+
+def test_settings_and_models_are_shown(page):
+    text = section(page, "setup")
+    assert "baselines.spring_gaus.anchors 1024 77" in text
+    assert "baselines.spring_gaus.neighbours" not in text and "baselines.gs_dynamics" not in text
+    assert "Method Model Search Regions" in text
+    assert "spring_gaus spring_gaus – – – – – ignore_hands: true" in text
+
+
+def test_a_report_of_twins_has_no_column_of_models(tmp_path):
+    folder = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0], pictures=False, curves=False)
+    assert "Method Search Regions" in section(report(folder), "setup")
+
+
+def test_training_curves_stand_beside_those_of_fits(page):
+    text = section(page, "curves")
+    assert "Fit: loss" in text and "Training of baselines: loss" in text
+    assert "Training of baselines: loss, rope: spring_gaus, gs_dynamics" in page or (
+        "Training of baselines: loss, rope: gs_dynamics, spring_gaus" in page
+    )
+
+
+def test_times_name_the_rules_and_whose_splats(page):
+    text = section(page, "work")
+    assert "train spring_gaus 1" in text and "predict static 1" in text and "rollout baseline 1" in text
+    assert "appearance spring_gaus 1" in text and "appearance shared 1" in text
+
+
+def test_jobs_of_baselines_belong_to_their_methods(results, tmp_path):
+    names = ("train/rope/spring_gaus/0", "predict/rope/static/0", "appearance/rope/appearance/0")
+    for name in (*names, "appearance/rope/appearance-spring_gaus/0"):
+        report_tree.save_job(tmp_path, name, [report_tree.attempt(0, 60)])
+    text = section(report(tmp_path), "work")
+    for words in ("spring_gaus 1 0", "static 1 0", "splats shared 1", "splats spring_gaus 1"):
+        assert words in text
+    assert text.index("train 1") < text.index("predict 1") < text.index("appearance 2")
+    assert {"spring_gaus", "static"} <= set(section(report(tmp_path), "failures").split())
+
+
+def test_every_picture_of_splats_is_shown_with_its_methods(page):
+    text = section(page, "pictures")
+    assert "Observed and drawn in frame 0, spring_gaus" in text and "Observed and drawn in frame 0, gs_dynamics" in text
+
+
+def test_what_does_not_apply_is_no_run(results):
+    studied = {
+        "studies": {"systems": SYSTEMS},
+        "scenarios": ["rope", "cable"],
+        "methods": ["baseline", "spring_gaus"],
+        "seeds": [0],
+    }
+    page = report(results, **studied, left_out={"spring_gaus": ("cable",)})
+    assert "runs finished 2 of 3 1 missing" in section(page, "verdict")
+    assert "Left out: spring_gaus on cable: it needs images." in section(page, "scores")
+    assert "empty: does not apply" in section(page, "failures")
+    assert "runs finished 2 of 4 2 missing" in section(report(results, **studied), "verdict")
+    choice = Choice(scenarios=("a", "b"), methods=("x", "y"), seeds=(0, 1), baseline="x", left_out={"x": ["b", "c"], "z": ["a"]})
+    assert choice.size == 6
+
+
+def test_failures_have_both_averages_in_the_report(tmp_path):
+    folder = report_tree.make(
+        tmp_path / "results", ["rope", "cloth"], ["baseline", "spring_gaus"], [0], pictures=False, curves=False
+    )
+    place = folder / "rope" / "spring_gaus" / "0"
+    run = json.loads((place / "run.json").read_text())
+    (place / "held.parquet").write_bytes((place / "scores.parquet").read_bytes())
+    (place / "run.json").write_text(json.dumps(run | {"status": "failed", "reason": "it diverged", "held_file": "held.parquet"}))
+    page = report(folder, studies={"systems": SYSTEMS})
+    text = section(page, "scores")
+    assert "spring_gaus 1 of 2 its successes" in text and "all, failures held" in text and "baseline 2 of 2 all" in text
+    assert "spring_gaus 1 (1 by its failures alone)" in text
+    assert "SG 1/2 its successes" in section(page, "studies")
+    (place / "run.json").write_text(json.dumps(run | {"status": "failed", "reason": "it diverged"}))
+    assert "spring_gaus: 1 of 1 failed runs have no scores of a held prediction" in section(report(folder), "scores")

@@ -1,0 +1,180 @@
+"""SSIM, PSNR, IoU and the masked pair against golden values (tests/golden/m01..m03) and their rules."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring.core.errors import InputError
+from neuspring.scores.images import iou, masked_pair, psnr, silhouettes, ssim, ssim_map
+
+FOLDER = Path(__file__).parents[1] / "golden"
+SINGLE = {"mean": 1e-5, "map": 1e-4, "gradient": 1e-3, "psnr": 1e-4, "relative": 1e-5}
+"""The golden README's tolerances for float32: SSIM absolute, its gradient relative to the largest, PSNR in dB."""
+DOUBLE = dict.fromkeys(SINGLE, 1e-9)
+CASES = range(8)
+DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
+
+
+def golden(name: str) -> dict[str, np.ndarray]:
+    with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
+
+
+@pytest.fixture(scope="module")
+def m01() -> dict[str, np.ndarray]:
+    return golden("m01_images")
+
+
+@pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
+def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+    return request.param
+
+
+def random_pair(*shape: int, dtype: torch.dtype = torch.float64) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    return [torch.rand(shape, generator=generator, dtype=dtype) for _ in range(2)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("k", CASES)
+def test_similarity_is_golden(m01, k, dtype, device):
+    allowed = DOUBLE if dtype == torch.float64 else SINGLE
+    a, b = (torch.tensor(m01[f"{name}{k}"], dtype=dtype, device=device) for name in "ab")
+    a.requires_grad_()
+    values = ssim_map(a, b)
+    assert values.shape == a.shape and values.dtype == dtype
+    mean = ssim(a, b)
+    (gradient,) = torch.autograd.grad(mean, a)
+    assert abs(mean.item() - m01[f"exp_ssim{k}"]) <= allowed["mean"]
+    per_image = values.mean(dim=(-3, -2, -1)).detach().cpu().numpy()
+    assert np.abs(per_image - m01[f"exp_ssim_per_image{k}"]).max() <= allowed["mean"]
+    if k in (1, 4, 5):
+        assert np.abs(values.detach().cpu().numpy() - m01[f"exp_ssim_map{k}"]).max() <= allowed["map"]
+    if k in (1, 3, 4):
+        expected = m01[f"exp_ssim_grad{k}"]
+        assert np.abs(gradient.cpu().numpy() - expected).max() <= allowed["gradient"] * np.abs(expected).max()
+    photo = 0.8 * (a - b).abs().mean() + 0.2 * (1 - mean)
+    assert photo.item() == pytest.approx(m01[f"exp_photo{k}"], rel=allowed["relative"], abs=allowed["relative"])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("k", CASES)
+def test_psnr_and_differences_are_golden(m01, k, dtype, device):
+    allowed = DOUBLE if dtype == torch.float64 else SINGLE
+    a, b = (torch.tensor(m01[f"{name}{k}"], dtype=dtype, device=device) for name in "ab")
+    found = psnr(a, b)
+    assert found.shape == a.shape[:-3]
+    assert found.cpu().numpy() == pytest.approx(m01[f"exp_psnr{k}"].reshape(found.shape), abs=allowed["psnr"])
+    per_channel = psnr(a.unsqueeze(-3), b.unsqueeze(-3)).cpu().numpy()
+    assert per_channel == pytest.approx(m01[f"exp_psnr_per_channel{k}"].reshape(per_channel.shape), abs=allowed["psnr"])
+    assert (a - b).abs().mean().item() == pytest.approx(m01[f"exp_l1_{k}"], rel=allowed["relative"])
+    assert (a - b).square().mean().item() == pytest.approx(m01[f"exp_mse{k}"], rel=allowed["relative"])
+
+
+def test_the_evaluation_is_golden():
+    values = golden("m02_eval_pipeline")
+    scores = []
+    for observed, mask, rendered, hand in zip(*(values[key] for key in ("gt", "mask", "render", "human")), strict=True):
+        pair = masked_pair(observed, mask, rendered, hand)
+        for picture in pair:
+            assert picture.shape == (3, *mask.shape) and picture.dtype == torch.float32
+            assert picture.min() >= 0 and picture.max() <= 1
+        scores.append((psnr(*pair).item(), ssim(*pair).item(), iou(*silhouettes(mask, rendered, hand))))
+    for name, found, allowed in zip(("psnr", "ssim", "iou"), np.array(scores).T, (1e-4, 1e-5, 0.0), strict=True):
+        assert np.abs(found - values[f"exp_{name}"]).max() <= allowed
+        assert abs(found.mean() - values[f"exp_mean_{name}"]) <= max(allowed, 1e-15)
+
+
+def test_overlap_is_golden():
+    values = golden("m03_iou")
+    assert [iou(*pair) for pair in zip(values["mask_a"], values["mask_b"], strict=True)] == values["exp_iou"].tolist()
+    # Any byte but 0 is foreground, not alpha above one half.
+    in_bytes = np.floor(255 * values["alpha"].astype(np.float64) + 0.5).astype(np.uint8)
+    assert np.array_equal(in_bytes, values["exp_alpha_u8"])
+    rendered = np.repeat(in_bytes[..., None], 4, axis=-1)
+    seen, drawn = silhouettes(values["mask_b"][0].astype(np.uint8) * 255, rendered, np.zeros_like(in_bytes))
+    assert iou(drawn, seen) == values["exp_alpha_iou_vs_mask_b0"]
+
+
+def test_overlap_of_nothing_is_one():
+    nothing = np.zeros((3, 4), bool)
+    assert iou(nothing, nothing) == 1.0
+    assert iou(nothing, ~nothing) == 0.0
+
+
+def test_similarity_is_that_of_the_definition():
+    """A loop over pixels with the full window, weights outside the picture lost."""
+    a, b = random_pair(2, 9, 13)
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    found = ssim_map(a, b).numpy()
+    for c, i, j in np.ndindex(2, 9, 13):
+        rows, columns = np.clip(offsets + i, 0, 8), np.clip(offsets + j, 0, 12)
+        inside = ((offsets + i == rows)[:, None] & (offsets + j == columns)[None]) * window
+        x, y = (p[c].numpy()[np.ix_(rows, columns)] for p in (a, b))
+        mx, my, xx, yy, xy = ((inside * p).sum() for p in (x, y, x * x, y * y, x * y))
+        above = (2 * mx * my + 1e-4) * (2 * (xy - mx * my) + 9e-4)
+        below = (mx * mx + my * my + 1e-4) * (xx - mx * mx + yy - my * my + 9e-4)
+        assert found[c, i, j] == pytest.approx(above / below, abs=1e-12)
+
+
+def test_gradients_are_those_of_central_differences():
+    a, b = random_pair(2, 7, 12)
+    assert torch.autograd.gradcheck(ssim_map, (a.requires_grad_(), b.requires_grad_()))
+    assert torch.autograd.gradcheck(psnr, (a, b))
+
+
+def test_leading_indices_are_independent(dtype):
+    a, b = random_pair(2, 3, 1, 3, 12, 15, dtype=dtype)
+    together = ssim_map(a, b)
+    values = psnr(a, b)
+    assert values.shape == (2, 3, 1)
+    for index in np.ndindex(2, 3, 1):
+        assert torch.allclose(together[index], ssim_map(a[index], b[index]), atol=1e-6)
+        assert torch.allclose(values[index], psnr(a[index], b[index]), atol=1e-5)
+
+
+def test_noncontiguous_pictures_are_the_same():
+    a, b = random_pair(12, 15, 3)
+    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)
+    assert torch.equal(ssim_map(a, b), ssim_map(a.contiguous(), b.contiguous()))
+
+
+def test_masks_weigh_by_their_value():
+    observed, rendered = np.full((1, 2, 3), 200, np.uint8), np.full((1, 2, 4), 100, np.uint8)
+    mask, hand = np.array([[255, 51]], np.uint8), np.array([[51, 0]], np.uint8)
+    truth, drawn = masked_pair(observed, mask, rendered, hand)
+    assert truth[0, 0].tolist() == pytest.approx([200 / 255 * 0.8, 200 / 255 * 0.2])
+    assert drawn[2, 0].tolist() == pytest.approx([100 / 255 * 0.8, 100 / 255])
+
+
+@pytest.mark.parametrize("function", [ssim, ssim_map, psnr])
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 6)),
+        (torch.zeros(4, 5), torch.zeros(4, 5)),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, dtype=torch.float64)),
+        (torch.zeros(3, 4, 5, dtype=torch.uint8), torch.zeros(3, 4, 5, dtype=torch.uint8)),
+    ],
+)
+def test_bad_pictures_are_refused(function, a, b):
+    with pytest.raises(InputError, match="pictures"):
+        function(a, b)
+
+
+def test_bad_masks_are_refused():
+    with pytest.raises(InputError, match="bool masks"):
+        iou(np.zeros((2, 3), np.uint8), np.zeros((2, 3), bool))
+    with pytest.raises(InputError, match="same shape"):
+        iou(np.zeros((2, 3), bool), np.zeros((3, 2), bool))
+    good = [np.zeros(shape, np.uint8) for shape in ((4, 5, 3), (4, 5), (4, 5, 4), (4, 5))]
+    for at, name in enumerate(("observed", "object_mask", "rendered", "hand_mask")):
+        bad = [p.astype(np.float32) if i == at else p for i, p in enumerate(good)]
+        with pytest.raises(InputError, match=name):
+            masked_pair(*bad)
+    with pytest.raises(InputError, match="rendered"):
+        silhouettes(good[1], good[0], good[3])

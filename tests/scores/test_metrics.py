@@ -1,0 +1,198 @@
+"""Reported metrics against golden values (tests/golden/m04, m06), and the rules for rows and averages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring.core.artifacts import Trajectory
+from neuspring.scores import metrics
+from tests.support.scenarios import observations, scenario
+
+GOLDEN = 1e-5
+"""Relative; the golden README's tolerance (we compute in float64 and agree to rounding). Traps differ by 14 % or more."""
+TRAP = 0.1
+
+
+def load(name: str) -> dict[str, np.ndarray]:
+    with np.load(Path(__file__).parents[1] / "golden" / f"{name}.npz", allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
+
+
+def rollout(positions: np.ndarray, **fields: object) -> Trajectory:
+    return Trajectory(positions=positions, **({"frame_count": len(positions)} | fields))
+
+
+# Golden ---------------------------------------------------------------------------------------------------------------
+
+
+def test_golden_chamfer() -> None:
+    d = load("m04_chamfer_eval")
+    surface, frames = int(d["num_surface_points"]), range(int(d["start"]), int(d["end"]))
+    inputs = d["vertices"], d["object_points"], d["object_visibilities"]
+    got = np.array([metrics.visible_to_surface(*(values[t] for values in inputs), surface) for t in frames])
+    np.testing.assert_allclose(got, d["exp_frame"], rtol=GOLDEN)
+    assert got.mean() == pytest.approx(float(d["exp_mean"]), rel=GOLDEN)
+    assert got[0] == pytest.approx(d["exp_first_frame_dist"].mean(), rel=GOLDEN)
+    for trap in ("trap_euclid_mean", "trap_sq_mean"):
+        assert abs(got.mean() / d[trap] - 1) > TRAP
+
+
+def test_golden_track_error() -> None:
+    d = load("m06_track_eval")
+    end = int(d["train_frame"])
+    got = metrics.track_errors(d["vertices"], d["gt_track_3d"])
+    np.testing.assert_allclose(got[1:end], d["exp_train_frame"], rtol=GOLDEN)
+    np.testing.assert_allclose(got[end:], d["exp_test_frame"], rtol=GOLDEN)
+    for part, name in ((got[1:end], "train"), (got[end:], "test")):
+        assert part.mean() == pytest.approx(float(d[f"exp_{name}"]), rel=GOLDEN)
+        assert abs(part.mean() / d[f"trap_skip_empty_{name}"] - 1) > TRAP
+
+
+def test_track_errors_of_float64_and_float32_agree() -> None:
+    d = load("m06_track_eval")
+    double = metrics.track_errors(d["vertices"].astype(np.float64), d["gt_track_3d"].astype(np.float64))
+    np.testing.assert_array_equal(metrics.track_errors(d["vertices"], d["gt_track_3d"]), double)
+
+
+# Rules ----------------------------------------------------------------------------------------------------------------
+
+
+def test_chamfer_is_the_l1_distance_of_visible_points_to_surface_nodes() -> None:
+    seen = np.ones((5, 3), bool)
+    seen[2] = [True, False, True]
+    given = observations(object_visibility=seen)
+    positions = np.tile(given.nodes, (5, 1, 1))
+    positions[:, 0] += [0.1, 0.2, -0.3]
+    positions[2, 1] += 10
+    # The interior node sits on an observed point; it does not count as surface.
+    positions[:, 4] = [0, 0, 0]
+    np.testing.assert_allclose(metrics.chamfer_per_frame(positions, given), [0.2, 0.2, 0.3, 0.2, 0.2], rtol=1e-6)
+
+
+def test_a_frame_in_which_nothing_is_visible_is_left_out() -> None:
+    """NaN per frame; the mean and its frame count are over the others; a task without any such frame gives no row."""
+    seen = np.ones((5, 3), bool)
+    seen[[1, 3, 4]] = False
+    given = observations(object_visibility=seen)
+    positions = np.tile(given.nodes, (5, 1, 1))
+    positions[:, :, 0] += 0.1
+    assert np.isnan(metrics.chamfer_per_frame(positions, given)).tolist() == [False, True, False, True, True]
+    rows = metrics.score(rollout(positions), given, "ours", 0)
+    assert rows[["task", "metric", "frames"]].to_numpy().tolist() == [["reconstruction", "chamfer", 1]]
+    assert rows["value"].item() == pytest.approx(0.1, rel=1e-5)
+
+
+def test_tracks_are_matched_once_to_all_nodes() -> None:
+    """The first track is nearest to the interior node at frame 0 and stays with it; the second appears late: never used."""
+    tracks = np.full((5, 2, 3), np.nan)
+    tracks[[0, 1, 3], 0] = [0.0, 0, 6.5]
+    tracks[1:, 1] = [1.0, 0, 0]
+    given = observations(tracks=tracks)
+    positions = np.tile(given.nodes, (5, 1, 1))
+    positions[1:, 3:] += [0.3, 0.4, 0.0]
+    found = metrics.track_error_per_frame(positions, given)
+    wanted = np.sqrt(0.3**2 + 0.4**2 + 0.5**2)
+    # Frames 2 and 4 are without annotation: they score 0 and are averaged in, as published.
+    np.testing.assert_allclose(found, [0.5, wanted, 0, wanted, 0], rtol=1e-6)
+    rows = metrics.score(rollout(positions), given, "ours", 0).query("metric == 'track_error'")
+    np.testing.assert_allclose(rows["value"], [wanted / 2, wanted / 2], rtol=1e-6)
+    assert rows["frames"].tolist() == [2, 2]
+
+
+def test_without_tracks_there_is_no_track_row() -> None:
+    late = np.full((5, 1, 3), np.nan)
+    late[1:] = 0.0
+    for tracks in (None, late):
+        given = observations(tracks=tracks)
+        assert np.isnan(metrics.track_error_per_frame(np.tile(given.nodes, (5, 1, 1)), given)).all()
+        rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 0)
+        assert set(rows["metric"]) == {"chamfer"}
+
+
+def test_a_row_says_what_it_is() -> None:
+    given = observations(tracks=np.zeros((5, 1, 3)))
+    rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 7)
+    assert tuple(rows.columns) == metrics.COLUMNS
+    assert rows[["task", "metric"]].to_numpy().tolist() == [[t, m] for t in metrics.TASKS for m in ("chamfer", "track_error")]
+    first = rows.iloc[0]
+    assert (first["scenario"], first["category"], first["method"], first["seed"], first["unit"]) == ("scene", "toy", "ours", 7, "m")
+    assert rows["frames"].tolist() == [2, 2, 2, 2]
+
+
+def test_tasks_split_at_the_end_of_training() -> None:
+    given = scenario(frame_count=10, train_end=7)
+    assert metrics.task_frames(given, "reconstruction") == range(1, 7)
+    assert metrics.task_frames(given, "future") == range(7, 10)
+
+
+@pytest.mark.parametrize(("end", "tasks"), [(1, []), (2, []), (3, ["reconstruction"]), (4, ["reconstruction"])])
+def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks: list[str]) -> None:
+    """Five frames, three of them training: diverging in frame `end` leaves only complete tasks, and never a NaN."""
+    given = observations(tracks=np.zeros((5, 1, 3)))
+    broken = rollout(np.tile(given.nodes, (end, 1, 1)), frame_count=5, diverged_frame=end, reason="node 0 left the scene")
+    rows = metrics.score(broken, given, "ours", 0)
+    assert rows["task"].unique().tolist() == tasks
+    assert tuple(rows.columns) == metrics.COLUMNS
+    assert not rows["value"].isna().any()
+
+
+def test_a_scenario_without_future_has_one_task() -> None:
+    given = observations(scenario=scenario(train_end=5))
+    rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 0)
+    assert rows["task"].tolist() == ["reconstruction"]
+
+
+# Averages -------------------------------------------------------------------------------------------------------------
+
+
+def table(*rows: tuple[str, str, int, float, int]) -> pd.DataFrame:
+    """Rows of (method, scenario, seed, value, frames)."""
+    found = pd.DataFrame(rows, columns=["method", "scenario", "seed", "value", "frames"])
+    return found.assign(task="future", metric="chamfer", category="toy", unit="m")
+
+
+def test_both_averages() -> None:
+    """Equal weights scenarios equally, frames weighs them by length; seeds are averaged within a scenario first."""
+    scores = table(
+        ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30), ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10)
+    )
+    row = metrics.averages(scores).iloc[0]
+    assert (row["method"], row["task"], row["metric"]) == ("ours", "future", "chamfer")
+    assert row["equal"] == pytest.approx((2 + 6) / 2)
+    assert row["frames"] == pytest.approx((2 * 30 + 6 * 10) / 40)
+    assert row["scenarios"] == 2
+    assert row["seed_std"] == pytest.approx(np.std([3.0, 5.0], ddof=1))
+
+
+def test_averages_keep_groups_apart() -> None:
+    scores = table(("ours", "a", 0, 1.0, 10), ("theirs", "a", 0, 2.0, 10), ("theirs", "b", 0, 4.0, 30))
+    found = metrics.averages(scores).set_index("method")
+    assert found.loc["ours", ["equal", "frames", "scenarios", "seed_std"]].tolist() == [1.0, 1.0, 1, 0.0]
+    assert found.loc["theirs", ["equal", "frames", "scenarios", "seed_std"]].tolist() == [3.0, 3.5, 2, 0.0]
+
+
+def test_averages_by_one_key() -> None:
+    scores = table(("ours", "a", 0, 1.0, 10), ("ours", "a", 1, 3.0, 10), ("theirs", "a", 0, 2.0, 10))
+    found = metrics.averages(scores, by=("method",)).set_index("method")
+    assert found.loc["ours", "seed_std"] == pytest.approx(np.std([1.0, 3.0], ddof=1))
+    assert found.loc["theirs", "seed_std"] == 0.0
+
+
+def test_scenarios_with_different_numbers_of_seeds() -> None:
+    """Seeds are averaged first, so that a scenario with more of them weighs no more; no spread from scenarios that seeds lack."""
+    scores = table(("ours", "a", 0, 9.0, 10), *(("ours", "b", seed, 1.0, 10) for seed in range(3)))
+    row = metrics.averages(scores).iloc[0]
+    assert (row["equal"], row["frames"]) == (5.0, 5.0)
+    assert np.isnan(row["seed_std"])
+    more = metrics.averages(pd.concat([scores, table(("ours", "a", 1, 8.0, 10))])).iloc[0]
+    assert more["seed_std"] == pytest.approx(np.std([5.0, 4.5], ddof=1))
+
+
+def test_averages_of_nothing_are_empty() -> None:
+    given = observations()
+    empty = metrics.score(rollout(given.nodes[None], frame_count=5, diverged_frame=1, reason="x"), given, "ours", 0)
+    assert metrics.averages(empty).empty

@@ -1,0 +1,334 @@
+"""Appearance from a small film whose motion is known: splats of frame 0, carried along, drawn, scored and filmed."""
+
+import dataclasses
+import json
+import shutil
+
+import av
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuspring.config import Config
+from neuspring.config.images import Appearance, ImageQuirks, Images, LpipsWeights
+from neuspring.core.artifacts import SplatCentres, Trajectory
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord, Stopwatch
+from neuspring.data.capture import HANDS, Capture
+from neuspring.perception.results import Masks
+from neuspring.scores import metrics
+from neuspring.splats.draw import turned
+from neuspring.splats.model import Gaussians, Splats
+from neuspring.splats.view import View
+from neuspring.stages import appearance
+from tests.stages.test_perceive import SETTINGS, perceived
+from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
+
+IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
+
+
+def settings(**changes: object) -> Config:
+    return dataclasses.replace(SETTINGS, images=dataclasses.replace(IMAGES, **changes))
+
+
+class Scene:
+    """A filmed scene with its perception, and what the steps of appearance make of it."""
+
+    def __init__(self, capture: Capture, folder) -> None:
+        self.capture, self.folder = capture, folder
+        self.observations = perceived(capture, folder)
+        self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
+        self.appearance = folder / "appearance" / "appearance.json"
+
+    def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
+        self.appearance.parent.mkdir(exist_ok=True)
+        lifted = self.folder / "lifted.json"
+        appearance.learn(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
+        return StageRecord.load(self.appearance)
+
+    def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
+        """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
+        path = self.folder / name / "rollout.json"
+        path.parent.mkdir(exist_ok=True)
+        nodes = self.observations.nodes
+        positions = nodes + np.arange(frames)[:, None, None] * step
+        ended = {} if frames == FRAMES else {"diverged_frame": frames, "reason": "test"}
+        Trajectory(positions=positions, frame_count=FRAMES, **ended).save(path.with_name("trajectory.npz"))
+        status = "ok" if frames == FRAMES else "failed"
+        record = Stopwatch().stage(
+            "rollout", status, {"trajectory": path.with_name("trajectory.npz")}, reason="" if status == "ok" else "rollout: test"
+        )
+        record.save(path)
+        return path
+
+    def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
+        output = rollout.with_name("render.json")
+        paths = (self.masks, self.folder / "observations.npz", self.appearance, rollout)
+        appearance.render(self.capture.folder, *paths, chosen, "cpu", output)
+        record = StageRecord.load(output)
+        return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("appearance")
+    made = Scene(film(folder / "capture"), folder)
+    made.learn(settings())
+    return made
+
+
+def mean(table: pd.DataFrame, metric: str, frame: int, camera: str = "0") -> float:
+    chosen = table[(table["metric"] == metric) & (table["frame"] == frame) & (table["camera"] == camera)]
+    return float(chosen["value"].iloc[0])
+
+
+def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
+    record = StageRecord.load(scene.appearance)
+    assert record.status == "ok"
+    assert all(record.facts[f"psnr_{name}"] > 28 for name in scene.capture.cameras)
+    # Below, no camera looks.
+    assert 0.05 < record.facts["unseen_surface"] < 0.6
+    assert record.inputs.keys() == {"capture", "masks0", "masks1", "masks2", "lift"}
+    assert record.facts["backend"] == "warp"
+    assert {"splats", "history", "picture"} == set(record.files)
+
+
+def test_the_true_motion_keeps_the_picture_and_none_loses_it(scene):
+    moved, right = scene.render(scene.roll(STEP, "moved"), settings())
+    _, still = scene.render(scene.roll(0 * STEP, "still"), settings())
+    assert moved.status == "ok"
+    assert mean(right, "psnr", FRAMES - 1) > mean(right, "psnr", 0) - 4
+    assert mean(right, "psnr", FRAMES - 1) > mean(still, "psnr", FRAMES - 1) + 4
+    assert mean(right, "iou", FRAMES - 1) > 0.85 > mean(still, "iou", FRAMES - 1)
+    assert mean(right, "psnr", 0) == mean(still, "psnr", 0)
+    assert moved.facts["lpips"].startswith("no AlexNet weights")
+    assert set(right["metric"]) == {"psnr", "ssim", "iou"}
+    with av.open(scene.folder / "moved" / "video.mp4") as video:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(pictures) == FRAMES
+    assert pictures[0].shape[1] == 3 * SIZE[0]
+
+
+def test_all_views_are_scored_if_wanted_each_with_its_own_camera(scene):
+    record, table = scene.render(scene.roll(STEP, "all"), settings(views="all", video=False))
+    assert set(table["camera"]) == set(scene.capture.cameras)
+    assert all(mean(table, "psnr", 0, camera) > 25 for camera in scene.capture.cameras)
+    assert set(record.files) == {"frames", "strip"}
+
+
+def test_quirks_are_switches_and_named(scene):
+    rollout = scene.roll(STEP, "quirks")
+    _, plain = scene.render(rollout, settings(video=False))
+    record, loose = scene.render(rollout, settings(video=False, released_quirks=ImageQuirks(any_alpha=True)))
+    assert record.facts["quirks"] == ["any_alpha"]
+    assert mean(loose, "iou", 0) < mean(plain, "iou", 0)
+    _, corner = scene.render(rollout, settings(video=False, released_quirks=ImageQuirks(corner_pixels=True)))
+    assert mean(corner, "psnr", 0) < mean(plain, "psnr", 0)
+
+
+def test_another_camera_s_intrinsics_make_another_picture(tmp_path):
+    """Cameras of two sizes: with the second one's matrix the first sees the object elsewhere."""
+    made = Scene(film(tmp_path / "capture", cameras=2, sizes=(SIZE, (120, 100))), tmp_path)
+    made.learn(settings())
+    rollout = made.roll(STEP, "borrowed")
+    _, own = made.render(rollout, settings(video=False))
+    _, borrowed = made.render(rollout, settings(video=False, released_quirks=ImageQuirks(second_camera_intrinsics=True)))
+    assert mean(borrowed, "psnr", 0) < mean(own, "psnr", 0) - 5
+
+
+def test_one_camera_that_misses_frames_and_z_down(tmp_path):
+    made = Scene(film(tmp_path / "capture", cameras=1, missing={0: (2,)}, up="-z"), tmp_path)
+    record = made.learn(settings())
+    assert record.facts["unseen_surface"] > 0.2
+    rendered, table = made.render(made.roll(FLIP[:3, :3] @ STEP, "one"), settings())
+    assert sorted(table["frame"].unique()) == [0, 1, 3, 4, 5]
+    scores = metrics.score_images(table, made.observations.scenario, FRAMES, "m", 0)
+    assert set(scores["frames"]) == {2}
+    assert rendered.status == "ok"
+    with pytest.raises(InputError, match="needs a second camera"):
+        made.render(made.roll(STEP, "two"), settings(released_quirks=ImageQuirks(second_camera_intrinsics=True)))
+
+
+def test_a_diverged_rollout_is_shown_as_far_as_it_goes_and_held_for_averages_over_all_runs(scene):
+    record, table = scene.render(scene.roll(STEP, "diverged", frames=4), settings())
+    assert (record.status, record.reason) == ("failed", "rollout: test")
+    with av.open(scene.folder / "diverged" / "video.mp4") as video:
+        assert sum(1 for _ in video.decode(video=0)) == 4
+    _, whole = scene.render(scene.roll(STEP, "whole"), settings())
+    assert mean(table, "iou", 3) == mean(whole, "iou", 3)
+    # The picture of frame 3 against what is seen in frame 5.
+    assert mean(table, "iou", FRAMES - 1) < mean(whole, "iou", FRAMES - 1)
+    # Reconstruction is frames 1 to 3, the future 4 and 5.
+    scores = metrics.score_images(table, scene.observations.scenario, 4, "m", 0)
+    assert set(scores["task"]) == {"reconstruction"}
+
+
+def test_what_cannot_be_trained_or_drawn_is_recorded_and_passed_on(scene):
+    rendered, table = scene.render(scene.roll(STEP, "faint"), settings(opacity=0.9999))
+    assert (rendered.status, table) == ("failed", None)
+    assert "no splat has an opacity above 0.9999" in rendered.reason
+    try:
+        record = scene.learn(settings(appearance=dataclasses.replace(IMAGES.appearance, scale_rate=1e4)))
+        assert record.status == "failed"
+        rendered, _ = scene.render(scene.roll(STEP, "failed"), settings())
+        assert (rendered.status, rendered.reason) == ("failed", record.reason)
+        assert "splats are not finite" in rendered.reason
+    finally:
+        scene.learn(settings())
+
+
+def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_path):
+    """Hands all over frame 1 leave black on both sides."""
+    for path in sorted((scene.capture.folder / "mask" / "0").iterdir()):
+        (tmp_path / "mask" / "0").mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, tmp_path / "mask" / "0" / path.name)
+    cv2.imwrite(str(tmp_path / "mask" / "0" / "00001.png"), np.full((SIZE[1], SIZE[0]), HANDS, np.uint8))
+    for kind in ("color", "depth", "tracks.json", "capture.json"):
+        (tmp_path / kind).symlink_to(scene.capture.folder / kind)
+    rollout = scene.roll(STEP, "covered")
+    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
+    appearance.render(tmp_path, *paths, settings(video=False), "cpu", rollout.with_name("render.json"))
+    record = StageRecord.load(rollout.with_name("render.json"))
+    assert record.facts["empty_frames"] == 1
+    table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
+    scores = metrics.score_images(table, scene.observations.scenario, FRAMES, "m", 0).set_index(["task", "metric"])
+    assert np.isfinite(scores["value"]).all()
+    assert scores.loc[("reconstruction", "psnr"), "frames"] == 2
+    assert scores.loc[("reconstruction", "ssim"), "frames"] == 3
+
+
+def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
+    rollout = scene.roll(0 * STEP, "own")
+    splats = Splats.load(scene.appearance.with_name("splats.ply"))
+    path = rollout.with_name("centres.npz")
+    SplatCentres(positions=splats.means + np.arange(FRAMES)[:, None, None] * STEP).save(path)
+    before = StageRecord.load(rollout)
+    files = {"trajectory": rollout.with_name("trajectory.npz"), "centres": path}
+    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    record, drawn = scene.render(rollout, settings())
+    # The nodes stand still, the splats do not; all of them are drawn, also faint ones.
+    assert record.facts["splats"] == len(splats.means)
+    assert mean(drawn, "iou", FRAMES - 1) > 0.85
+    SplatCentres(positions=splats.means[None, 1:]).save(path)
+    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    with pytest.raises(InputError, match="one centre for each of"):
+        scene.render(rollout, settings())
+    before.save(rollout)
+
+
+def test_pictures_of_any_camera_and_frame(scene, tmp_path):
+    rollout = scene.roll(STEP, "drawn")
+    common = (scene.capture.folder, scene.appearance, rollout)
+    made = appearance.draw(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
+    assert [path.name for path in made] == ["00001.png", "00004.png"]
+    white = cv2.imread(str(made[0]), cv2.IMREAD_UNCHANGED)
+    black = cv2.imread(str(appearance.draw(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
+    assert white.shape == (SIZE[1], SIZE[0], 4)
+    assert np.array_equal(white[..., 3], black[..., 3])
+    # Over a background c the colour is colour over black + (1 - coverage) c.
+    assert np.abs(white[..., :3].astype(int) - black[..., :3] - (255 - black[..., 3:].astype(int))).max() <= 2
+    with pytest.raises(InputError, match="must be a camera of"):
+        appearance.draw(*common, "7", None, "black", settings(), "cpu", tmp_path)
+    with pytest.raises(InputError, match=r"frames 0 to 5; received \[9\]"):
+        appearance.draw(*common, "0", [9], "black", settings(), "cpu", tmp_path)
+
+
+def test_training_follows_its_seed_and_repeats(scene, tmp_path):
+    first = scene.appearance.with_name("splats.ply").read_bytes()
+    scene.learn(settings(), seed=1)
+    other = scene.appearance.with_name("splats.ply").read_bytes()
+    scene.learn(settings())
+    assert first == scene.appearance.with_name("splats.ply").read_bytes() != other
+
+
+def test_a_frozen_skin_is_a_setting(scene):
+    _, table = scene.render(scene.roll(STEP, "frozen"), settings(frozen_skinning=True, video=False))
+    assert mean(table, "psnr", FRAMES - 1) > mean(table, "psnr", 0) - 4
+
+
+def test_pictures_from_the_side_keep_the_object_in_view(scene):
+    gaussians = Gaussians.of(Splats.load(scene.appearance.with_name("splats.ply")))
+    camera = scene.capture.cameras["0"]
+    view = View.of(camera.camera_to_world, camera.intrinsics, camera.width, camera.height)
+    pictures = [turned(gaussians, view, "warp", angle) for angle in (0, 90, 180, 270)]
+    for picture in pictures:
+        dark = (picture.min(axis=2) < 200).mean()
+        assert 0.01 < dark < 0.5
+    with torch.no_grad():
+        straight = gaussians.draw(view, background=(1.0, 1.0, 1.0)).rgb.clamp(0, 1).numpy()
+    assert np.abs(pictures[0] / 255 - straight).max() < 0.02
+
+
+def spoiled(scene: Scene, folder, **changes: object) -> Capture:
+    """The capture with other entries for camera 0, its images shared."""
+    values = json.loads((scene.capture.folder / "capture.json").read_text())
+    values["cameras"][0] |= changes
+    folder.mkdir()
+    for kind in ("color", "depth", "mask", "tracks.json"):
+        (folder / kind).symlink_to(scene.capture.folder / kind)
+    (folder / "capture.json").write_text(json.dumps(values))
+    return Capture.load(folder)
+
+
+def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
+    lifted = scene.folder / "lifted.json"
+    appearance.learn(capture.folder, masks or scene.masks, settings(), 0, "cpu", tmp_path / "appearance.json", lifted_record=lifted)
+
+
+def test_a_camera_inside_the_object_is_named(scene, tmp_path):
+    pose = np.array(scene.capture.description.cameras[0].camera_to_world)
+    pose[:3, 3] = scene.observations.nodes.mean(axis=0)
+    with pytest.raises(InputError, match=r"capture\.json: cameras\.0\.camera_to_world.*outside the object"):
+        learn_from(scene, spoiled(scene, tmp_path / "inside", camera_to_world=pose.tolist()), tmp_path)
+
+
+def test_images_of_another_size_are_named(scene, tmp_path):
+    with pytest.raises(InputError, match=r"masks must have the frames and size of camera 0: \(6, 90, 200\).*\(6, 90, 160\)"):
+        learn_from(scene, spoiled(scene, tmp_path / "wide", width=200), tmp_path)
+
+
+def with_masks(scene: Scene, folder, labels: np.ndarray) -> list:
+    """The scene's masks, camera 0's replaced."""
+    folder.mkdir()
+    Masks(labels=labels, backend="given").save(folder / "masks.npz")
+    Stopwatch().stage("segment", "ok", {"masks": folder / "masks.npz"}).save(folder / "masks.json")
+    return [folder / "masks.json", *scene.masks[1:]]
+
+
+def test_masks_of_another_size_and_empty_ones_are_named(scene, tmp_path, capsys):
+    other = with_masks(scene, tmp_path / "small", np.ones((FRAMES, 45, 80), np.uint8))
+    with pytest.raises(InputError, match=r"masks\.json.*size of camera 0.*\(6, 45, 80\)"):
+        learn_from(scene, scene.capture, tmp_path, other)
+    empty = with_masks(scene, tmp_path / "empty", np.zeros((FRAMES, SIZE[1], SIZE[0]), np.uint8))
+    learn_from(scene, scene.capture, tmp_path, empty)
+    assert "camera 0: the object is not in view in frame 0" in capsys.readouterr().out
+    assert StageRecord.load(tmp_path / "appearance.json").facts["cameras"] == ["1", "2"]
+    with pytest.raises(InputError, match="at least one camera must have the object in view"):
+        learn_from(scene, scene.capture, tmp_path, [empty[0]] * 3)
+
+
+def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
+    shorter = spoiled(scene, tmp_path / "shorter")
+    values = json.loads((shorter.folder / "capture.json").read_text())
+    (shorter.folder / "capture.json").write_text(json.dumps(values | {"frame_count": 5}))
+    rollout = scene.roll(STEP, "length")
+    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
+    with pytest.raises(InputError, match=r"capture\.json: must have as many frames as .*observations\.npz: 6.*received 5.*enabled"):
+        appearance.render(shorter.folder, *paths, settings(), "cpu", rollout.with_name("render.json"))
+
+
+def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
+    missing = LpipsWeights(backbone=str(tmp_path / "none.pth"))
+    with pytest.raises(InputError, match=r"none\.pth"):
+        scene.render(scene.roll(STEP, "weights"), settings(lpips=missing))
+
+
+def test_processed_data_need_no_lifted_points(scene, tmp_path):
+    """As of PhysTwin's released cases: masks are lifted, surface points of the observations stand for the shape prior."""
+    output, seen = tmp_path / "appearance.json", scene.folder / "observations.npz"
+    appearance.learn(scene.capture.folder, scene.masks, settings(), 0, "cpu", output, observations_path=seen)
+    facts = StageRecord.load(output).facts
+    assert facts["unseen_surface"] is None
+    assert all(facts[f"psnr_{name}"] > 25 for name in scene.capture.cameras)

@@ -1,0 +1,202 @@
+"""The steps from a capture to observations, on a small film whose motion is known."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.config import Config, ScenarioRow
+from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling, Segmentation
+from neuspring.core.artifacts import Observations
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.data import phystwin
+from neuspring.data.capture import Capture
+from neuspring.stages import perceive, stages
+from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
+from tests.support.phystwin_case import dump, write_json
+
+ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
+SETTINGS = Config(
+    scenarios=("film",),
+    perception=Perception(
+        track=PointTracking(opencv=OpenCvTracking(points=400)),
+        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
+        sample=Sampling(voxel=0.015),
+    ),
+)
+
+
+def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
+    """All steps through their records, as the workflow calls them."""
+    masks, tracks = [], []
+    for camera in capture.cameras:
+        masks.append(folder / camera / "masks.json")
+        tracks.append(folder / camera / "tracks.json")
+        masks[-1].parent.mkdir(parents=True)
+        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
+        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
+    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
+    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
+    return Observations.load(folder / "observations.npz")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    capture = film(folder / "capture")
+    return capture, perceived(capture, folder), folder
+
+
+def motion_error(observations: Observations, turn: np.ndarray | None = None) -> np.ndarray:
+    """Distance, m, of visible points from where the film moved them."""
+    moved = observations.object_points[0] + np.arange(FRAMES)[:, None, None] * (STEP if turn is None else turn @ STEP)
+    return np.linalg.norm(moved - observations.object_points, axis=2)[1:][observations.object_visibility[1:]]
+
+
+def test_points_and_controllers_move_as_filmed(whole):
+    _, observations, _ = whole
+    assert observations.object_points.shape[1] > 40
+    assert np.median(motion_error(observations)) < 0.002
+    controllers = observations.controller_points
+    assert controllers.shape[1] == 10
+    moved = np.linalg.norm(controllers - controllers[0] - np.arange(FRAMES)[:, None, None] * STEP, axis=2)
+    # A pixel is 4.4 mm wide there, and a ball has little to hold on to.
+    assert np.median(moved[1:]) < 0.003
+    assert len(observations.surface_points) > 10
+    assert len(observations.interior_points) > 10
+    assert observations.tracks.shape == (FRAMES, observations.tracks.shape[1], 3)
+
+
+def test_each_step_names_its_backend_and_draws_a_picture(whole):
+    _, observations, folder = whole
+    masks = StageRecord.load(folder / "0" / "masks.json")
+    assert masks.settings["Segmentation"]["backend"] == "given"
+    tracks = StageRecord.load(folder / "0" / "tracks.json")
+    assert tracks.settings["PointTracking"]["backend"] == "opencv"
+    assert 0 < tracks.facts["visible_share"] <= 1
+    lifted = StageRecord.load(folder / "lifted.json")
+    assert lifted.facts["controllers"] == 10
+    for path, role in ((folder / "0" / "masks.json", "picture"), (folder / "lifted.json", "picture")):
+        assert StageRecord.load(path).file(role, path).stat().st_size > 5000
+    assert observations.scenario.provenance["shape prior"] == "visual_hull"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_fewer_cameras_see_less_of_the_same(tmp_path, whole, count):
+    observations = perceived(film(tmp_path / "capture", cameras=count), tmp_path)
+    assert np.median(motion_error(observations)) < 0.003
+    assert observations.object_points.shape[1] < whole[1].object_points.shape[1]
+
+
+def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
+    capture = film(tmp_path / "capture", cameras=2, sizes=((160, 90), (120, 100)), missing={1: (2, 3)})
+    observations = perceived(capture, tmp_path)
+    assert np.median(motion_error(observations)) < 0.003
+    # Frames 2 and 3 have the first camera alone, frame 4 both.
+    assert observations.object_visibility[2].mean() < observations.object_visibility[4].mean()
+
+
+def test_opencv_finds_what_the_given_masks_show(tmp_path, whole):
+    settings = replace(SETTINGS, perception=replace(SETTINGS.perception, segment=Segmentation(backend="opencv")))
+    observations = perceived(whole[0], tmp_path, settings=settings)
+    assert np.median(motion_error(observations)) < 0.003
+    assert StageRecord.load(tmp_path / "0" / "masks.json").settings["Segmentation"]["backend"] == "opencv"
+
+
+def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
+    """Its world has z down; a capture of ours in that world, and the same written raw and imported."""
+    own = film(tmp_path / "own", cameras=2, up="-z", train_end=4)
+    case = write_raw(own, tmp_path / "data" / "thing")
+    row = ScenarioRow(scenario="film", source="phystwin_raw", category="toy", path="thing", self_collision=False, ground=True)
+    perceive.make_capture(row, replace(SETTINGS, data_root=str(case.parent)), tmp_path / "imported" / "capture.json")
+    imported = Capture.load(tmp_path / "imported")
+    assert imported.train_end == 4
+    expected, found = perceived(own, tmp_path / "a"), perceived(imported, tmp_path / "b", row)
+    assert np.median(motion_error(found, FLIP[:3, :3])) < 0.003
+    for name in ("object_points", "object_visibility", "object_motion_valid", "controller_points", "surface_points", "tracks"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9, err_msg=name)
+
+
+def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp_path):
+    observations = perceived(film(tmp_path / "capture", cameras=2, up="-z"), tmp_path)
+    case = tmp_path / "different_types" / "film"
+    visible = observations.object_visibility
+    dump(
+        case / "final_data.pkl",
+        {
+            "object_points": observations.object_points.astype(float),
+            "object_colors": np.where(visible[..., None], 0.5, 0.0) * np.ones(3),
+            "object_visibilities": visible,
+            "object_motions_valid": observations.object_motion_valid,
+            "controller_points": observations.controller_points.astype(float),
+            "surface_points": observations.surface_points.astype(float),
+            "interior_points": observations.interior_points.astype(float),
+            "controller_mask": np.arange(observations.controller_points.shape[1]),
+        },
+    )
+    write_json(case / "split.json", {"frame_len": FRAMES, "train": [0, 4], "test": [4, FRAMES]})
+    dump(case / "gt_track_3d.pkl", observations.tracks.astype(float))
+    read = phystwin.read(replace(ROW, source="phystwin", path=str(case)), case)
+    for name in ("object_points", "object_visibility", "object_motion_valid", "controller_points", "surface_points"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(observations, name), err_msg=name)
+
+
+def test_given_masks_must_be_there(tmp_path):
+    capture = film(tmp_path / "capture", cameras=1, masks=False)
+    with pytest.raises(InputError, match=r"backend: given needs masks: true.*Choose another backend: opencv"):
+        perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+
+
+def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
+    capture = film(tmp_path / "capture", cameras=1)
+    for frame in range(FRAMES):
+        labels = capture.mask("0", frame)
+        labels[2:22, 2:22] = 1
+        labels = np.where((labels == 1) & (frame > 3), 0, labels).astype(np.uint8)
+        cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
+    perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+    said = capsys.readouterr().out
+    assert "the object's mask of frame 0 has 2 pieces far apart; two objects become one twin" in said
+    assert "no object in 2 frames, first in frame 4" in said
+    facts = StageRecord.load(tmp_path / "masks.json").facts
+    assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
+
+
+def test_a_camera_without_object_and_hand_in_frame_0_is_not_used(tmp_path, capsys):
+    capture = film(tmp_path / "capture", cameras=2)
+    cv2.imwrite(str(capture.path("mask", "1", 0)), np.zeros(SIZE[::-1], np.uint8))
+    observations = perceived(capture, tmp_path)
+    assert "camera 1: neither object nor hands in frame 0; it is not used" in capsys.readouterr().out
+    assert np.median(motion_error(observations)) < 0.003
+
+
+def test_an_unknown_camera_is_named(tmp_path, whole):
+    with pytest.raises(InputError, match=r"must have a camera left; received \['0', '1', '2'\]"):
+        perceive.segment(whole[0].folder, "left", SETTINGS, "cpu", tmp_path / "masks.json")
+
+
+def test_every_camera_s_records_are_required(tmp_path, whole):
+    _, _, folder = whole
+    with pytest.raises(InputError, match="one record per camera is required"):
+        perceive.lift(whole[0].folder, [folder / "0" / "masks.json"], [folder / "0" / "tracks.json"], SETTINGS, tmp_path / "l.json")
+
+
+def test_too_few_controllers_say_what_to_change(tmp_path, whole):
+    _, _, folder = whole
+    settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighbourhood=0.02, least_controllers=3000)))
+    records = [[folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")]
+    with pytest.raises(InputError, match=r"at least 3000 points of the hands.*perception\.lift has controller_gaps"):
+        perceive.lift(whole[0].folder, *records, settings, tmp_path / "lifted.json")
+
+
+def test_raw_video_must_be_perceived_first(tmp_path):
+    with pytest.raises(InputError, match="need --capture and --lifted"):
+        stages.observe(ROW, SETTINGS, tmp_path / "observations.npz")
+
+
+def test_records_are_plain_json(whole):
+    _, _, folder = whole
+    assert json.loads((folder / "lifted.json").read_text())["status"] == "ok"

@@ -1,0 +1,182 @@
+"""Stages by hand: records name their files, failures pass through, the run record is complete."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.records import StageRecord
+from neuspring.experiments.tracking import log as tracking
+from neuspring.report.tables import summary as tables
+from neuspring.scores import metrics
+from neuspring.stages import stages
+from tests.support import small
+
+SETTINGS = config.Config(
+    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    fit=config.Fit(epochs=2),
+    toy=config.Toy(frames=8),
+    device="cpu",
+)
+
+
+METHODS = {"phystwin": (1, "springs"), "search_only": (1, None), "neuspring": (3, "field")}
+"""Regions and what the second stage trains."""
+
+
+def run_all(folder, name="small", *, method="phystwin", settings=SETTINGS):
+    """Observe, search, fit, roll out and score one toy scene; returns the path of run.json."""
+    clusters, kind = METHODS[method]
+    searched = "search-uniform" if clusters == 1 else f"search-piecewise_{clusters}"
+    seen, found = folder / name / "observations.npz", folder / name / searched / "0" / "search.json"
+    out = folder / name / method / "0"
+    if not seen.exists():
+        stages.observe(small.row(name=name), settings, seen)
+    if not found.exists():
+        stages.search(seen, settings, clusters, 0, "cpu", found)
+    records = {"search": found}
+    if kind:
+        stages.fit(seen, found, settings, kind, "cpu", out / "fit.json")
+        records["fit"] = out / "fit.json"
+    stages.rollout(seen, list(records.values())[-1:], False, "cpu", out / "rollout.json")
+    stages.score(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
+    return out / "run.json"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Results of one scene, with and without the second stage."""
+    folder = tmp_path_factory.mktemp("results")
+    return folder, run_all(folder), run_all(folder, method="search_only")
+
+
+def test_every_step_leaves_what_its_record_names(finished):
+    folder, run, _ = finished
+    record = StageRecord.load(run.with_name("fit.json"))
+    assert record.status == "ok"
+    twin = Twin.load(record.file("twin", run.with_name("fit.json")))
+    observations = Observations.load(folder / "small" / "observations.npz")
+    assert len(twin.topology.nodes) == len(observations.nodes)
+    assert Twin.load(folder / "small" / "truth.npz").topology.nodes.shape == twin.topology.nodes.shape
+    assert not list(folder.rglob("*partial*"))
+    assert not list(folder.rglob("*.part"))
+    plots = sorted(path.name for path in run.parent.glob("plots/*.png"))
+    assert plots == ["errors.png", "losses.png", "motion.png", "stiffness.png", "topology.png"]
+
+
+def test_scores_are_the_metrics_of_the_trajectory(finished):
+    folder, run, _ = finished
+    observations = Observations.load(folder / "small" / "observations.npz")
+    trajectory = Trajectory.load(run.with_name("trajectory.npz"))
+    expected = metrics.score(trajectory, observations, "phystwin", 0)
+    pd.testing.assert_frame_equal(pd.read_parquet(run.with_name("scores.parquet")), expected)
+    assert len(expected) == 4
+
+
+def test_the_tracking_module_accepts_the_run_record(finished):
+    _, run, _ = finished
+    record = tracking.RunRecord.load(run)
+    assert record.status == "ok"
+    assert set(record.timings) == {"search", "fit", "rollout", "score"}
+    assert record.params["search.result.springs"] > 0
+    assert set(record.histories) == {"search", "fit"}
+
+
+def test_a_method_without_second_stage_shares_the_search(finished):
+    _, run, coarse = finished
+    first, second = (json.loads(path.read_text()) for path in (run, coarse))
+    assert first["histories"]["search"] == second["histories"]["search"] == "../../search-uniform/0/history.parquet"
+    assert second["artifacts"]["twin"] == ["../../search-uniform/0/twin.npz"]
+    assert first["run_key"] != second["run_key"]
+
+
+def test_regions_and_a_field_pass_through_every_stage(tmp_path):
+    fit = config.Fit(epochs=2, selection="tail", field=config.SpringField(channels=4, hidden=16, bands=2))
+    run = run_all(tmp_path, method="neuspring", settings=replace(SETTINGS, fit=fit))
+    record = tracking.RunRecord.load(run)
+    assert record.status == "ok"
+    assert (record.params["search.clusters"], record.params["fit.kind"]) == (3, "field")
+    assert {f"search.result.object_radius.{region}" for region in range(3)} <= record.params.keys()
+    found = tmp_path / "small" / "search-piecewise_3" / "0" / "search.json"
+    assert StageRecord.load(found).settings["clusters"] == 3
+    coarse = Twin.load(found.with_name("twin.npz"))
+    fitted = Twin.load(run.with_name("twin.npz"))
+    assert np.unique(fitted.topology.labels).tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(fitted.topology.springs, coarse.topology.springs)
+    history = pd.read_parquet(run.with_name("history.parquet"))
+    counts = history["metric"].value_counts().to_dict()
+    assert counts == {"loss": 2, "tail_loss": 2, "gradient_norm": 2, "learning_rate": 2}
+
+
+def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
+    seen = finished[0] / "small" / "observations.npz"
+    larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
+    stages.search(seen, SETTINGS, 1, 0, "cpu", tmp_path / "search.json")
+    before = pd.read_parquet(tmp_path / "trace.parquet")
+    stages.search(seen, larger, 1, 0, "cpu", tmp_path / "search.json")
+    record, after = StageRecord.load(tmp_path / "search.json"), pd.read_parquet(tmp_path / "trace.parquet")
+    assert (record.attempts, record.facts["rollouts"], len(after)) == (2, 14, 14)
+    # Candidates that were there are not evaluated again: not even their times change.
+    pd.testing.assert_frame_equal(after[: len(before)], before, check_exact=True)
+    assert record.file("trace", tmp_path / "search.json").exists()
+    # Everything else does start a search afresh.
+    other = replace(larger, losses=config.Losses(track=2.0))
+    stages.search(seen, other, 1, 0, "cpu", tmp_path / "search.json")
+    assert StageRecord.load(tmp_path / "search.json").attempts == 1
+
+
+def test_the_same_results_have_the_same_key(finished, tmp_path):
+    _, run, _ = finished
+    again = run_all(tmp_path)
+    first, second = (json.loads(path.read_text()) for path in (run, again))
+    assert first["run_key"] == second["run_key"]
+
+
+def test_a_missing_or_changed_artefact_is_an_error_that_says_what_to_do(finished, tmp_path):
+    twin = tmp_path / "twin.npz"
+    _, run, _ = finished
+    record = tmp_path / "fit.json"
+    record.write_bytes(run.with_name("fit.json").read_bytes())
+    with pytest.raises(InputError, match=r"twin.npz: named by .*no such file.*Delete .*fit.json and run again"):
+        StageRecord.load(record).file("twin", record)
+    twin.write_bytes(b"other")
+    with pytest.raises(InputError, match="other content"):
+        StageRecord.load(record).file("twin", record)
+
+
+def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypatch):
+    def fails(*_arguments, **_options):
+        raise NumericalFailure("every candidate diverged")
+
+    monkeypatch.setattr("neuspring.twin.search.search", fails)
+    run_all(tmp_path, "bad")
+    monkeypatch.undo()
+    run_all(tmp_path, "good")
+    collected = tables.collect(tmp_path, ["bad", "good"], ["phystwin"], [0])
+    by_name = collected.runs.set_index("scenario")
+    assert by_name.loc["bad", "status"] == "failed"
+    assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
+    text = tables.summary_text(collected, "phystwin")
+    assert "1/2 (1 failed)" in text
+    assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
+    assert "nan" not in text.lower()
+    assert tracking.RunRecord.load(tmp_path / "bad" / "phystwin" / "0" / "run.json").status == "failed"
+
+
+def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
+    folder, _, _ = finished
+    monkeypatch.setattr("neuspring.twin.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
+    found = folder / "small" / "search-uniform" / "0" / "search.json"
+    stages.rollout(folder / "small" / "observations.npz", [found], False, "cpu", tmp_path / "rollout.json")
+    record = StageRecord.load(tmp_path / "rollout.json")
+    assert record.status == "failed"
+    assert "left the scene in frame" in record.reason
+    records = {"search": found, "rollout": tmp_path / "rollout.json"}
+    stages.score(folder / "small" / "observations.npz", records, "search_only", {}, 0, tmp_path / "run.json")
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
+    assert len(pd.read_parquet(tmp_path / "scores.parquet")) < 4

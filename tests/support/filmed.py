@@ -1,0 +1,112 @@
+"""A small film with known motion for tests: a body and a hand's ball above it move together, seen by cameras around them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.synthetic.hands import SKIN
+from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
+from neuspring.data.synthetic.make import looking
+from neuspring.data.synthetic.render import Part, Renderer
+from neuspring.data.synthetic.sensor import quantised
+from tests.support.phystwin_case import dump, write_json
+
+FRAMES = 6
+STEP = np.array([0.004, 0.002, 0.006])
+"""m per frame."""
+BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
+HAND_PLACE = np.array([-0.02, 0.0, 0.145])
+EYES = ((0.45, -0.35, 0.4), (-0.2, 0.55, 0.4), (-0.4, -0.4, 0.45))
+SIZE = (160, 90)
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From a world with z up to one with z down, as PhysTwin's."""
+
+
+def intrinsics(size: tuple[int, int]) -> np.ndarray:
+    focal = 0.85 * size[0]
+    return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
+
+
+def film(
+    folder: Path,
+    cameras: int = 3,
+    sizes: Sequence[tuple[int, int]] = (SIZE, SIZE, SIZE),
+    missing: Mapping[int, tuple[int, ...]] | None = None,
+    up: str = "+z",
+    **changes: object,
+) -> Capture:
+    """A capture with masks; `missing` frames by camera. Annotated tracks: twenty vertices of the body."""
+    missing = missing or {}
+    vertices, faces = surface(BODY, (-0.08, -0.08, -0.01), (0.15, 0.08, 0.13), 0.004)
+    ball, ball_faces = surface(sphere((0, 0, 0), 0.032), (-0.04,) * 3, (0.04,) * 3, 0.004)
+    colours = np.where(np.sin(90 * vertices[:, :1] + 60 * vertices[:, 1:2]) > 0, [0.15, 0.3, 0.65], [0.3, 0.55, 0.3])
+    renderer = Renderer(
+        [
+            Part(vertices, faces, colours, OBJECT, (60.0, 0.8)),
+            Part(ball, ball_faces, np.tile(SKIN, (len(ball), 1)), HANDS, (45.0, 0.6)),
+        ]
+    )
+    turn = FLIP if up == "-z" else np.eye(4)
+    poses = [looking(np.array(eye), np.array([0.03, 0, 0.08])) for eye in EYES[:cameras]]
+    entries = tuple(
+        CameraEntry(
+            name=str(k),
+            width=size[0],
+            height=size[1],
+            intrinsics=rows(intrinsics(size)),
+            camera_to_world=rows(turn @ pose),
+            missing=missing.get(k, ()),
+        )
+        for k, (pose, size) in enumerate(zip(poses, sizes, strict=False))
+    )
+    plain = {"format": 1, "name": "film", "category": "toy", "frame_count": FRAMES, "frame_rate": 30.0, "masks": True}
+    writer = Writer(folder, Description(**(plain | {"cameras": entries, "up": up} | changes)))
+    upright = {entry.name: (entry, pose) for entry, pose in zip(entries, poses, strict=True)}
+    for frame in range(FRAMES):
+        renderer.move([vertices + frame * STEP, ball + HAND_PLACE + frame * STEP])
+        for name, camera in writer.capture.cameras.items():
+            entry, pose = upright[name]
+            if frame not in entry.missing:
+                view = renderer.render(type(camera)(name, camera.width, camera.height, camera.intrinsics, pose))
+                writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
+    chosen = vertices[:: len(vertices) // 20]
+    return writer.finish((chosen + np.arange(FRAMES)[:, None, None] * STEP) @ turn[:3, :3].T)
+
+
+def write_raw(capture: Capture, case: Path) -> Path:
+    """The capture in PhysTwin's raw layout: one mask per detection, depth as npy in millimetres, poses as a pickle."""
+    case.mkdir(parents=True)
+    first = next(iter(capture.cameras.values()))
+    metadata = {
+        "intrinsics": [camera.intrinsics.tolist() for camera in capture.cameras.values()],
+        "WH": [first.width, first.height],
+        "frame_num": capture.frame_count,
+        "fps": 30,
+    }
+    write_json(case / "metadata.json", metadata)
+    dump(case / "calibrate.pkl", [camera.camera_to_world for camera in capture.cameras.values()])
+    write_json(case / "split.json", {"frame_len": capture.frame_count, "train": [0, 4], "test": [4, capture.frame_count]})
+    dump(case / "gt_track_3d.pkl", capture.tracks())
+    for name in capture.cameras:
+        (case / "mask").mkdir(exist_ok=True)
+        (case / "mask" / f"mask_info_{name}.json").write_text(json.dumps({"0": "toy", "1": "hand"}))
+        for frame in range(capture.frame_count):
+            for kind in ("color", "depth"):
+                (case / kind / name).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(case / "color" / name / f"{frame}.png"), capture.colour(name, frame)[..., ::-1])
+            np.save(case / "depth" / name / f"{frame}.npy", np.round(1000 * capture.depth(name, frame)).astype(np.uint16))
+            for detection, label in (("0", OBJECT), ("1", HANDS)):
+                path = case / "mask" / name / detection / f"{frame}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(path), np.where(capture.mask(name, frame) == label, 255, 0).astype(np.uint8))
+    return case
+
+
+def rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(map(float, row)) for row in matrix)

@@ -1,0 +1,242 @@
+"""A results folder as the workflow leaves it, with invented numbers: for tests of the report, and to time it.
+
+`python -m tests.support.report_tree FOLDER` makes the full benchmark (22 scenarios, 20 methods, 3 seeds) and times its report.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Scenario, Trajectory
+from neuspring.core.files import write_table, write_text
+from neuspring.core.job_records import Attempt, JobRecord
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.report.video import Video
+from neuspring.scores import paper
+from neuspring.scores.metrics import COLUMNS, UNITS
+
+FRAMES, TRAIN, RATE = 20, 14, 30.0
+SEARCHES = {"search_only": "uniform", "baseline": "uniform", "phystwin": "uniform", "model_b": "uniform"}
+"""All other methods start from a piecewise search."""
+LEVELS = {"chamfer": 0.006, "track_error": 0.010, "psnr": 28.0, "ssim": 0.94, "iou": 0.84}
+SCORED = ("chamfer", "track_error")
+
+
+def make(
+    results: Path,
+    scenarios: Sequence[str] = ("rope", "cloth"),
+    methods: Sequence[str] = ("baseline", "neuspring"),
+    seeds: Sequence[int] = (0, 1),
+    *,
+    source: str = "synthetic",
+    pictures: bool = True,
+    curves: bool = True,
+    nodes: int = 30,
+    commit: str = "0123456789abcdef",
+) -> Path:
+    """Finished runs of every combination; returns `results`."""
+    drawn = _pictures(results / "drawn") if pictures else {}
+    for scenario in scenarios:
+        seen = _observations(scenario, source, nodes)
+        seen.save(results / scenario / "observations.npz")
+        for method in methods:
+            for seed in seeds:
+                write_run(results, seen, method, seed, drawn, curves=curves, commit=commit)
+    return results
+
+
+def write_run(
+    results: Path, seen: Observations, method: str, seed: int, drawn: dict[str, bytes], *, curves: bool = True, **changes: Any
+) -> Path:
+    """One finished run with the records of its stages; `changes` replace entries of run.json. Returns its path.
+
+    Without `curves` it has no histories and no trajectory.
+    """
+    scenario = seen.scenario
+    rng = np.random.default_rng(zlib.crc32(f"{scenario.name} {method} {seed}".encode()))
+    row = SEARCHES.get(method, "piecewise_5")
+    folder, search = results / scenario.name / method / str(seed), results / scenario.name / f"search-{row}" / str(seed)
+    for place in (folder, search):
+        place.mkdir(parents=True, exist_ok=True)
+    chosen = config.plain(config.Config(fit=config.Fit(epochs=5), search=config.Search(rollouts=30)))
+    own = {name: chosen[name] for name in ("simulation", "losses", "released_quirks")}
+    settings: dict[str, dict[str, Any]] = {"search": own | {"search": chosen["search"]}, "rollout": {}}
+    _history(search / "history.parquet", "best_cost", np.minimum.accumulate(rng.uniform(1e-5, 2e-3, 30)))
+    StageRecord(stage="search", status="ok", settings=settings["search"]).save(search / "search.json")
+    records, histories = {"search": search / "search.json"}, {"search": search / "history.parquet"}
+    if method != "search_only":
+        settings["fit"] = own | {"fit": chosen["fit"]}
+        _history(folder / "history.parquet", "loss", 1e-4 * np.exp(-np.arange(5.0)))
+        StageRecord(stage="fit", status="ok", settings=settings["fit"]).save(folder / "fit.json")
+        records["fit"], histories["fit"] = folder / "fit.json", folder / "history.parquet"
+    named = {}
+    if curves:
+        positions = seen.nodes + 1e-3 * rng.normal(size=(FRAMES, 1, 3)).cumsum(axis=0)
+        Trajectory(positions=positions, frame_count=FRAMES).save(folder / "trajectory.npz")
+        named = {"trajectory": ["trajectory.npz", digest_file(folder / "trajectory.npz")]}
+    StageRecord(stage="rollout", status="ok", files=named).save(folder / "rollout.json")
+    records["rollout"] = folder / "rollout.json"
+    _scores(scenario, method, seed, bool(drawn), rng).to_parquet(folder / "scores.parquet", index=False)
+    for name, data in drawn.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(data)
+    names = list(drawn)
+    run = {
+        **{"scenario": scenario.name, "method": method, "seed": seed, "source": scenario.source, "category": scenario.category},
+        **{"format": 1, "status": "ok", "reason": "", "notes": [], "run_key": digest_file(folder / "scores.parquet")},
+        **{"commit": "0123456789abcdef", "device": "cuda:0", "machine": "x86_64, Python 3.11.7", "attempt": 1},
+        **{"variant": {"search": row, "clusters": 5, "fit": "field", "carry_over": False, "average_seeds": False, "horizon": 10}},
+        **{"images": None, "params": {}, "settings": settings, "data_digest": "0" * 64, "scores_file": "scores.parquet"},
+        "histories": {name: _relative(path, folder) for name, path in histories.items() if curves},
+        "timings": {name: float(rng.uniform(60, 600)) for name in records} | {"score": 2.0},
+        "peak_memory_mb": dict.fromkeys(records, 900.0),
+        "artifacts": {
+            "records": [_relative(path, folder) for path in records.values()],
+            "plots": [name for name in names if name.startswith("plots/")],
+            "images": [name for name in names if not name.startswith("plots/")],
+        },
+    }
+    write_text(folder / "run.json", json.dumps(run | changes))
+    return folder / "run.json"
+
+
+def write_jobs(
+    results: Path,
+    scenarios: Iterable[str],
+    methods: Iterable[str],
+    seeds: Iterable[int],
+    gpus: int = 4,
+    *,
+    again: int = 10,
+    never: int = 25,
+) -> None:
+    """Job records of fits that filled some GPUs; every `again`-th needed a second attempt, every `never`-th failed for good."""
+    ends, count = [0.0] * gpus, 0
+    for scenario in scenarios:
+        for method in methods:
+            for seed in seeds:
+                gpu = ends.index(min(ends))
+                attempts = []
+                outcomes = (
+                    ["permanent"] if count % never == never - 1 else ["transient", "ok"] if count % again == again - 1 else ["ok"]
+                )
+                for outcome in outcomes:
+                    seconds = 200.0 + 37 * (count % 7)
+                    attempts.append(attempt(ends[gpu], seconds, outcome=outcome, devices=[str(gpu)]))
+                    ends[gpu] += seconds + 3
+                save_job(results, f"fit/{scenario}/{method}/{seed}", attempts)
+                count += 1
+
+
+def attempt(start: float, seconds: float, **changes: Any) -> Attempt:
+    """An attempt that began `start` seconds after midnight; failed ones ran out of memory unless told otherwise."""
+    stamp = pd.Timestamp("2026-01-05T00:00:00+00:00") + pd.Timedelta(seconds=start)
+    failed = changes.get("outcome", "ok") not in ("ok", "running")
+    values: dict[str, Any] = {
+        **{"started": stamp.isoformat(), "seconds": seconds, "waited": 2.0, "outcome": "ok", "host": "server", "exit": int(failed)},
+        **{"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "peak_gpu_memory_mb": 5000.0, "gpu_utilisation": 83.0},
+        **{"cause": "out of GPU memory" if failed else "", "message": "CUDA error: out of memory" if failed else ""},
+        "cpu_seconds": 1.1 * seconds,
+    }
+    return Attempt(**(values | changes))
+
+
+def save_job(results: Path, name: str, attempts: Sequence[Attempt]) -> None:
+    """A job record and its log."""
+    JobRecord(rule=name.partition("/")[0], name=name, log=f"logs/{name}.log", attempts=list(attempts)).save(results)
+    write_text(results / "logs" / f"{name}.log", "what it said\n")
+
+
+def _observations(name: str, source: str, nodes: int) -> Observations:
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    category = name.removeprefix("synthetic_").split("_")[-1] if not name[-1].isdigit() else name.split("_")[-2]
+    scenario = Scenario(name=name, source=source, category=category, frame_count=FRAMES, train_end=TRAIN, frame_rate=RATE, up="+z")
+    points = rng.uniform(-0.1, 0.1, (nodes, 3)) + np.zeros((FRAMES, 1, 1))
+    everywhere = np.ones((FRAMES, nodes), bool)
+    return Observations(
+        scenario=scenario,
+        object_points=points,
+        object_visibility=everywhere,
+        object_motion_valid=everywhere,
+        controller_points=points[:, :1],
+        surface_points=np.zeros((0, 3)),
+        interior_points=np.zeros((0, 3)),
+        tracks=points[:, :5],
+    )
+
+
+def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.random.Generator) -> pd.DataFrame:
+    better = 0.85 if method == "neuspring" else 1.0
+    rows = []
+    for task, factor, frames in (("reconstruction", 1.0, TRAIN - 1), ("future", 1.8, FRAMES - TRAIN)):
+        for metric, level in LEVELS.items():
+            if metric in SCORED:
+                value = level * factor * better * rng.uniform(0.8, 1.25)
+            elif pictured:
+                value = level - 0.02 * level * factor * better * rng.uniform(0.8, 1.25)
+            else:
+                continue
+            rows.append((scenario.name, scenario.category, method, seed, task, metric, value, UNITS[metric], frames))
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _history(path: Path, metric: str, values: np.ndarray) -> None:
+    write_table(pd.DataFrame({"step": np.arange(len(values)), "metric": metric, "value": values}), path)
+
+
+def _pictures(folder: Path) -> dict[str, bytes]:
+    """Name in a run's folder -> bytes of a picture or film of that kind."""
+    folder.mkdir(parents=True)
+    across = np.linspace(0, 255, 1300).astype(np.uint8)
+    found = {}
+    for name, height in {"images.png": 500, "plots/motion.png": 600, "plots/stiffness.png": 400, "plots/topology.png": 500}.items():
+        picture = np.repeat(np.repeat(across[None, :, None], height, axis=0), 3, axis=2)
+        cv2.putText(picture, name, (40, height // 2), cv2.FONT_HERSHEY_SIMPLEX, 3, (60, 90, 200), 5)
+        found[name] = cv2.imencode(".png", picture)[1].tobytes()
+    for name in ("video.mp4", "turntable.mp4"):
+        with Video(folder / name, RATE) as video:
+            for frame in range(5):
+                video.add(np.full((32, 48, 3), 40 * frame, np.uint8))
+        found[name] = (folder / name).read_bytes()
+        (folder / name).unlink()
+    folder.rmdir()
+    return found
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def main() -> None:
+    """Make the full benchmark and time its report."""
+    from neuspring.report.page import Options, write
+    from neuspring.scores.studies import read_studies
+
+    results = Path(sys.argv[1])
+    methods = list(config.read_yaml(Path("config/methods.yaml")))[:20]
+    scenarios, seeds = sorted(paper.scenarios()), (0, 1, 2)
+    if not results.exists():
+        make(results, scenarios, methods, seeds, source="phystwin", nodes=2000)
+        write_jobs(results, scenarios, methods, seeds, gpus=8)
+    wall, cpu = time.perf_counter(), time.process_time()
+    page = write(results, results / "report.html", Options(studies=read_studies(Path("config/studies.yaml"))))
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    print(
+        f"{len(scenarios)} x {len(methods)} x {len(seeds)}: {wall:.1f} s ({cpu:.1f} s of CPU), {page.stat().st_size / 1e6:.1f} MB"
+    )
+
+
+if __name__ == "__main__":
+    main()

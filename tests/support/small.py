@@ -1,0 +1,77 @@
+"""Small toy captures and settings, cheap enough for tests that search, fit and run the workflow."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+from neuspring import config
+from neuspring.core.artifacts import Observations
+from neuspring.data.synthetic import toy
+from neuspring.twin.fit import FitProblem
+from neuspring.twin.search import SearchProblem, candidate
+
+FRAMES = 8
+
+
+def row(path: str = "rope/lift/smooth", name: str = "small") -> config.ScenarioRow:
+    """A row of the scenario table for a toy scene."""
+    return config.ScenarioRow(scenario=name, source="toy", category="rope", path=path, self_collision=False, ground=True)
+
+
+@functools.cache
+def scene(path: str = "rope/lift/smooth", noise: float = 0.0, occlusion: float = 0.0, frames: int = FRAMES) -> toy.ToyScene:
+    """A toy scene of a few frames."""
+    return toy.make(row(path), config.Toy(frames=frames, noise=noise, occlusion=occlusion))
+
+
+def observations() -> Observations:
+    """Exact observations of the default scene."""
+    return scene().observations
+
+
+def spoiled_future() -> Observations:
+    """The default scene with everything that a method must not read made wrong: all arrays after the split, and the tracks."""
+    seen = observations()
+    changed = {}
+    for name in ("object_points", "controller_points"):
+        values = getattr(seen, name).copy()
+        values[seen.scenario.train_end :] += 1.0
+        changed[name] = values
+    for name in ("object_visibility", "object_motion_valid"):
+        values = getattr(seen, name).copy()
+        values[seen.scenario.train_end :] ^= True
+        changed[name] = values
+    return replace(seen, **changed, tracks=seen.tracks + 1.0)
+
+
+def search_problem(seen: Observations | None = None, **changes: object) -> SearchProblem:
+    """A search of two generations; `changes` replace fields of SearchProblem."""
+    settings: dict[str, object] = {
+        "observations": seen or observations(),
+        "search": config.Search(rollouts=22, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+        "simulation": config.Simulation(),
+        "losses": config.Losses(),
+        "quirks": config.ReleasedQuirks(),
+    }
+    return SearchProblem(**(settings | changes))  # type: ignore[arg-type]
+
+
+def start_values() -> dict[str, float]:
+    """Physical values near the truth of the default scene, stiffness too low."""
+    start = config.plain(config.SearchStart(object_radius=0.045, object_neighbours=18, stiffness=6e3, drag=1.0, dashpot=20.0))
+    return {name: float(value) for name, value in start.items()}
+
+
+def fit_problem(seen: Observations | None = None, values: dict[str, float] | None = None, **changes: object) -> FitProblem:
+    """A short fit from `start_values`; `changes` replace fields of FitProblem."""
+    search = search_problem(seen)
+    settings: dict[str, object] = {
+        "observations": search.observations,
+        "twin": candidate(search, values or start_values()),
+        "fit": config.Fit(epochs=3, learning_rate=5e-2, checkpoint_every=1),
+        "simulation": search.simulation,
+        "losses": search.losses,
+        "quirks": search.quirks,
+    }
+    return FitProblem(**(settings | changes))  # type: ignore[arg-type]

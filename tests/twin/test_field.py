@@ -1,0 +1,273 @@
+"""The neural spring field: zero at the start, as large as the paper says, and the same function as its dense definition."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import grid_sample
+
+from neuspring import config
+from neuspring.twin.field import AXES, SpringField, TriPlane, adaptive_resolution, bilinear, fourier, in_cube, midpoints
+from neuspring.twin.parameters import TwinParameters
+from tests.support import small
+
+EXACT = 1e-12
+"""Absolute, for values of order 1 in float64: the same sums in another order."""
+STEPS = 1e-8
+"""Absolute, for weights of order 1 after optimiser steps in float64: Adam divides by gradients, which magnifies rounding."""
+SMALL = {"channels": 3, "hidden": 8, "bands": 2}
+FOURIER = ("feature", "coordinates", "both", "none")
+
+
+def points(count: int = 30, seed: int = 0) -> np.ndarray:
+    """Midpoints of a body of 0.3 x 0.1 x 0.2 m, away from the origin."""
+    return np.random.default_rng(seed).uniform(0, 1, (count, 3)) * [0.3, 0.1, 0.2] + [5, -3, 1]
+
+
+def made(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **settings) -> SpringField:
+    """A small field in float64."""
+    return SpringField(points() if at is None else at, config.SpringField(**(SMALL | settings)), outputs, seed).double()
+
+
+def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
+    """A few steps towards `target` [S, outputs]."""
+    optimiser = torch.optim.Adam(field.parameters(), lr=1e-2)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        (field() - target).square().mean().backward()
+        optimiser.step()
+
+
+# The start ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{}, {"triplane": False}, {"fourier": "none"}, {"resolution": 256}])
+def test_the_field_is_zero_at_the_start_and_can_leave_it(settings):
+    field = made(**settings)
+    assert not field().any()
+    train(field, torch.ones(30, 2))
+    assert field().abs().min() > 0
+
+
+@pytest.mark.parametrize("scale", ["log", "linear"])
+@pytest.mark.parametrize("output_bound", [0.0, 1.5])
+def test_stiffness_is_bitwise_that_of_the_twin_at_the_start(scale, output_bound):
+    """Clamped as the simulation clamps it, and no further."""
+    twin = small.scene().truth  # stiffness from 6e3 to 2.4e4 N
+    limits = (7e3, 2e4)
+    settings = config.Fit(stiffness_range=limits, output_bound=output_bound, field=config.SpringField(scale=scale))
+    found = TwinParameters(twin, settings, "field", "cpu").physical()["stiffness"].detach().numpy()
+    np.testing.assert_array_equal(found, np.clip(twin.material.stiffness, *limits))
+    assert (found != twin.material.stiffness).any()
+
+
+def test_weights_follow_the_seed_alone():
+    torch.manual_seed(1)
+    first = made(seed=3).state_dict()
+    torch.manual_seed(2)
+    again, other = made(seed=3).state_dict(), made(seed=4).state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["planes.texels"], other["planes.texels"])
+    assert not torch.equal(first["layers.0.weight"], other["layers.0.weight"])
+
+
+# Size -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("springs", "resolution"), [(1, 2), (9, 3), (50, 6), (1062, 28), (4000, 54), (20000, 120)])
+def test_the_adaptive_resolution_follows_the_number_of_springs(springs, resolution):
+    """N = round(0.85 sqrt(|E|)), and two texels at least."""
+    assert adaptive_resolution(springs) == max(2, math.floor(0.85 * math.sqrt(springs) + 0.5)) == resolution
+
+
+def test_the_resolution_is_adaptive_or_fixed():
+    assert made(points(50)).resolution == 6
+    fixed = made(points(50), resolution=256)
+    assert fixed.resolution == 256
+    assert fixed.planes is not None
+    # Of 3 x 256 x 256 texels only those that some midpoint reads can change.
+    assert len(fixed.planes.texels) <= 12 * 50
+
+
+def test_the_network_has_three_layers_of_the_paper_s_width():
+    field = SpringField(points(), config.SpringField(), 1, 0)
+    # 32 channels and 3 coordinates, each as sine and cosine of 4 bands.
+    assert [tuple(layer.weight.shape) for layer in field.layers] == [(128, (32 + 3) * 8), (128, 128), (1, 128)]
+    assert field.planes is not None
+    assert field.planes.texels.shape[1] == 32
+
+
+@pytest.mark.parametrize("option", FOURIER)
+def test_every_fourier_option_has_its_width_and_trains(option):
+    width = {"feature": 3 * 4, "coordinates": 3 + 3 * 4, "both": 3 * 4 + 3 * 4, "none": 3}[option]
+    field = made(fourier=option)
+    assert field.encoded().shape == (30, width)
+    assert field.layers[0].in_features == width
+    before = field.planes.texels.detach().clone()
+    train(field, torch.from_numpy(np.sin(points(30)[:, :2])))
+    assert not torch.equal(field.planes.texels, before), "the planes take part"
+
+
+def test_the_fourier_transform_by_hand():
+    u = torch.tensor([[0.25, -0.5]])
+    pi = math.pi
+    angles = [0.25 * pi, 0.5 * pi, 1.0 * pi, -0.5 * pi, -1.0 * pi, -2.0 * pi]
+    expected = torch.tensor([[*map(math.sin, angles), *map(math.cos, angles)]])
+    torch.testing.assert_close(fourier(u, 3), expected)
+
+
+# Where springs are ----------------------------------------------------------------------------------------------------
+
+
+def test_midpoints_lie_between_nodes_and_controllers():
+    nodes, hands = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 4, 2]])
+    np.testing.assert_array_equal(midpoints(np.concatenate([nodes, hands]), np.array([[0, 1], [2, 1]])), [[0.5, 0, 0], [0.5, 2, 1]])
+
+
+def test_the_bounding_cube_has_the_longest_side_and_one_scale_for_all_axes():
+    corners = np.array([[0.0, 0, 0], [4, 1, 2], [1, 0.5, 0]])
+    np.testing.assert_allclose(in_cube(corners), [[-1, -0.25, -0.5], [1, 0.25, 0.5], [-0.5, 0, -0.5]], atol=EXACT)
+    assert not in_cube(np.ones((3, 3))).any(), "a single place is the centre"
+
+
+@pytest.mark.parametrize("factor", [1000.0, 39.37])
+def test_units_and_place_do_not_matter(factor):
+    """Midpoints in metres, millimetres or inches, here or elsewhere: the same coordinates, texels and features."""
+    metres, other = made(), made(points() * factor + 7)
+    torch.testing.assert_close(other.coordinates, metres.coordinates)
+    assert torch.equal(other.planes.indices, metres.planes.indices)
+    # Coordinates pass through float32 when the field is made.
+    torch.testing.assert_close(other.encoded(), metres.encoded(), rtol=0, atol=1e-5)
+
+
+def test_permuting_springs_permutes_the_field_and_changes_nothing_else():
+    order = np.random.default_rng(1).permutation(30)
+    target = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
+    first, second = made(), made(points()[order])
+    train(first, target)
+    train(second, target[order])
+    assert first().std() > 1e-3
+    torch.testing.assert_close(second(), first()[order], rtol=0, atol=STEPS)
+    for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
+        torch.testing.assert_close(b, a, rtol=0, atol=STEPS, msg=name)
+
+
+def test_without_planes_only_coordinates_count():
+    field = made(triplane=False)
+    assert field.planes is None
+    torch.testing.assert_close(field.encoded(), fourier(field.coordinates, 2), rtol=0, atol=0)
+    assert {name.partition(".")[0] for name, _ in field.named_parameters()} == {"layers"}
+    assert field.roughness() == 0
+    # Springs at the same place have the same F.
+    twice = made(np.concatenate([points(), points()]), triplane=False)
+    train(twice, torch.randn(60, 2, generator=torch.Generator().manual_seed(0)))
+    torch.testing.assert_close(twice()[30:], twice()[:30], rtol=0, atol=EXACT)
+
+
+# Planes ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_bilinear_lookup_by_hand():
+    """N = 3: texels at -1, 0, 1. The point (0.5, -1, 0.2) lies on column 1.5 and row 0 of xy, and so on."""
+    cells, weights = bilinear(np.array([[0.5, -1.0, 0.2]]), 3)
+    found = dict.fromkeys(range(27), 0.0)
+    for cell, weight in zip(cells[0], weights[0], strict=True):
+        found[int(cell)] += weight
+    xy = {1: 0.5, 2: 0.5}  # row 0 (y = -1), columns 1 and 2
+    yz = {9 + 3: 0.8, 9 + 6: 0.2}  # rows 1 and 2 (z = 0.2), column 0
+    xz = {18 + 4: 0.4, 18 + 5: 0.4, 18 + 7: 0.1, 18 + 8: 0.1}
+    assert {cell: weight for cell, weight in found.items() if weight} == pytest.approx(xy | yz | xz)
+
+
+def dense(at: np.ndarray, resolution: int, channels: int, scale: float) -> tuple[TriPlane, torch.Tensor]:
+    """Planes that keep only the texels in use, and the full planes [3, C, N, N] of which they are a part, in float64."""
+    planes = TriPlane(at, resolution, channels, scale, torch.Generator().manual_seed(5)).double()
+    full = scale * torch.randn(3 * resolution**2, channels, generator=torch.Generator().manual_seed(5))
+    return planes, full.double().reshape(3, resolution, resolution, channels).permute(0, 3, 1, 2).contiguous()
+
+
+def sample(full: torch.Tensor, at: np.ndarray) -> torch.Tensor:
+    """Summed features [S, C] of full planes [3, C, N, N], by torch's own bilinear interpolation."""
+    grid = torch.stack([torch.from_numpy(at[:, list(axes)]) for axes in AXES])[:, None]
+    return grid_sample(full, grid, mode="bilinear", align_corners=True)[:, :, 0].sum(dim=0).T
+
+
+def scattered(count: int = 40) -> np.ndarray:
+    """Points of the cube [-1, 1]^3, some of them on its sides and corners."""
+    at = np.random.default_rng(3).uniform(-1, 1, (count, 3))
+    at[:3], at[3, 0], at[4, 1:], at[5] = [[-1, -1, -1], [1, 1, 1], [1, -1, 1]], 1.0, -1.0, 0.0
+    return at
+
+
+@pytest.mark.parametrize("resolution", [2, 3, 16])
+def test_the_lookup_equals_grid_sample_on_the_full_planes(resolution):
+    at = scattered()
+    planes, full = dense(at, resolution, 4, 1.0)
+    # The interpolation weights are kept in float32.
+    weights = torch.from_numpy(bilinear(at, resolution)[1])
+    torch.testing.assert_close(planes.weights, weights.float().double(), rtol=0, atol=0)
+    planes.weights = weights
+    torch.testing.assert_close(planes(), sample(full, at), rtol=0, atol=EXACT)
+
+
+def test_texels_in_use_take_the_same_steps_as_full_planes():
+    """Three steps of Adam towards random features; texels that no point reads keep their first values."""
+    at, resolution = scattered(), 16
+    planes, full = dense(at, resolution, 4, 0.1)
+    planes.weights = torch.from_numpy(bilinear(at, resolution)[1])
+    first = full.clone()
+    full.requires_grad_()
+    target = torch.randn(len(at), 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for parameter, features in ((planes.texels, planes), (full, lambda: sample(full, at))):
+        optimiser = torch.optim.AdamW([parameter], lr=1e-2, weight_decay=0.0)
+        for _ in range(3):
+            optimiser.zero_grad()
+            (features() - target).square().mean().backward()
+            optimiser.step()
+    active = np.unique(bilinear(at, resolution)[0])
+    flat, start = (values.detach().permute(0, 2, 3, 1).reshape(-1, 4) for values in (full, first))
+    assert 0 < len(active) == len(planes.texels) < 3 * resolution**2
+    torch.testing.assert_close(planes.texels.detach(), flat[active], rtol=0, atol=STEPS)
+    assert (planes.texels.detach() - start[active]).abs().max() > 1e-3
+    unread = np.setdiff1d(np.arange(3 * resolution**2), active)
+    assert torch.equal(flat[unread], start[unread])
+
+
+def test_roughness_by_hand():
+    """N = 2, one point inside: all four texels of each plane are in use, so each plane has four pairs of neighbours."""
+    planes, full = dense(np.zeros((1, 3)), 2, 2, 1.0)
+    squares = []
+    for plane in full:
+        (a, b), (c, d) = plane.permute(1, 2, 0)
+        squares += [(p - q).square() for p, q in ((a, b), (c, d), (a, c), (b, d))]
+    torch.testing.assert_close(planes.roughness(), torch.stack(squares).mean(), rtol=0, atol=EXACT)
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_roughness_counts_neighbours_in_use_and_no_others(count):
+    """Neither across the end of a row nor from one plane to the next, nor texels that no point reads."""
+    at, resolution = scattered()[:count], 5
+    planes, full = dense(at, resolution, 2, 1.0)
+    used = np.zeros(3 * resolution**2, bool)
+    used[bilinear(at, resolution)[0]] = True
+    used = used.reshape(3, resolution, resolution)
+    values = full.permute(0, 2, 3, 1).numpy()
+    squares = [
+        np.square(values[p, i, j] - values[p, i + down, j + right])
+        for p in range(3)
+        for i in range(resolution)
+        for j in range(resolution)
+        for down, right in ((1, 0), (0, 1))
+        if i + down < resolution and j + right < resolution and used[p, i, j] and used[p, i + down, j + right]
+    ]
+    assert planes.roughness().item() == pytest.approx(np.mean(squares), rel=EXACT)
+
+
+def test_smoothing_lowers_the_roughness():
+    planes, _ = dense(scattered(), 5, 2, 1.0)
+    before = planes.roughness()
+    before.backward()
+    with torch.no_grad():
+        planes.texels -= 0.1 * planes.texels.grad
+    assert planes.roughness() < before

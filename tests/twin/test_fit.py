@@ -1,0 +1,408 @@
+"""The first-order stage: recovery on exact data, horizons, selection, schedules, exact continuation, rollback, quirks."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.stats import pearsonr
+
+from neuspring import config
+from neuspring.core.artifacts import SCALARS, Observations, Twin
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.physics import stability
+from neuspring.twin import fit as module
+from neuspring.twin.fit import LOWEST_RATE, FitProblem, NonFinite, TwinFit, fit
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.rollout import roll_out
+from tests.support import small
+
+RATE = 1e-12
+"""Relative: learning rates are a few operations in float64."""
+MEAN = 1e-6
+"""Relative: a mean of losses in float32, summed in another order."""
+FIELD = config.SpringField(channels=4, hidden=16, bands=2)
+"""Small enough for tests."""
+
+
+def true_problem(**settings) -> FitProblem:
+    """The true topology and damping, with the stiffness made homogeneous: only it is to be found."""
+    truth = small.scene().truth
+    mean = np.full_like(truth.material.stiffness, 1.2e4)
+    start = replace(truth, material=replace(truth.material, stiffness=mean))
+    return small.fit_problem(twin=start, fit=config.Fit(**({"epochs": 12, "learning_rate": 3e-2} | settings)))
+
+
+@pytest.mark.parametrize("horizon", [1, 3, 0])
+def test_training_lowers_the_loss_on_exact_data(horizon):
+    result = fit(true_problem(horizon=horizon))
+    losses = result.history["loss"]
+    assert losses.iloc[-1] < 0.7 * losses.iloc[0]
+    assert result.rollbacks == []
+
+
+def field_fit(**settings) -> config.Fit:
+    """Settings of a fit of a small field."""
+    return config.Fit(**({"epochs": 5, "learning_rate": 1e-2, "checkpoint_every": 1, "field": FIELD} | settings))
+
+
+@pytest.mark.parametrize("horizon", [1, 0])
+@pytest.mark.parametrize("field", [{}, {"triplane": False}, {"scale": "linear"}], ids=str)
+def test_a_field_lowers_the_loss(field, horizon):
+    settings = field_fit(
+        epochs=8 if horizon else 12,
+        learning_rate=5e-3 if horizon else 1e-2,
+        horizon=horizon,
+        output_bound=1.5,
+        field=replace(FIELD, **field),
+    )
+    result = fit(replace(true_problem(), fit=settings, kind="field"))
+    losses = result.history["loss"]
+    assert losses.iloc[-1] < 0.7 * losses.iloc[0]
+    assert result.rollbacks == []
+    assert result.twin.material.stiffness.std() > 10.0, "not one factor for all"
+
+
+def test_the_whole_horizon_gradient_moves_stiffness_towards_the_truth():
+    truth = np.log(small.scene().truth.material.stiffness)
+    result = fit(true_problem(horizon=0, epochs=30, learning_rate=5e-2))
+    found = np.log(result.twin.material.stiffness)
+    start = np.log(1.2e4)
+    moved = np.abs(found - start) > 0.05
+    assert moved.sum() > 100
+    # Eight frames do not determine every spring, but the ones that moved cannot have moved this way by chance.
+    correlation = pearsonr(found[moved], truth[moved])
+    assert correlation.statistic > 0
+    assert correlation.pvalue < 1e-6
+    assert result.history["loss"].iloc[-1] < 0.1 * result.history["loss"].iloc[0]
+
+
+GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0, checkpoint_every=1)}
+REGULARISED = {"kind": "field", "fit": field_fit(epochs=3, field=replace(FIELD, weight_decay=1e-3, plane_smoothness=1e-3))}
+EVERYTHING = {
+    "kind": "field",
+    "fit": field_fit(
+        schedule="cosine",
+        warmup_epochs=1,
+        homogeneous_epochs=2,
+        damping="springs",
+        rest_length_bound=0.05,
+        output_bound=1.5,
+        selection="tail",
+    ),
+}
+LIMITED = {
+    "fit": config.Fit(epochs=4, learning_rate=0.3, checkpoint_every=1),
+    "simulation": config.Simulation(max_substeps=70),
+}
+"""Substeps grow within the second epoch, until it is rolled back because they may not grow further."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "killed_in"),
+    [({}, 3), (GROWING, 8), (GROWING, 10), (REGULARISED, 3), (EVERYTHING, 2), (EVERYTHING, 4), (LIMITED, 3)],
+    ids=["springs", "growing-8", "growing-10", "field", "everything-2", "everything-4", "limited"],
+)
+def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
+    whole = fit(small.fit_problem(**changes))
+    partial = tmp_path / "fit.npz"
+    epochs = 0
+    run_epoch = TwinFit.epoch
+
+    def dying(self):
+        nonlocal epochs
+        epochs += 1
+        if epochs == killed_in:
+            raise KeyboardInterrupt
+        return run_epoch(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TwinFit, "epoch", dying)
+        with pytest.raises(KeyboardInterrupt):
+            fit(small.fit_problem(**changes), partial=partial, key="k")
+    continued = fit(small.fit_problem(**changes), partial=partial, key="k")
+    assert (whole.attempts, continued.attempts) == (1, 2)
+    assert_same_twin(continued.twin, whole.twin)
+    assert (continued.best_epoch, continued.best_loss) == (whole.best_epoch, whole.best_loss)
+    pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
+
+
+def assert_same_twin(found: Twin, expected: Twin) -> None:
+    """Everything that a fit may change is equal, bit for bit."""
+    assert found.simulation == expected.simulation
+    for name in ("stiffness", "dashpot"):
+        np.testing.assert_array_equal(getattr(found.material, name), getattr(expected.material, name))
+    np.testing.assert_array_equal(found.topology.rest_lengths, expected.topology.rest_lengths)
+    for name in SCALARS:
+        # The physics is computed in single precision, so a fit rounds scalars to it.
+        assert np.float32(getattr(found.material, name)) == np.float32(getattr(expected.material, name)), name
+
+
+def test_the_seed_decides_the_first_weights_of_a_field():
+    runs = [fit(small.fit_problem(kind="field", fit=field_fit(epochs=2), seed=seed)) for seed in (0, 0, 1)]
+    assert_same_twin(runs[0].twin, runs[1].twin)
+    assert not np.array_equal(runs[0].twin.material.stiffness, runs[2].twin.material.stiffness)
+
+
+def test_a_checkpoint_of_another_problem_is_ignored(tmp_path, capsys):
+    partial = tmp_path / "fit.npz"
+    fit(small.fit_problem(), partial=partial, key="one")
+    assert fit(small.fit_problem(), partial=partial, key="two").attempts == 1
+    assert "other inputs or settings" in capsys.readouterr().out
+
+
+def test_a_non_finite_gradient_rolls_back_and_is_reported(monkeypatch):
+    problem = small.fit_problem()
+    calls = 0
+    real = module.simulate_frame
+
+    def poisoned(*arguments):
+        nonlocal calls
+        calls += 1
+        x, v = real(*arguments)
+        return (x * float("nan"), v) if calls == 7 else (x, v)  # in the second epoch: 4 training frames each
+
+    monkeypatch.setattr(module, "simulate_frame", poisoned)
+    result = fit(problem)
+    assert len(result.rollbacks) == 1
+    assert "epoch 1: the loss is not finite in frames 3 to 3" in result.rollbacks[0]
+    rows = result.history
+    assert rows["rolled_back"].tolist() == [False, True, False]
+    assert rows["learning_rate"].tolist() == [0.05, 0.05, 0.025]
+    assert np.isfinite(result.twin.material.stiffness).all()
+
+
+@pytest.mark.parametrize("settings", [{}, {"selection": "tail"}, {"selection": "tail", "horizon": 0}], ids=str)
+def test_a_fit_that_never_completes_an_epoch_is_a_named_failure(monkeypatch, settings):
+    monkeypatch.setattr(module, "simulate_frame", lambda s, p, x, v, b, e: (x * float("nan"), v))
+    with pytest.raises(NumericalFailure, match=r"no epoch could be completed: epoch 0: the loss is not finite"):
+        fit(small.fit_problem(fit=config.Fit(epochs=10, **settings)))
+
+
+def test_gradient_clipping_limits_the_step():
+    # Plain momentum-free Adam normalises steps, so clipping shows in its first moment, not in the step.
+    runs = {}
+    for limit in (0.0, 1e-9):
+        run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, clip_gradient_norm=limit, betas=(0.0, 0.0))))
+        run.epoch()
+        runs[limit] = np.linalg.norm(run.moments()["0.exp_avg"])
+    assert runs[1e-9] <= 1.01e-9 < runs[0.0]
+
+
+def test_stiffness_stays_within_its_clamp():
+    limit = (0.0, 7e3)
+    result = fit(small.fit_problem(fit=config.Fit(epochs=4, learning_rate=0.3, stiffness_range=limit)))
+    assert result.twin.material.stiffness.max() <= 7e3
+
+
+def test_stiffening_springs_get_more_substeps():
+    problem = small.fit_problem(**GROWING)
+    result = fit(problem)
+    assert result.twin.material.stiffness.max() > 2 * problem.twin.material.stiffness.max()
+    assert result.twin.simulation.substeps > problem.twin.simulation.substeps
+    stability.check(result.twin)
+
+
+def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
+    run = TwinFit(small.fit_problem(fit=config.Fit(damping="springs")))
+    with torch.no_grad():
+        run.parameters.offsets[0, 1] = 100.0
+    with pytest.raises(NonFinite, match="stiffness, rest length or dashpot is not finite"):
+        run.settled()
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_substeps_grow_within_an_epoch(kind):
+    """One epoch of four steps, so long that the last frames could not be integrated with the first substeps."""
+    settings = field_fit(epochs=1, learning_rate={"springs": 0.5, "field": 0.05}[kind])
+    problem = small.fit_problem(fit=settings, kind=kind)
+    result = fit(problem)
+    assert result.rollbacks == []
+    assert result.twin.simulation.substeps > problem.twin.simulation.substeps
+    stability.check(result.twin)
+    run = TwinFit(problem)
+    run.start_epoch(0, 1.0)
+    assert np.isfinite(run.epoch()["loss"])
+    assert run.twin.simulation.substeps > problem.twin.simulation.substeps, "before the epoch's end"
+    fixed = fit(
+        replace(problem, simulation=config.Simulation(substeps=problem.twin.simulation.substeps), fit=replace(settings, epochs=6))
+    )
+    assert "stiffness grew beyond" in fixed.rollbacks[0]
+
+
+def test_growing_dashpots_get_more_substeps():
+    start = small.fit_problem().twin
+    damped = replace(start, material=replace(start.material, dashpot=np.full_like(start.material.dashpot, 40.0)))
+    run = TwinFit(small.fit_problem(twin=damped, fit=config.Fit(damping="homogeneous")))
+    before = stability.smallest_safe_substeps(stability.twin_spectrum(damped), damped.simulation.frame_time, 0.8)
+    run.use_substeps(before)
+    run.settled()
+    assert run.twin.simulation.substeps == before
+    with torch.no_grad():
+        run.parameters.factors["dashpot"].fill_(math.log(3.0))
+    run.settled()
+    assert run.twin.simulation.substeps > before
+    stability.check(run.parameters.as_twin(run.twin))
+
+
+def test_overflow_is_counted_although_solvers_are_rebuilt():
+    seen = small.observations()
+    crowded = small.fit_problem(replace(seen, scenario=replace(seen.scenario, self_collision=True)))
+    start = replace(crowded.twin, simulation=replace(crowded.twin.simulation, collision_capacity=1))
+    slow, fast = (fit(replace(crowded, twin=start, fit=config.Fit(epochs=2, learning_rate=rate))) for rate in (1e-4, 0.5))
+    assert slow.twin.simulation.substeps == start.simulation.substeps < fast.twin.simulation.substeps
+    # Every node of the rope has about the same neighbours in both.
+    assert fast.collision_overflow > 0.9 * slow.collision_overflow > 0
+
+
+def limited(kind: str) -> dict[str, object]:
+    """Settings under which stiffness outgrows the substeps that it may have."""
+    start = small.fit_problem(**GROWING).twin
+    count = start.simulation.substeps
+    if kind == "fixed":
+        return GROWING | {"simulation": config.Simulation(substeps=count)}
+    return GROWING | {"simulation": config.Simulation(max_substeps=count)}
+
+
+@pytest.mark.parametrize("kind", ["fixed", "max_substeps"])
+def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind):
+    problem = small.fit_problem(**limited(kind))
+    result = fit(problem)
+    assert any("stiffness grew beyond" in text for text in result.rollbacks)
+    # The learning rate is halved, so training goes on after a rollback ...
+    rolled = result.history["rolled_back"].tolist()
+    assert not all(rolled[rolled.index(True) :])
+    # ... and what comes out can be rolled out as it is.
+    assert result.twin.simulation.substeps == problem.twin.simulation.substeps
+    stability.check(result.twin)
+
+
+def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epochs():
+    result = fit(small.fit_problem())
+    assert result.best_epoch == result.history["loss"].idxmin()
+    quirks = config.ReleasedQuirks(sparse_checkpoints=True)
+    eligible = [e for e in range(30) if module._eligible(e, small.fit_problem(quirks=quirks, fit=config.Fit(epochs=30)))]
+    assert eligible == [0, 20, 29]
+
+
+@pytest.mark.parametrize("changes", [{}, EVERYTHING, {"simulation": config.Simulation(initial_velocity="observed")}])
+def test_the_future_is_never_read(changes):
+    first, second = (fit(small.fit_problem(seen, **changes)) for seen in (small.observations(), small.spoiled_future()))
+    assert_same_twin(first.twin, second.twin)
+    pd.testing.assert_frame_equal(first.history, second.history, check_exact=True)
+
+
+# Which epoch wins -----------------------------------------------------------------------------------------------------
+
+
+def observed_as(twin: Twin, first: int) -> Observations:
+    """The default scene, in which training frames from `first` on show exactly what `twin` does."""
+    seen = small.observations()
+    predicted = roll_out(twin, seen.controller_points).positions[:, : seen.object_points.shape[1]]
+    points = seen.object_points.copy()
+    points[first : seen.scenario.train_end] = predicted[first : seen.scenario.train_end]
+    return replace(seen, object_points=points)
+
+
+def loss_of(twin: Twin, seen: Observations, frames: range) -> float:
+    """Mean loss of a rollout over some frames, m^2."""
+    loss = FrameLoss.of(seen, config.Losses(), "cpu")
+    positions = torch.tensor(roll_out(twin, seen.controller_points).positions)
+    return float(torch.stack([loss(frame, positions[frame]) for frame in frames]).mean())
+
+
+@pytest.mark.parametrize("horizon", [1, 0])
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon):
+    """Half of the four training frames are held back. Where they show what the start does, the start wins."""
+    settings = field_fit(selection="tail", tail_fraction=0.5, horizon=horizon)
+    start = small.fit_problem().twin
+    problems = [small.fit_problem(seen, fit=settings, kind=kind) for seen in (small.observations(), observed_as(start, 3))]
+    learned, stayed = (fit(problem) for problem in problems)
+    for column in ("loss", "gradient_norm", "learning_rate"):
+        assert learned.history[column].tolist() == stayed.history[column].tolist()
+    assert learned.history["tail_loss"].tolist() != stayed.history["tail_loss"].tolist()
+    assert learned.best_epoch > 0
+    assert stayed.best_epoch == -1
+    assert_same_twin(stayed.twin, start)
+    assert stayed.best_loss == pytest.approx(0, abs=1e-12)
+    # What selected is the loss of the twin that comes out, over the frames held back.
+    assert learned.best_loss == pytest.approx(loss_of(learned.twin, small.observations(), range(3, 5)), rel=MEAN)
+    assert learned.best_loss == learned.history["tail_loss"].min()
+
+
+def test_at_least_one_frame_is_held_back_and_one_trained_on():
+    for fraction, head_end in ((0.01, 4), (0.5, 3), (0.99, 2)):
+        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail", tail_fraction=fraction))).head_end == head_end
+    assert TwinFit(small.fit_problem()).head_end == 5
+
+
+def test_a_single_training_frame_cannot_be_held_back_and_trained_on():
+    seen = small.observations()
+    short = replace(seen, scenario=replace(seen.scenario, train_end=2))
+    with pytest.raises(InputError, match=r"selection.*two training frames"):
+        fit(small.fit_problem(short, fit=config.Fit(epochs=1, selection="tail")))
+    fit(small.fit_problem(short, fit=config.Fit(epochs=1)))
+
+
+def test_the_loss_of_a_one_step_epoch_belongs_to_the_values_before_the_step():
+    settings = {"horizon": 0, "learning_rate": 5e-2}
+    start = small.fit_problem().twin
+    once = fit(small.fit_problem(fit=config.Fit(epochs=1, **settings)))
+    assert once.best_epoch == -1
+    assert_same_twin(once.twin, start)
+    assert once.best_loss == pytest.approx(loss_of(start, small.observations(), range(1, 5)), rel=MEAN)
+    thrice = fit(small.fit_problem(fit=config.Fit(epochs=3, **settings)))
+    assert thrice.best_epoch == 1  # the loss seen in epoch 2 is that of the values at the end of epoch 1
+    assert thrice.best_loss == thrice.history["loss"].iloc[2] == thrice.history["loss"].min()
+    assert thrice.best_loss == pytest.approx(loss_of(thrice.twin, small.observations(), range(1, 5)), rel=MEAN)
+
+
+def test_several_steps_per_epoch_pair_the_loss_with_the_values_after_them():
+    """As released: the loss is summed while parameters change."""
+    result = fit(small.fit_problem(fit=config.Fit(epochs=1, learning_rate=5e-2)))
+    assert result.best_epoch == 0
+    assert not np.array_equal(result.twin.material.stiffness, small.fit_problem().twin.material.stiffness)
+
+
+# Learning rates -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+@pytest.mark.parametrize("warmup", [0, 3])
+def test_schedules_set_the_rates_that_their_formulas_say(schedule, warmup):
+    field = replace(FIELD, plane_learning_rate=0.2)
+    settings = field_fit(
+        epochs=8, learning_rate=0.1, scalar_learning_rate=0.3, schedule=schedule, warmup_epochs=warmup, field=field
+    )
+    run = TwinFit(small.fit_problem(fit=settings, kind="field"))
+    for epoch in range(8):
+        factor = min((epoch + 1) / (warmup + 1), 1.0)
+        if schedule == "cosine":
+            factor *= LOWEST_RATE + (1 - LOWEST_RATE) * 0.5 * (1 + math.cos(math.pi * epoch / 8))
+        # Rollbacks halve every rate.
+        for halved in (1.0, 0.25):
+            run.start_epoch(epoch, halved)
+            found = [group["lr"] for group in run.optimiser.param_groups]
+            assert found == pytest.approx([halved * factor * rate for rate in (0.1, 0.2, 0.3)], rel=RATE)
+
+
+def test_the_scheduled_rate_is_the_step_that_is_taken():
+    """The first step of Adam is the learning rate itself, but for its epsilon, 1e-3 of the largest gradient here."""
+    settings = config.Fit(epochs=4, learning_rate=0.1, warmup_epochs=3, horizon=0)
+    run = TwinFit(small.fit_problem(fit=settings))
+    run.start_epoch(0, 1.0)
+    run.epoch()
+    assert run.parameters.offsets.abs().max().item() == pytest.approx(0.1 / 4, rel=1e-2)
+    history = fit(small.fit_problem(fit=settings)).history
+    assert history["learning_rate"].tolist() == pytest.approx([0.025, 0.05, 0.075, 0.1], rel=RATE)
+
+
+def test_training_is_deterministic_whatever_torch_drew_before():
+    torch.manual_seed(1)
+    first = fit(small.fit_problem())
+    torch.manual_seed(2)
+    second = fit(small.fit_problem())
+    np.testing.assert_array_equal(first.twin.material.stiffness, second.twin.material.stiffness)

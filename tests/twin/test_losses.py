@@ -1,0 +1,145 @@
+"""Training losses against golden values (tests/golden/m05) and their rules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring.config import Losses
+from neuspring.twin import losses
+from neuspring.twin.losses import FrameLoss
+
+GOLDEN = {float: 1e-12, "float32": 1e-5}
+"""Relative: the golden README accepts 1e-5 from float32; values are float64 sums of some 100 terms of float32 inputs."""
+CASES = range(3)
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, np.ndarray]:
+    with np.load(Path(__file__).parents[1] / "golden/m05_train_losses.npz", allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
+
+
+@pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
+def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+    return request.param
+
+
+def tolerance(dtype: torch.dtype) -> float:
+    return GOLDEN[float] if dtype == torch.float64 else GOLDEN["float32"]
+
+
+def case(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    names = ("pred", "gt", "visible", "motion_valid", "v_start", "v_end", "prev_acc")
+    values = {name: torch.tensor(golden[f"{name}{k}"]) for name in names}
+    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in values.items()}
+
+
+def assert_close(got: torch.Tensor, wanted: np.ndarray, relative: float) -> None:
+    """Relative to the largest entry."""
+    scale = float(np.abs(wanted).max()) or 1.0
+    np.testing.assert_allclose(got.detach().double().numpy() / scale, wanted / scale, atol=relative, rtol=0)
+
+
+@pytest.mark.parametrize("k", CASES)
+def test_golden_chamfer(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+    """Small errors, errors beyond 1 m, nothing visible: value and gradient."""
+    c, surface = case(golden, k, dtype), int(golden[f"num_surface_points{k}"])
+    nodes = c["pred"].requires_grad_()
+    value = losses.chamfer(nodes, c["gt"], c["visible"], surface)
+    value.backward()
+    assert_close(value, golden[f"exp_chamfer{k}"], tolerance(dtype))
+    assert_close(nodes.grad, golden[f"exp_chamfer_grad{k}"], tolerance(dtype))
+
+
+@pytest.mark.parametrize("k", CASES)
+def test_golden_track(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+    c = case(golden, k, dtype)
+    nodes = c["pred"].requires_grad_()
+    value = losses.track(nodes, c["gt"], c["motion_valid"])
+    value.backward()
+    assert_close(value, golden[f"exp_track{k}"], tolerance(dtype))
+    assert_close(nodes.grad, golden[f"exp_track_grad{k}"], tolerance(dtype))
+
+
+@pytest.mark.parametrize("k", CASES)
+def test_golden_acceleration_and_total(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+    c, surface, weights = case(golden, k, dtype), int(golden[f"num_surface_points{k}"]), Losses()
+    smooth = weights.acceleration * losses.acceleration(c["v_end"] - c["v_start"], c["prev_acc"])
+    near = losses.chamfer(c["pred"], c["gt"], c["visible"], surface)
+    total = weights.chamfer * near + weights.track * losses.track(c["pred"], c["gt"], c["motion_valid"]) + smooth
+    assert_close(smooth, golden[f"exp_acc{k}"], tolerance(dtype))
+    assert_close(total, golden[f"exp_total{k}"], tolerance(dtype))
+
+
+@pytest.mark.parametrize("k", CASES)
+def test_golden_nearest(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same nodes, whatever the chunk size."""
+    c, surface = case(golden, k, dtype), int(golden[f"num_surface_points{k}"])
+    expected = golden[f"exp_nn{k}"][golden[f"visible{k}"]]
+    for chunk in (losses.CHUNK_ENTRIES, 7 * surface, 1):
+        monkeypatch.setattr(losses, "CHUNK_ENTRIES", chunk)
+        np.testing.assert_array_equal(losses.nearest(c["gt"][c["visible"]], c["pred"][:surface]), expected)
+
+
+def test_ties_go_to_the_lowest_index() -> None:
+    nodes = torch.tensor([[9.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    assert losses.nearest(torch.zeros(2, 3), nodes).tolist() == [1, 1]
+    assert losses.nearest(torch.zeros(1, 3), nodes.flip(0)).tolist() == [0]
+
+
+def test_the_track_loss_is_linear_beyond_one_metre() -> None:
+    nodes = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True)
+    value = losses.track(nodes, torch.zeros(1, 3), torch.tensor([True]))
+    assert value.item() == pytest.approx((0.5**2 / 2 + 1.5) / 3)
+    value.backward()
+    np.testing.assert_allclose(nodes.grad, [[0.5 / 3, 1 / 3, 0.0]])
+
+
+def test_nothing_seen_is_zero_with_a_gradient() -> None:
+    nodes = torch.rand(4, 3, requires_grad=True)
+    nobody = torch.zeros(2, dtype=torch.bool)
+    total = losses.chamfer(nodes, torch.rand(2, 3), nobody, 3) + losses.track(nodes, torch.rand(2, 3), nobody)
+    total.backward()
+    assert total.item() == 0.0
+    assert not nodes.grad.any()
+
+
+def frame_loss(*, frozen: bool = False, weights: Losses | None = None) -> tuple[FrameLoss, torch.Tensor]:
+    """Three frames of two points; frame 1 sees both, frame 2 sees one; one motion is valid in each of frames 0 and 1."""
+    points = torch.tensor([[[0.0, 0, 0], [1, 0, 0]], [[0.1, 0, 0], [1.1, 0, 0]], [[0.2, 0, 0], [1.2, 0, 0]]])
+    visible = torch.tensor([[True, True], [True, True], [False, True]])
+    valid = torch.tensor([[True, True], [False, True], [False, False]])
+    nodes = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.2, 0.0, 0]])
+    return FrameLoss(points, visible, valid, 2, weights or Losses(), frozen), nodes
+
+
+def test_frames_use_their_visibility_and_the_motion_before() -> None:
+    loss, nodes = frame_loss()
+    near, moved = loss.terms(1, nodes)
+    assert near.item() == pytest.approx(0.01)
+    assert moved.item() == pytest.approx(2 * 0.005 / 6)
+    near, moved = loss.terms(2, nodes)
+    # Only point 1 is visible, and node 2, which would be nearer, is not surface; only its motion 1 -> 2 is valid.
+    assert near.item() == pytest.approx(0.04)
+    assert moved.item() == pytest.approx(0.02 / 3)
+    assert loss(2, nodes).item() == pytest.approx(0.04 + 0.02 / 3)
+
+
+def test_frozen_counts_divide_by_frame_one() -> None:
+    """Released quirk 4: frame 2 sees one point and one motion, but is divided by frame 1's two and two."""
+    plain, nodes = frame_loss()
+    frozen, _ = frame_loss(frozen=True)
+    assert torch.equal(frozen(1, nodes), plain(1, nodes))
+    for got, wanted in zip(frozen.terms(2, nodes), plain.terms(2, nodes), strict=True):
+        assert got.item() == pytest.approx(wanted.item() / 2)
+
+
+def test_weights() -> None:
+    plain, nodes = frame_loss()
+    weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))
+    near, moved = plain.terms(1, nodes)
+    assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())

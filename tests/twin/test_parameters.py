@@ -1,0 +1,389 @@
+"""What is trained becomes physics: gradients through the field and the simulator, bounds, clamps, warm start."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
+from neuspring.physics.solver import FrameSolver
+from neuspring.twin.field import in_cube, midpoints
+from neuspring.twin.fit import TwinFit
+from neuspring.twin.parameters import CONTACT_SCALARS, TwinParameters, bounded, inward_clamp
+from tests.support import small
+from tests.support.scenes import random_scene, twin_of
+
+STEP = 1e-6
+ROUNDING = 1e-9
+"""Absolute error of central differences: a loss of 0.7 in float64 is known to 1e-16, and 1e-16 / STEP = 1e-10; measured that."""
+TRUNCATION = 1e-7
+"""The same, relative to the largest derivative: STEP^2 = 1e-12 times third derivatives, which networks and contact make large."""
+SINGLE = 1e-6
+"""Relative: a few operations in float32, whose rounding is 6e-8."""
+SMALL = {"channels": 3, "hidden": 8, "bands": 2}
+ALL = {"damping": "springs", "rest_length_bound": 0.2, "output_bound": 1.5}
+
+
+def twin() -> Twin:
+    """Ten nodes, two controllers, about 20 springs of 20 to 200 N, some of them controllers'."""
+    made, x, _, hands = random_scene(3)
+    return twin_of(made, x, hands[0])
+
+
+def parameters(kind: str = "field", start: Twin | None = None, field: dict | None = None, **settings) -> TwinParameters:
+    """Trained values of the small twin."""
+    chosen = config.Fit(field=config.SpringField(**(SMALL | (field or {}))), **settings)
+    return TwinParameters(start or twin(), chosen, kind, "cpu")
+
+
+def disturb(trained: TwinParameters, scale: float = 0.3, seed: int = 0) -> TwinParameters:
+    """Every trained value moved away from its start, at random, but contact scalars hardly, so that they stay in range."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, tensor in trained.named_parameters():
+            step = 0.01 if name.startswith("scalars") else scale
+            tensor += step * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
+    return trained
+
+
+def offsets(trained: TwinParameters, values: torch.Tensor | float) -> TwinParameters:
+    """Offsets of single springs [S, channels] set to `values`."""
+    with torch.no_grad():
+        trained.offsets.copy_(torch.as_tensor(values).expand_as(trained.offsets))
+    return trained
+
+
+# Gradients ------------------------------------------------------------------------------------------------------------
+
+TRAINED = {
+    "field": ("field", {}, ALL),
+    "linear field": ("field", {"scale": "linear"}, ALL),
+    "field of coordinates": ("field", {"triplane": False}, ALL),
+    "field of rest lengths too": ("field", {}, ALL | {"rest_lengths_by": "field"}),
+    "field without controllers": ("field", {"controllers": False, "fourier": "none"}, ALL | {"homogeneous_epochs": 1}),
+    "springs": ("springs", {}, ALL | {"damping": "homogeneous", "homogeneous_epochs": 1}),
+}
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_gradients_through_simulated_frames_match_differences(name):
+    """A loss over three frames, through simulator, physical values and network, down to single weights and texels.
+
+    The seed is one of a scene that touches the ground, so that every trained value has a gradient, and in which no stiffness
+    lies beyond its clamp, where the gradient is not meant to be the derivative.
+    """
+    kind, field, settings = TRAINED[name]
+    made, x, v, hands = random_scene(9, substeps=10)
+    start = twin_of(made, x, hands[0])
+    trained = parameters(kind, start, field, **settings).double()
+    trained.start = {key: value.double() for key, value in trained.start.items()}
+    disturb(trained)
+    topology, motion = start.topology, torch.tensor(hands)
+    solver = FrameSolver(topology.springs, len(x), hands.shape[1], start.simulation, dtype=torch.float64)
+    target = torch.tensor(np.random.default_rng(1).normal(size=(4, *x.shape)) * 0.1)
+
+    def loss() -> torch.Tensor:
+        packed, state = trained.pack(start.simulation.substep), (torch.tensor(x), torch.tensor(v))
+        total = torch.zeros((), dtype=torch.float64)
+        for frame in (1, 2, 3):
+            state = simulate_frame(solver, packed, *state, motion[frame - 1], motion[frame])
+            total = total + (state[0] - target[frame]).square().sum()
+        return total
+
+    loss().backward()
+    for parameter_name, tensor in trained.named_parameters():
+        if parameter_name.startswith("scalars.contact"):
+            continue  # nodes do not collide in this scene
+        flat, gradient = tensor.detach().view(-1), tensor.grad.view(-1)
+        largest = gradient.abs().topk(min(3, len(flat))).indices.tolist()
+        checked = sorted({*largest, 0, len(flat) // 2})
+        measured = []
+        for index in checked:
+            value = float(flat[index])
+            sides = []
+            for sign in (1, -1):
+                flat[index] = value + sign * STEP
+                with torch.no_grad():
+                    sides.append(float(loss()))
+            flat[index] = value
+            measured.append((sides[0] - sides[1]) / (2 * STEP))
+        scale = float(gradient.abs().max())
+        assert scale > 1e4 * ROUNDING, f"{parameter_name}: too small to be told from rounding"
+        tolerance = ROUNDING + TRUNCATION * scale
+        np.testing.assert_allclose(gradient[checked].numpy(), measured, rtol=0, atol=tolerance, err_msg=parameter_name)
+
+
+CLAMPED = [  # value, gradient, what is left of it
+    (0.5, 1.0, 1.0),
+    (0.5, -1.0, -1.0),
+    (2.0, 1.0, 1.0),  # above: a descent step leads back
+    (2.0, -1.0, 0.0),  # above: a descent step leads further away
+    (-2.0, -1.0, -1.0),
+    (-2.0, 1.0, 0.0),
+    (1.0, -1.0, 0.0),  # at the limit
+    (1.0, 1.0, 1.0),
+    (0.0, 1.0, 0.0),
+    (0.0, -1.0, -1.0),
+]
+
+
+@pytest.mark.parametrize(("value", "gradient", "left"), CLAMPED)
+def test_the_inward_clamp_feels_only_what_pulls_back(value, gradient, left):
+    at = torch.tensor([value], requires_grad=True)
+    clamped = inward_clamp(at, 0.0, 1.0)
+    assert clamped.item() == min(max(value, 0.0), 1.0)
+    clamped.backward(torch.tensor([gradient]))
+    assert at.grad.item() == left
+
+
+def test_a_spring_beyond_a_limit_stays_there_as_released_and_a_field_finds_back():
+    """The springs of a field move together, so those beyond the limit must say that they would be better off inside."""
+    limit = (0.0, 100.0)
+    single, field = parameters("springs", stiffness_range=limit), parameters("field", stiffness_range=limit)
+    stiffness = single.start["stiffness"]
+    beyond = stiffness > limit[1]
+    assert 0 < beyond.sum() < len(beyond)
+    for trained in (single, field):
+        found = trained.physical()["stiffness"]
+        assert torch.equal(found.detach(), stiffness.clamp(*limit))
+        found.sum().backward()  # as if lower stiffness were better
+    assert torch.equal(single.offsets.grad[:, 0], stiffness.masked_fill(beyond, 0.0))
+    torch.testing.assert_close(field.field.layers[-1].bias.grad[0], stiffness.sum(), rtol=SINGLE, atol=0)
+
+
+# Values ---------------------------------------------------------------------------------------------------------------
+
+
+def test_bounded_is_the_identity_near_zero_and_saturates():
+    offset = torch.linspace(-50, 50, 101, dtype=torch.float64)
+    assert torch.equal(bounded(offset, 0.0), offset)
+    within = bounded(offset, 1.5)
+    assert within.abs().max() <= 1.5
+    assert (within.diff() >= 0).all()
+    torch.testing.assert_close(within, 1.5 * torch.tanh(offset / 1.5))
+    near = torch.tensor([-1e-4, 1e-4], dtype=torch.float64)
+    torch.testing.assert_close(bounded(near, 1.5), near, rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_the_start_is_the_twin_whatever_is_trained(kind):
+    """Bit for bit, in single precision."""
+    start = twin()
+    found = parameters(kind, start, **ALL, homogeneous_epochs=2).physical()
+    for name, value in twin_tensors(start, "cpu").items():
+        assert torch.equal(found[name].detach().expand_as(value), value), name
+
+
+def test_offsets_are_logarithms_of_factors():
+    trained = parameters("springs", damping="springs")
+    values = torch.linspace(-1, 1, len(trained.start["stiffness"]))
+    offsets(trained, torch.stack([values, -values], dim=1))
+    found = trained.physical()
+    torch.testing.assert_close(found["stiffness"], trained.start["stiffness"] * values.exp(), rtol=SINGLE, atol=0)
+    torch.testing.assert_close(found["dashpot"], trained.start["dashpot"] * (-values).exp(), rtol=SINGLE, atol=0)
+
+
+def test_bounds_of_stiffness_dashpots_and_rest_lengths():
+    """However far the offsets go; stiffness and dashpot share a bound, rest lengths have their own."""
+    for sign in (-1.0, 1.0):
+        trained = offsets(parameters("springs", **ALL), sign * 50.0)
+        found = trained.physical()
+        for name, bound in (("stiffness", 1.5), ("dashpot", 1.5), ("rest_lengths", 0.2)):
+            factor = torch.tensor(np.exp(sign * bound), dtype=torch.float32)
+            torch.testing.assert_close(found[name], trained.start[name] * factor, rtol=SINGLE, atol=0)
+    free = offsets(parameters("springs"), 3.0)
+    assert torch.equal(free.physical()["rest_lengths"], free.start["rest_lengths"])
+
+
+def test_homogeneous_damping_has_one_factor_for_all_dashpots_and_one_for_drag():
+    trained = parameters(damping="homogeneous")
+    with torch.no_grad():
+        trained.factors["drag"].fill_(0.5)
+        trained.factors["dashpot"].fill_(-0.5)
+    found, start = trained.physical(), trained.start
+    assert trained.channels == ["stiffness"]
+    torch.testing.assert_close(found["drag"], start["drag"] * np.exp(0.5), rtol=SINGLE, atol=0)
+    torch.testing.assert_close(found["dashpot"], start["dashpot"] * np.exp(-0.5), rtol=SINGLE, atol=0)
+    assert torch.equal(found["stiffness"], start["stiffness"])
+
+
+def test_fixed_damping_does_not_move():
+    trained = disturb(parameters())
+    assert "drag" not in dict(trained.named_parameters())
+    for name in ("drag", "dashpot", "rest_lengths", "contact_distance"):
+        assert torch.equal(trained.physical()[name], trained.start[name])
+
+
+def test_damping_of_springs_is_an_output_of_the_field():
+    trained = disturb(parameters(damping="springs"))
+    assert trained.field().shape[1] == 2
+    factor = (trained.physical()["dashpot"] / trained.start["dashpot"]).detach()
+    assert factor.std() > 1e-3
+
+
+def test_a_linear_field_adds_a_fraction_and_stops_at_the_clamp():
+    trained = disturb(parameters(field={"scale": "linear"}), 1.0)
+    f = trained.field()[:, 0]
+    assert f.min() < -1, "some springs would be negative"
+    expected = (trained.start["stiffness"] * (1 + f)).clamp(0, 1e5)
+    torch.testing.assert_close(trained.physical()["stiffness"], expected, rtol=SINGLE, atol=0)
+    assert trained.physical()["stiffness"].min() == 0
+
+
+def test_a_bounded_linear_field_stays_within_the_bound_and_finds_back():
+    trained = disturb(parameters(field={"scale": "linear"}, output_bound=1.5), 1.0)
+    stiffness, start = trained.physical()["stiffness"], trained.start["stiffness"]
+    factor = (stiffness / start).detach()
+    assert factor.min() == pytest.approx(math.exp(-1.5)), "some springs are at the bound"
+    assert factor.max() < math.exp(1.5)
+    lowest = int(factor.argmin())
+    (towards_more,) = torch.autograd.grad(-stiffness[lowest], trained.field.layers[-1].bias, retain_graph=True)
+    (towards_less,) = torch.autograd.grad(stiffness[lowest], trained.field.layers[-1].bias)
+    assert towards_more.abs().sum() > 0
+    assert towards_less.abs().sum() == 0
+
+
+def test_controllers_that_the_field_does_not_cover_keep_their_values_exactly():
+    start = twin()
+    inner = start.topology.object_spring_count
+    for controllers in (False, True):
+        trained = disturb(parameters(field={"controllers": controllers}, **ALL, rest_lengths_by="field"))
+        for name in ("stiffness", "rest_lengths"):
+            same = (trained.physical()[name] == trained.start[name]).detach()
+            assert same[inner:].all() == (not controllers)
+            assert not same[:inner].any()
+    assert parameters(field={"controllers": False}).field.coordinates.shape[0] == inner < len(start.topology.springs)
+
+
+def test_rest_lengths_are_free_per_spring_or_an_output_of_the_field():
+    free, shared = (parameters(**ALL, rest_lengths_by=by) for by in ("springs", "field"))
+    assert (free.field().shape[1], shared.field().shape[1]) == (2, 3)
+    with torch.no_grad():
+        free.rest_offsets[3] = 0.5
+    ratio = (free.physical()["rest_lengths"] / free.start["rest_lengths"]).detach()
+    assert ratio[3].item() == pytest.approx(np.exp(0.2 * np.tanh(0.5)), rel=SINGLE)
+    assert (ratio == 1).sum() == len(ratio) - 1
+    assert shared.rest_offsets is None
+    assert parameters(rest_lengths_by="field").rest_offsets is None, "no bound: not trained"
+
+
+def test_the_field_lives_on_the_rest_shape():
+    made = twin()
+    points = len(made.topology.nodes) + len(made.topology.controllers)
+    shape = np.random.default_rng(0).uniform(0, 1, (points, 3)).astype(np.float32)
+    trained = parameters(start=replace(made, topology=replace(made.topology, rest_shape=shape)))
+    np.testing.assert_allclose(trained.field.coordinates, in_cube(midpoints(shape, made.topology.springs)), atol=SINGLE)
+
+
+def test_springs_are_covered_whatever_the_field_s_settings():
+    trained = disturb(parameters("springs", field={"controllers": False}))
+    assert not (trained.physical()["stiffness"] == trained.start["stiffness"]).any()
+
+
+def test_stiffness_of_zero_can_grow():
+    """It is raised to a floor first: no factor brings zero to life."""
+    start = twin()
+    dead = replace(start, material=replace(start.material, stiffness=np.zeros_like(start.material.stiffness)))
+    trained = offsets(parameters("springs", dead), 1.0)
+    assert trained.physical()["stiffness"].min() > 1e-3
+
+
+# Training -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [("springs", {}), ("field", {}), ("field", {"weight_decay": 0.1}), ("field", {"plane_smoothness": 10.0})],
+    ids=str,
+)
+def test_a_warm_start_leaves_single_springs_alone(kind, settings):
+    """In the first epochs one factor and the scalars are trained; the epochs after train the springs too."""
+    field = config.SpringField(**SMALL, **settings)
+    fit = config.Fit(epochs=3, learning_rate=1e-2, homogeneous_epochs=2, rest_length_bound=0.05, field=field)
+    run = TwinFit(small.fit_problem(fit=fit, kind=kind))
+    of_springs = {name for name, _ in run.parameters.named_parameters() if not name.startswith(("scalars", "factors"))}
+    start = run.parameters.copy()
+    for epoch in range(2):
+        run.start_epoch(epoch, 1.0)
+        run.epoch()
+    warm = run.parameters.copy()
+    factor = float(np.exp(warm["factors.stiffness"]))
+    assert abs(factor - 1) > 1e-3
+    assert {name for name in start if np.array_equal(start[name], warm[name])} >= of_springs
+    stiffness = run.parameters.physical()["stiffness"].detach()
+    torch.testing.assert_close(stiffness, run.parameters.start["stiffness"] * factor, rtol=SINGLE, atol=0)
+    run.start_epoch(2, 1.0)
+    run.epoch()
+    after = run.parameters.copy()
+    assert not any(np.array_equal(after[name], warm[name]) for name in of_springs)
+    # The factor stays, and is trained on.
+    assert after["factors.stiffness"] not in (0, warm["factors.stiffness"])
+
+
+def test_learning_rates_and_decay_of_each_group():
+    field = {"plane_learning_rate": 0.3, "weight_decay": 0.01}
+    rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "rest_learning_rate": 0.4}
+    trained = parameters(field=field, damping="homogeneous", rest_length_bound=0.1, **rates)
+    expected = {"field.layers": (0.1, 0.01), "field.planes": (0.3, 0.01), "rest_offsets": (0.4, 0.0)}
+    names = {tensor: name for name, tensor in trained.named_parameters()}
+    for group in trained.groups():
+        assert group["lr"] == group["base_rate"]
+        for tensor in group["params"]:
+            name = names.pop(tensor)
+            wanted = next((values for start, values in expected.items() if name.startswith(start)), (0.2, 0.0))
+            assert (group["lr"], group["weight_decay"]) == wanted, name
+    assert not names, "every trained value belongs to one group"
+
+
+def test_unset_learning_rates_are_the_common_one():
+    for kind in ("springs", "field"):
+        assert {group["lr"] for group in parameters(kind, learning_rate=0.1, rest_length_bound=0.1).groups()} == {0.1}
+
+
+def test_the_penalty_is_the_weighted_roughness():
+    trained = disturb(parameters(field={"plane_smoothness": 0.5}))
+    assert trained.penalty().item() == pytest.approx(0.5 * trained.field.roughness().item(), rel=SINGLE)
+    assert trained.penalty() > 0
+    for other in (parameters(), parameters("springs", field={"plane_smoothness": 0.5})):
+        assert disturb(other).penalty() == 0
+    assert parameters(field={"plane_smoothness": 0.5, "triplane": False}).penalty() == 0
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_copies_restore_everything_that_is_trained(kind):
+    trained = disturb(parameters(kind, **ALL, homogeneous_epochs=1))
+    kept, before = trained.copy(), {name: value.detach().clone() for name, value in trained.physical().items()}
+    assert kept.keys() == dict(trained.named_parameters()).keys()
+    disturb(trained, seed=1)
+    assert any(not np.array_equal(kept[name], value) for name, value in trained.copy().items())
+    trained.restore(kept)
+    for name, value in trained.physical().items():
+        assert torch.equal(value, before[name]), name
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_the_twin_is_what_is_simulated(kind):
+    """The packed parameters of the twin that comes out are those of the training, bit for bit, clamps included."""
+    start = twin()
+    trained = disturb(parameters(kind, start, **ALL, stiffness_range=(0.0, 100.0)), 1.0)
+    with torch.no_grad():
+        trained.scalars["ground_elasticity"].fill_(1.2)  # beyond its clamp
+    made, substep = trained.as_twin(start), start.simulation.substep
+    again = pack(**twin_tensors(made, "cpu"), substep=substep)
+    for found, expected in zip(again.tensors(), trained.pack(substep).tensors(), strict=True):
+        assert torch.equal(found, expected.detach())
+    assert made.material.stiffness.max() == 100
+    np.testing.assert_array_equal(made.topology.springs, start.topology.springs)
+    assert made.simulation == start.simulation
+
+
+def test_a_fixed_rest_length_is_not_rewritten():
+    start = twin()
+    made = disturb(parameters("springs", start)).as_twin(start)
+    assert made.topology is start.topology
+    assert made.material.contact_distance == start.material.contact_distance
+    assert set(CONTACT_SCALARS) <= set(twin_tensors(made, "cpu"))

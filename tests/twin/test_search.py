@@ -1,0 +1,413 @@
+"""The zero-order stage: coding of variables, budget, failure handling, and exact continuation."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neuspring import config
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.twin import search as module
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.search import PENALTY, SearchProblem, candidate, cost, search
+from neuspring.twin.topology import distances, isolated, regions, uniform_topology
+from tests.support import small
+
+RELEASED = {
+    "stiffness": 0.3,
+    "object_radius": 0.25,
+    "object_neighbours": 0.5,
+    "controller_radius": 3 / 7,
+    "controller_neighbours": 4 / 7,
+    "ground_elasticity": 0.5,
+    "ground_friction": 0.15,
+    "contact_elasticity": 0.7,
+    "contact_friction": 0.15,
+    "contact_distance": 0.25,
+    "drag": 0.15,
+    "dashpot": 0.5,
+}
+"""The released variables in the released order, and the released start on the normalised scale."""
+CODING = 1e-12
+"""Relative: to the normalised scale and back, rounding of float64 only."""
+FLOAT32_LENGTHS = 1e-6
+"""Relative: the rest shape is kept in float32; lengths of 0.02 m between points at 0.2 m round to parts in 1e6."""
+
+
+def plain(**changes: object) -> SearchProblem:
+    """A search with the released settings, for its coding."""
+    clusters = {"clusters": changes.pop("clusters")} if "clusters" in changes else {}
+    return small.search_problem(search=config.Search(**changes), **clusters)
+
+
+# Variables ------------------------------------------------------------------------------------------------------------
+
+
+def test_one_region_has_the_twelve_variables_of_the_released_search_and_its_start():
+    problem = plain()
+    assert problem.variables == tuple(RELEASED)
+    np.testing.assert_allclose(problem.encode(), list(RELEASED.values()), rtol=CODING)
+    assert not problem.labels.any()
+
+
+@pytest.mark.parametrize("clusters", [2, 5])
+def test_k_regions_have_2k_plus_10_variables(clusters):
+    problem = plain(clusters=clusters)
+    assert len(problem.variables) == 2 * clusters + 10
+    regional = [name for name in problem.variables if "." in name]
+    assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbours") for region in range(clusters)]
+    # Every region starts where the uniform search does.
+    start = dict(zip(problem.variables, problem.encode(), strict=True))
+    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]] for name in start}, rel=CODING)
+    assert np.unique(problem.labels).tolist() == list(range(clusters))
+
+
+@pytest.mark.parametrize("changes", [{}, {"stiffness_scale": "log", "ranges": config.SearchRanges(stiffness=(1e2, 1e5))}])
+def test_the_start_is_decoded_to_itself(changes):
+    problem = plain(clusters=3, **changes)
+    start = config.plain(config.SearchStart())
+    for name, value in problem.decode(problem.encode()).items():
+        # Counts are truncated, and 30 may come back as 29.999...
+        slack = {"abs": 1} if name.partition(".")[0] in module.INTEGERS else {"rel": CODING}
+        assert value == pytest.approx(start[name.partition(".")[0]], **slack)
+
+
+def test_the_logarithmic_scale_of_stiffness():
+    ranges = config.SearchRanges(stiffness=(1e1, 1e5))
+    middle = np.full(12, 0.5)
+    logarithmic = plain(stiffness_scale="log", ranges=ranges).decode(middle)
+    linear = plain(ranges=ranges).decode(middle)
+    assert (logarithmic["stiffness"], linear["stiffness"]) == (pytest.approx(1e3), pytest.approx(50005))
+    # No other variable is touched.
+    assert logarithmic | {"stiffness": 0} == linear | {"stiffness": 0}
+
+
+@given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
+def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalised, scale):
+    ranges = config.SearchRanges(stiffness=(1.0, 1e5))
+    for clusters in (1, 3):
+        problem = plain(clusters=clusters, ranges=ranges, stiffness_scale=scale)
+        for name, value in problem.decode(np.array(normalised[: 2 * clusters + 10])).items():
+            base = name.partition(".")[0]
+            low, high = getattr(ranges, base)
+            assert low * (1 - CODING) <= value <= high * (1 + CODING)
+            assert base not in module.INTEGERS or value == int(value)
+
+
+# Candidates -----------------------------------------------------------------------------------------------------------
+
+
+def test_equal_regions_are_the_uniform_candidate():
+    values = small.start_values()
+    regional = {f"{name}.{region}": values[name] for name in ("object_radius", "object_neighbours") for region in range(3)}
+    uniform, pieces = candidate(small.search_problem(), values), candidate(small.search_problem(clusters=3), values | regional)
+    np.testing.assert_array_equal(pieces.topology.springs, uniform.topology.springs)
+    assert pieces.simulation == uniform.simulation
+    assert np.unique(pieces.topology.labels).tolist() == [0, 1, 2]
+
+
+def test_a_region_s_values_reach_its_own_nodes():
+    values = small.start_values()
+    regional = {"object_radius.0": 0.03, "object_radius.1": 0.045, "object_neighbours.0": 5.0, "object_neighbours.1": 18.0}
+    problem = small.search_problem(clusters=2)
+    topology = candidate(problem, values | regional).topology
+    inner = topology.springs[: topology.object_spring_count]
+    longest = [topology.rest_lengths[: len(inner)][(problem.labels[inner] == r).all(axis=1)].max() for r in (0, 1)]
+    assert longest[0] < 0.03 < longest[1] < 0.045
+    degree = np.bincount(inner.ravel(), minlength=len(problem.labels))
+    assert degree[problem.labels == 0].mean() < degree[problem.labels == 1].mean() / 2
+
+
+def test_regions_and_candidates_are_made_on_the_rest_shape():
+    seen = small.observations()
+    # A rope whose second half was compressed in frame 0 to half its length; a rollout still starts there.
+    shape = seen.canonical.astype(np.float64)
+    shape[:, 0] += np.maximum(shape[:, 0] - shape[:, 0].mean(), 0)
+    problem = small.search_problem(replace(seen, rest_shape=shape), clusters=3)
+    np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3, config.Clusters()))
+    assert (problem.labels != small.search_problem(clusters=3).labels).any()
+    regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbours") for r in range(3)}
+    topology = candidate(problem, small.start_values() | regional).topology
+    np.testing.assert_array_equal(topology.nodes, seen.nodes)
+    np.testing.assert_allclose(topology.rest_lengths, distances(shape, topology.springs), rtol=FLOAT32_LENGTHS)
+
+
+def loosely(**changes: object) -> SearchProblem:
+    """A search whose radii may be so small that only nodes at the controllers have springs."""
+    return small.search_problem(search=config.Search(ranges=config.SearchRanges(object_radius=(0.001, 0.05)), **changes))
+
+
+def test_isolated_nodes_are_repaired_penalised_or_left():
+    values = small.start_values() | {"object_radius": 0.005}
+    count = len(small.observations().nodes)
+    left = candidate(loosely(isolated_nodes="allow"), values)
+    alone = isolated(count, left.topology.springs)
+    assert 0 < len(alone) < count
+    assert left.topology.object_spring_count == 0
+    with pytest.raises(NumericalFailure, match=f"{len(alone)} nodes have no spring, the first is node {alone[0]}"):
+        candidate(loosely(isolated_nodes="penalise"), values)
+    mended = candidate(loosely(isolated_nodes="repair"), values)
+    assert len(isolated(count, mended.topology.springs)) == 0
+    # Nothing is isolated: the three are the same.
+    whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "penalise", "allow")]
+    for other in whole[1:]:
+        np.testing.assert_array_equal(other.topology.springs, whole[0].topology.springs)
+
+
+def test_allow_is_the_released_topology():
+    seen, values = small.observations(), small.start_values() | {"object_radius": 0.005}
+    released = uniform_topology(seen.nodes, seen.controller_points[0], 0.005, 18, values["controller_radius"], 50)
+    found = candidate(loosely(isolated_nodes="allow"), values).topology
+    np.testing.assert_array_equal(found.springs, released.springs)
+
+
+def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
+    """Radii around the distance of the rope's rings: some candidates leave nodes alone."""
+    ranges, start = config.SearchRanges(object_radius=(0.001, 0.03)), config.SearchStart(object_radius=0.012)
+    settings = config.Search(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
+    trace = search(small.search_problem(search=settings), seed=0).trace
+    refused = trace[trace["reason"].str.contains("nodes have no spring")]
+    assert 0 < len(refused) < len(trace)
+    assert (refused["cost"] == PENALTY).all()
+    assert (trace["cost"] < PENALTY).any()
+
+
+# The search -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_truth_costs_less_than_its_neighbours():
+    problem = small.search_problem()
+    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
+    values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbours": 12.0}
+    values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
+    by_stiffness = [cost(problem, candidate(problem, values | {"stiffness": s}), loss)[0] for s in (2e3, 1.2e4, 9e4)]
+    assert by_stiffness[1] == min(by_stiffness)
+
+
+def test_the_best_evaluated_candidate_wins_within_the_budget():
+    problem = small.search_problem()
+    result = search(problem, seed=0)
+    assert len(result.trace) == 22
+    assert result.cost == result.trace["cost"].min()
+    # The returned twin is that candidate: simulating it again gives its cost.
+    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
+    assert cost(problem, result.twin, loss) == (result.cost, 0)
+
+
+def test_seeds_decide_the_candidates():
+    columns = [f"normalised.{name}" for name in RELEASED]
+    runs = [search(small.search_problem(), seed).trace[columns].to_numpy() for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt a search while it evaluates one more candidate."""
+    calls = 0
+    evaluate = module._evaluate
+
+    def dying(*arguments):
+        nonlocal calls
+        calls += 1
+        if calls > evaluated:
+            raise KeyboardInterrupt
+        return evaluate(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_evaluate", dying)
+        with pytest.raises(KeyboardInterrupt):
+            search(problem, seed, record=record, key="k")
+
+
+def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
+    record = tmp_path / "trace.parquet"
+    whole = search(small.search_problem(), seed=5)
+    die_after(14, small.search_problem(), 5, record, monkeypatch)  # in the middle of the second generation
+    assert len(pd.read_parquet(record)) == 11
+    continued = search(small.search_problem(), seed=5, record=record, key="k")
+    assert (whole.attempts, continued.attempts) == (1, 2)
+    assert continued.earlier_seconds > 0
+    assert_same_trace(continued.trace, whole.trace)
+
+
+def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
+    """The default search with another budget."""
+    problem = small.search_problem(clusters=clusters)
+    return replace(problem, search=replace(problem.search, rollouts=rollouts))
+
+
+def assert_same_trace(found: pd.DataFrame, expected: pd.DataFrame) -> None:
+    """Equal bit for bit, but for the time that each candidate took."""
+    pd.testing.assert_frame_equal(found.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)
+
+
+@pytest.mark.parametrize(("clusters", "population"), [(1, 11), (3, 12)])
+@pytest.mark.parametrize("rollouts", [5, 11, 15])
+def test_every_search_uses_exactly_its_budget(rollouts, clusters, population):
+    trace = search(budget(rollouts, clusters), seed=0).trace
+    assert len(trace) == rollouts
+    assert trace["rollout"].tolist() == list(range(rollouts))
+    # The population is that of CMA-ES for so many variables, so the last generation is cut where it does not divide the budget.
+    assert trace["generation"].value_counts().max() == min(rollouts, population)
+
+
+def test_a_larger_budget_continues_as_if_it_had_been_there_from_the_start(tmp_path):
+    """15 rollouts end in the middle of the second generation of 11."""
+    record = tmp_path / "trace.parquet"
+    first = search(budget(15), seed=2, record=record, key="k")
+    evaluated = search(budget(24), seed=2, record=record, key="k")
+    whole = search(budget(24), seed=2)
+    assert_same_trace(evaluated.trace, whole.trace)
+    assert_same_trace(pd.read_parquet(record), whole.trace)
+    assert (evaluated.cost, evaluated.values, evaluated.attempts) == (whole.cost, whole.values, 2)
+    np.testing.assert_array_equal(evaluated.twin.topology.springs, whole.twin.topology.springs)
+    # What was recorded was not computed again, and a smaller budget is a prefix.
+    assert evaluated.trace["seconds"].tolist()[:15] == first.trace["seconds"].tolist()
+    assert_same_trace(first.trace, whole.trace[:15])
+
+
+def test_a_smaller_budget_is_a_prefix_of_the_record_and_leaves_it(tmp_path, monkeypatch):
+    record = tmp_path / "trace.parquet"
+    whole = search(budget(24), seed=2, record=record, key="k")
+    before = record.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_evaluate", lambda *_: pytest.fail("everything is recorded"))
+        less = search(budget(13), seed=2, record=record, key="k")
+    assert_same_trace(less.trace, whole.trace[:13])
+    assert less.cost == whole.trace["cost"][:13].min()
+    assert record.read_bytes() == before
+
+
+def tied(rollouts: int, clusters: int = 3, tied_rollouts: int = 15) -> SearchProblem:
+    """A search whose regions share their values in its first rollouts; 15 end in the middle of a generation of 11."""
+    problem = small.search_problem(clusters=clusters)
+    return replace(problem, search=replace(problem.search, rollouts=rollouts, tied_rollouts=tied_rollouts))
+
+
+def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best():
+    trace = search(tied(30), seed=0).trace
+    uniform = search(budget(15), seed=0).trace
+    assert len(trace) == 30
+    np.testing.assert_array_equal(trace["cost"][:15], uniform["cost"])
+    for name in RELEASED:
+        regional = name in module.REGIONAL
+        for column in [f"normalised.{name}.{region}" for region in range(3)] if regional else [f"normalised.{name}"]:
+            np.testing.assert_array_equal(trace[column][:15], uniform[f"normalised.{name}"])
+    radii = trace[[f"normalised.object_radius.{region}" for region in range(3)]][15:]
+    assert (radii.nunique(axis=1) == 3).all()
+    # 12 candidates for 16 variables, drawn around the best of the uniform ones: their mean is within four standard errors.
+    start = uniform.loc[uniform["cost"].idxmin()]
+    sigma = config.Search().freed_sigma
+    names = [column for column in trace if column.startswith("normalised.")]
+    inside = [n for n in names if 0.2 < start[re.sub(r"\.\d$", "", n)] < 0.8]  # away from the bounds, where steps are folded back
+    assert len(inside) > 8
+    for name in inside:
+        assert trace[name][15:27].mean() == pytest.approx(start[re.sub(r"\.\d$", "", name)], abs=4 * sigma / np.sqrt(12))
+
+
+def test_one_region_has_nothing_to_tie():
+    assert_same_trace(search(tied(22, clusters=1), seed=0).trace, search(budget(22), seed=0).trace)
+
+
+@pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15), (29, 27)])
+def test_a_search_with_tied_regions_continues_exactly(tmp_path, monkeypatch, evaluated, kept):
+    """Killed while the regions are tied, in the first generation after it, and in the second."""
+    record = tmp_path / "trace.parquet"
+    die_after(evaluated, tied(30), 1, record, monkeypatch)
+    assert len(pd.read_parquet(record)) == kept
+    assert_same_trace(search(tied(30), seed=1, record=record, key="k").trace, search(tied(30), seed=1).trace)
+
+
+def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_path, capsys):
+    record = tmp_path / "trace.parquet"
+    first = search(small.search_problem(), seed=0, record=record, key="one")
+    other = search(small.search_problem(), seed=0, record=record, key="two")
+    assert "other inputs or settings" in capsys.readouterr().out
+    assert (other.attempts, other.cost) == (1, first.cost)
+    table = pd.read_parquet(record)
+    table.loc[0, "normalised.drag"] += 0.01
+    table.to_parquet(record)
+    forged = search(small.search_problem(), seed=0, record=record, key="two")
+    assert "does not replay" in capsys.readouterr().out
+    assert (forged.attempts, forged.cost) == (1, first.cost)
+
+
+def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys):
+    record = tmp_path / "trace.parquet"
+    whole = search(budget(15), seed=0, record=record, key="k")
+    table = pd.read_parquet(record)
+    table.loc[12, "normalised.drag"] += 0.01
+    table.to_parquet(record)
+    mended = search(budget(15), seed=0, record=record, key="k")
+    assert "continues afresh from rollout 11" in capsys.readouterr().out
+    assert_same_trace(mended.trace, whole.trace)
+    assert_same_trace(pd.read_parquet(record), whole.trace)
+    assert mended.trace["seconds"].tolist()[:11] == whole.trace["seconds"].tolist()[:11]
+
+
+def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
+    problem = small.search_problem(simulation=config.Simulation(substeps=1))
+    with pytest.raises(
+        InputError, match=r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1"
+    ) as caught:
+        search(problem, seed=0)
+    assert re.search(r"unstable: simulation.substeps, node \d+: .*stability bound.* Use at least \d+ substeps", str(caught.value))
+
+
+def test_a_search_whose_candidates_all_fail_is_a_named_failure():
+    problem = small.search_problem(simulation=config.Simulation(max_substeps=1))
+    with pytest.raises(
+        NumericalFailure, match=r"none of 22 candidates could be simulated; the first: needs \d+ substeps per frame"
+    ):
+        search(problem, seed=0)
+
+
+def test_bad_input_is_not_mistaken_for_a_bad_candidate():
+    seen = small.observations()
+    hands = seen.controller_points.copy()
+    hands[:, 0] += seen.object_points[0, 0] - hands[0, 0]
+    with pytest.raises(InputError, match="controller may not coincide"):
+        search(small.search_problem(replace(seen, controller_points=hands)), seed=0)
+
+
+@pytest.mark.parametrize("changes", [{}, {"clusters": 3}, {"simulation": config.Simulation(initial_velocity="observed")}])
+def test_the_future_is_never_read(changes):
+    seen = (small.observations(), small.spoiled_future())
+    first, second = (search(small.search_problem(o, **changes), seed=0) for o in seen)
+    assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
+
+
+def test_a_search_started_on_a_damaged_checkpoint_starts_afresh(tmp_path, capsys):
+    record = tmp_path / "trace.parquet"
+    record.write_bytes(b"PAR1 not really")
+    assert search(small.search_problem(), seed=0, record=record, key="k").attempts == 1
+    assert "starts afresh" in capsys.readouterr().out
+
+
+def test_released_quirks_of_the_search():
+    quirks = config.ReleasedQuirks(integer_damping=True, frame_time_667=True)
+    values = small.start_values() | {"drag": 17.7, "dashpot": 20.9}
+    twin = candidate(small.search_problem(quirks=quirks), values)
+    assert twin.simulation.substeps == 667
+    assert twin.simulation.frame_time == pytest.approx(0.03335)
+    # The truncation belongs to what leaves the search; candidates themselves use floats.
+    assert twin.material.drag == 17.7
+    result = search(small.search_problem(quirks=config.ReleasedQuirks(integer_damping=True)), seed=0)
+    assert result.twin.material.drag == int(result.twin.material.drag)
+    assert result.twin.material.dashpot[0] == int(result.twin.material.dashpot[0])
+    assert result.trace["drag"].mod(1).ne(0).any()
+
+
+def test_an_unstable_candidate_is_penalised_not_fatal():
+    needed = search(small.search_problem(simulation=config.Simulation(safety=1.0)), seed=0).trace["substeps"]
+    # Enough substeps for the softer half of the first candidates only.
+    problem = small.search_problem(simulation=config.Simulation(substeps=int(needed.median())))
+    result = search(problem, seed=0)
+    penalised = result.trace[result.trace["cost"] == PENALTY]
+    assert 0 < len(penalised) < len(result.trace)
+    assert penalised["reason"].str.startswith("unstable").all()

@@ -1,0 +1,81 @@
+"""Twins on other recordings of the same object."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.core.errors import InputError
+from neuspring.twin.rollout import mean_trajectory, roll_out
+from neuspring.twin.transfer import rebase
+from tests.support import small
+
+# Rest lengths are float32.
+SINGLE = 1e-6
+
+
+def test_the_same_recording_gives_the_same_twin():
+    problem = small.fit_problem()
+    moved = rebase(problem.twin, problem.observations)
+    np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths, rtol=SINGLE)
+    assert moved.simulation == problem.twin.simulation
+    assert np.array_equal(moved.material.stiffness, problem.twin.material.stiffness)
+
+
+def test_rest_lengths_follow_the_new_first_frame_and_keep_what_was_learned():
+    problem = small.fit_problem()
+    learned = replace(problem.twin.topology, rest_lengths=problem.twin.topology.rest_lengths * 1.03)
+    seen = problem.observations
+    larger = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
+    moved = rebase(replace(problem.twin, topology=learned), larger)
+    np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths * 2.06, rtol=SINGLE)
+    assert np.array_equal(moved.topology.nodes, larger.nodes)
+    kept = rebase(replace(problem.twin, topology=learned), larger, keep_lengths=True)
+    np.testing.assert_array_equal(kept.topology.rest_lengths, learned.rest_lengths)
+
+
+def test_rest_lengths_follow_the_rest_shape_where_there_is_one():
+    problem = small.fit_problem()
+    seen, topology = problem.observations, problem.twin.topology
+    straight = replace(seen, rest_shape=seen.canonical * 2)
+    bent = replace(straight, object_points=seen.object_points * 4, surface_points=seen.surface_points * 4)
+    moved = rebase(problem.twin, bent)
+    np.testing.assert_allclose(moved.topology.rest_lengths, topology.rest_lengths * 2, rtol=SINGLE)
+    assert np.array_equal(moved.topology.canonical, bent.rest_shape)
+    assert np.array_equal(moved.topology.nodes, bent.nodes)
+    # Another pose of a body in the same rest shape changes nothing.
+    again = rebase(moved, replace(bent, object_points=seen.object_points * 3))
+    np.testing.assert_array_equal(again.topology.rest_lengths, moved.topology.rest_lengths)
+
+
+def test_more_substeps_where_the_new_distances_need_them():
+    problem = small.fit_problem()
+    seen = problem.observations
+    smaller = replace(seen, **{name: getattr(seen, name) / 4 for name in ("object_points", "surface_points", "controller_points")})
+    moved = rebase(problem.twin, smaller)
+    assert moved.simulation.substeps > problem.twin.simulation.substeps
+    assert roll_out(moved, smaller.controller_points).diverged_frame is None
+
+
+def test_the_frame_time_follows_the_recording_unless_it_is_kept():
+    problem = small.fit_problem()
+    released = replace(problem.twin, simulation=replace(problem.twin.simulation, frame_time=0.03335))
+    assert rebase(released, problem.observations).simulation.frame_time == 1 / problem.observations.scenario.frame_rate
+    assert rebase(released, problem.observations, keep_frame_time=True).simulation.frame_time == 0.03335
+
+
+def test_another_number_of_nodes_is_refused():
+    problem = small.fit_problem()
+    seen = problem.observations
+    with pytest.raises(InputError, match=r"as many nodes: \d+; received \d+.*mocap\.rings"):
+        rebase(problem.twin, replace(seen, surface_points=seen.surface_points[1:]))
+
+
+def test_the_mean_of_rollouts():
+    problem = small.fit_problem()
+    one = roll_out(problem.twin, problem.observations.controller_points)
+    other = replace(one, positions=one.positions + np.float32(0.02), collision_overflow=3)
+    mean = mean_trajectory([one, other])
+    np.testing.assert_allclose(mean.positions, one.positions + 0.01, atol=SINGLE)
+    assert mean.collision_overflow == 3
+    assert mean_trajectory([one]) is one
