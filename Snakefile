@@ -8,21 +8,12 @@ configfile: "config/config.yaml"
 
 
 include: "workflow/rules/common.smk"
-include: "workflow/rules/helpers/perceive.smk"
-include: "workflow/rules/helpers/images.smk"
-include: "workflow/rules/helpers/twin.smk"
-include: "workflow/rules/helpers/baselines.smk"
-include: "workflow/rules/helpers/sweep.smk"
-include: "workflow/rules/helpers/tables.smk"
-include: "workflow/rules/helpers/hooks.smk"
+include: "workflow/rules/hooks.smk"
 include: "workflow/rules/perceive.smk"
-include: "workflow/rules/observe.smk"
 include: "workflow/rules/twin.smk"
 include: "workflow/rules/images.smk"
 include: "workflow/rules/baselines.smk"
-include: "workflow/rules/score.smk"
-include: "workflow/rules/tables.smk"
-include: "workflow/rules/tracking.smk"
+include: "workflow/rules/results.smk"
 include: "workflow/rules/sweep.smk"
 
 
@@ -40,21 +31,16 @@ localrules:
 rule all:
     default_target: True
     input:
-        tables=TABLES,
-        studies=[study_table(name) for name in CONFIG.studies],
-        report=REPORT,
-        perception=perception_tables(),
-        tracked=tracked_runs(),
+        tables=rules.tables.output,
+        report=rules.report.input,
+        page=rules.report.output,
+        logged=INPUTS.logged_runs(),
 
 
-# The last: a study is a target by its name, which must not be another's.
-include: "workflow/rules/studies.smk"
-
-
-# It is the main process that tries a job again, with more memory: inside a submitted job rules' own retries would multiply.
-if workflow.remote_exec:
-    for submitted in workflow.rules:
-        submitted.restart_times = 0
+# A job that fails is tried twice again, with more memory. On a cluster it is the main process that tries again: inside a submitted
+# job rules' own retries would multiply.
+for each in workflow.rules:
+    each.restart_times = 0 if workflow.remote_exec else 2
 
 
 onstart:
@@ -62,8 +48,8 @@ onstart:
 
 
 onsuccess:
-    report_end(failed=False)
+    finish()
 
 
 onerror:
-    report_end(failed=True)
+    give_up()

@@ -1,1 +1,1 @@
-"""The command line: `main` runs one command, `options` holds the options that commands share."""
+"""The command line: `main` runs one command, `tools` names the modules of those that are no stage of the workflow."""

@@ -5,9 +5,6 @@ torch, Warp or MLflow, because the workflow reads the configuration before any j
 """
 
 from neuspring.config.settings import (
-    FILMED,
-    MADE,
-    UNTRAINED,
     Clusters,
     Config,
     Fit,
@@ -33,9 +30,6 @@ from neuspring.config.settings import (
 )
 
 __all__ = [
-    "FILMED",
-    "MADE",
-    "UNTRAINED",
     "Clusters",
     "Config",
     "Fit",

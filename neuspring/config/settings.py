@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import AfterValidator, Field, StringConstraints, TypeAdapter, ValidationError
 
-from neuspring.config.baselines import Baselines, Model
+from neuspring.config.baselines import Baselines
 from neuspring.config.gpus import Gpus
 from neuspring.config.images import Images
 from neuspring.config.perception import Perception, Synthetic
@@ -30,14 +30,8 @@ from neuspring.core.uri import masked, refuse_password
 
 T = TypeVar("T")
 Beta = Annotated[float, Field(ge=0, lt=1)]
-FILMED = ("synthetic", "capture", "phystwin_raw")
-"""Sources of raw video, which perception makes observations of."""
-MADE = ("toy", "synthetic")
-"""Sources that need no data."""
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
-UNTRAINED = ("static", "controller_lbs")
-"""Models of baselines that have nothing to learn, and no settings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -459,8 +453,8 @@ class Method:
     """A row of the search table; methods that name the same row share the search."""
     fit: Kind | None = None
     """What the first-order stage trains: each spring by itself, or the neural spring field."""
-    model: Model | None = None
-    """A baseline without search and fit."""
+    model: Name | None = None
+    """A baseline without search and fit (`neuspring.baselines.BASELINES`)."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""
@@ -478,15 +472,6 @@ class Method:
         given = [name for name, value in twins_only.items() if value]
         if self.model and given:
             raise ValueError(f"{', '.join(given)}: these belong to methods with a search, not to model {self.model}")
-        if self.appearance is not None and self.model != "spring_gaus":
-            raise ValueError(f"appearance: only spring_gaus draws with splats of its own, received model {self.model}")
-        if self.settings and self.model in UNTRAINED:
-            raise ValueError(f"settings: model {self.model} has none, received {sorted(self.settings)}")
-
-    @property
-    def trained(self) -> bool:
-        """Whether a baseline's model is trained before it predicts."""
-        return self.model is not None and self.model not in UNTRAINED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -495,7 +480,8 @@ class ScenarioRow:
 
     __pydantic_config__ = STRICT
     scenario: Name
-    source: Literal["phystwin", "mocap", "toy", "synthetic", "capture", "phystwin_raw"]
+    source: Name
+    """The kind of its data (`neuspring.data.sources.SOURCES`)."""
     category: Name
     path: str
     """Folder or file under data_root; for toy and synthetic scenes, the scene's name."""

@@ -403,6 +403,16 @@ class Twin(Artifact):
         if springs != values:
             raise InputError("twin", f"the material must have one stiffness per spring ({springs})", values)
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes worth keeping in a record."""
+        return {
+            "nodes": len(self.topology.nodes),
+            "springs": len(self.topology.springs),
+            "object_springs": self.topology.object_spring_count,
+            "substeps": self.simulation.substeps,
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory(Artifact):

@@ -111,33 +111,55 @@ def read_json(path: Path, version: int) -> dict[str, Any]:
     return values
 
 
-class Stopwatch:
-    """Wall time and peak memory of a stage."""
+class Recorder:
+    """Measures a stage and writes its record.
 
-    def __init__(self) -> None:
-        self.started = now()
-        self._start = time.perf_counter()
+    Make it when the stage begins; `inputs` are digested at once, so that the record names what was read.
+    """
+
+    def __init__(
+        self, stage: str, output: Path, *, inputs: Mapping[str, Path] | None = None, settings: Any = None, device: str = "cpu"
+    ) -> None:
+        self.stage, self.output = stage, output
+        self.inputs = {role: digest_file(path) for role, path in (inputs or {}).items()}
+        self.settings: dict[str, Any] = dict(settings or {})
+        self.device = device
+        self._started, self._start = now(), time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Seconds so far."""
         return time.perf_counter() - self._start
 
-    def stage(
-        self, stage: str, status: Status, files: Mapping[str, Path] | None = None, earlier_seconds: float = 0.0, **values: Any
-    ) -> StageRecord:
-        """A record of this stage with its time, memory, machine and the digests of its files."""
-        named = {role: [path.name, digest_file(path)] for role, path in (files or {}).items()}
+    def beside(self, **names: str) -> dict[str, Path]:
+        """Role -> path of a file beside the record."""
+        return {role: self.output.with_name(name) for role, name in names.items()}
+
+    def save(
+        self,
+        files: Mapping[str, Path] | None = None,
+        facts: Mapping[str, Any] | None = None,
+        *,
+        failure: str = "",
+        attempts: int = 1,
+        earlier_seconds: float = 0.0,
+    ) -> None:
+        """Write the record, with time, peak memory, machine and the digests of `files`; `failure` says why the stage failed."""
         # Linux counts in KiB, macOS in bytes.
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
-        return StageRecord(
-            stage=stage,
-            status=status,
-            files=named,
-            started=self.started,
+        StageRecord(
+            stage=self.stage,
+            status="failed" if failure else "ok",
+            reason=failure,
+            files={role: [path.name, digest_file(path)] for role, path in (files or {}).items()},
+            inputs=self.inputs,
+            facts=dict(facts or {}),
+            settings=self.settings,
+            started=self._started,
             seconds=round(earlier_seconds + self.seconds, 3),
             peak_memory_mb=round(peak, 1),
+            attempts=attempts,
+            device=self.device,
             machine=f"{platform.machine()}, Python {platform.python_version()}",
             versions={name: version(name) for name in COMPUTING},
-            **values,
-        )
+        ).save(self.output)

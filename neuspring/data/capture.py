@@ -150,6 +150,11 @@ class Capture:
         """Training frames are [0, train_end)."""
         return self.description.train_end or int(0.7 * self.frame_count)
 
+    def require_camera(self, name: str) -> None:
+        """Raise InputError if there is no such camera."""
+        if name not in self.cameras:
+            raise InputError(self.folder / CAPTURE, f"must have a camera {name}", sorted(self.cameras))
+
     def has(self, camera: str, frame: int) -> bool:
         """Whether the camera has this frame."""
         return frame not in self._missing[camera]

@@ -6,15 +6,14 @@ import dataclasses
 import difflib
 import fnmatch
 import shlex
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring.baselines import BASELINES
 from neuspring.config import (
-    FILMED,
-    MADE,
     Config,
     Fit,
     Method,
@@ -24,14 +23,12 @@ from neuspring.config import (
     merge,
     parse,
     plain,
-    read_text,
     read_yaml,
 )
-from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.config.images import Appearance
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
-from neuspring.data import capture, phystwin_raw
+from neuspring.data.sources import SOURCES, Source, location, read_scenarios
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.studies import Study, read_studies
 
@@ -40,36 +37,23 @@ RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "publ
 
 
 def read_methods(path: Path) -> dict[str, Method]:
-    """The method table: name -> Method."""
-    return {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+    """The method table: name -> Method. Raises InputError."""
+    methods = {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+    for name, method in methods.items():
+        where = f"{path}, method {name}"
+        if method.model and method.model not in BASELINES:
+            raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
+        if method.settings and method.model and not BASELINES[method.model].trained:
+            raise InputError(f"{where}, settings", f"model {method.model} has none", sorted(method.settings))
+        if method.appearance is not None and not (method.model and BASELINES[method.model].own_splats):
+            owners = ", ".join(name for name, baseline in BASELINES.items() if baseline.own_splats)
+            raise InputError(f"{where}, appearance", f"only {owners} draws with splats of its own", method.model)
+    return methods
 
 
 def read_searches(path: Path) -> dict[str, SearchRow]:
     """The search table: name -> SearchRow."""
     return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
-
-
-def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
-    """The scenario table (tab-separated, one header line, `#` comments): name -> ScenarioRow."""
-    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
-    columns = [f.name for f in dataclasses.fields(ScenarioRow)]
-    if not lines or lines[0].split("\t") != columns:
-        raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
-    rows: dict[str, ScenarioRow] = {}
-    for line in lines[1:]:
-        cells = line.split("\t")
-        where = f"{path}, row {cells[0]!r}"
-        if len(cells) != len(columns):
-            raise InputError(where, f"{len(columns)} tab-separated cells are required", len(cells))
-        values: dict[str, Any] = dict(zip(columns, cells, strict=True))
-        for flag in ("self_collision", "ground"):
-            if values[flag] not in ("true", "false"):
-                raise InputError(f"{where}, {flag}", "must be true or false", values[flag])
-            values[flag] = values[flag] == "true"
-        if cells[0] in rows:
-            raise InputError(where, "scenario names must differ")
-        rows[cells[0]] = parse(ScenarioRow, values, where)
-    return rows
 
 
 def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
@@ -112,9 +96,10 @@ def search_of(config: Config, row: SearchRow, name: str) -> Search:
     return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
 
 
-def model_of(config: Config, method: Method, name: str) -> SpringGaus | GsDynamics:
+def section_of(config: Config, method: Method, name: str) -> Any:
     """The settings of a trained baseline: its section, with the method's own on top. Raises InputError for unknown keys."""
-    section = config.baselines.spring_gaus if method.model == "spring_gaus" else config.baselines.gs_dynamics
+    assert method.model
+    section = getattr(config.baselines, BASELINES[method.model].section)
     return parse(type(section), _overlaid(section, method.settings), f"method {name}, settings")
 
 
@@ -127,6 +112,32 @@ def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
     values = plain(settings)
     merge(values, own)
     return values
+
+
+def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmark:
+    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
+    benchmark = Benchmark.of(values, root)
+    if benchmark.config.tune:
+        # Optuna takes a second to import.
+        from neuspring.experiments.tuning.space import Plan
+
+        Plan.of(benchmark.config, benchmark.config.tune, root)
+        check_storage(benchmark.config.tune, cluster=cluster)
+    results = Path(benchmark.config.results)
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=results).close()
+    except OSError as error:
+        where, rule = f"configuration, results ({results})", "this folder must be writable"
+        raise InputError(where, rule, error.strerror, "Choose another: --config results=...") from error
+    return benchmark
+
+
+def check_storage(tune: Tune, *, cluster: bool) -> None:
+    """Raise InputError if workers of a sweep on several machines would share an SQLite file, whose locks hold within one alone."""
+    if cluster and tune.workers > 1 and tune.storage is None:
+        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
+        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
 
 
 @dataclass(frozen=True)
@@ -214,10 +225,11 @@ class Benchmark:
     def _check_settings(self, name: str, method: Method) -> None:
         """Settings of a method's own, before any job starts."""
         if method.model:
-            chosen = model_of(self.config, method, name) if method.trained else None
-            if name in self.pictured and isinstance(chosen, SpringGaus):
-                # Named weights that are missing or wrong are an error before the first job.
-                vgg16_weights.find(chosen.vgg16)
+            if BASELINES[method.model].trained:
+                section = section_of(self.config, method, name)
+                if name in self.pictured:
+                    # Named weights that are missing or wrong are an error before the first job.
+                    BASELINES[method.model].features(section)
             appearance_of(self.config, method, name)
         if not (method.search and method.fit):
             return
@@ -246,16 +258,18 @@ class Benchmark:
         """Of a scenario, whether it is chosen or not."""
         return self.scenarios.get(name) or self.whole_scenarios[name]
 
+    def source(self, name: str) -> Source:
+        """The kind of data of a scenario."""
+        return SOURCES[self._row(name).source]
+
     def data_path(self, name: str) -> Path | None:
-        """Where a scenario's data lie; None for toy and synthetic scenes, which need none."""
-        row = self._row(name)
-        return None if row.source in MADE else Path(self.config.data_root or ".") / row.path
+        """Where a scenario's data lie; None for scenes that are made here."""
+        return location(self._row(name), self.config) if self.source(name).needs_data else None
 
     def has_images(self, name: str) -> bool:
         """Whether a scenario's predictions are drawn and scored."""
-        source, path = self._row(name).source, self.data_path(name)
-        beside = source == "phystwin" and path is not None and phystwin_raw.has_images(path)
-        return self.config.images.enabled and (source in FILMED or beside)
+        source, path = self.source(name), self.data_path(name)
+        return self.config.images.enabled and (source.films or (path is not None and source.images_beside(path)))
 
     def applies(self, method: str, scenario: str) -> bool:
         """Whether a method can be run on a scenario: what is trained on silhouettes needs images."""
@@ -275,19 +289,13 @@ class Benchmark:
             raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
 
     def capture_folder(self, name: str) -> Path:
-        """Where a filmed scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
-        own = self.data_path(name) if self.scenarios[name].source == "capture" else None
+        """Where a scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
+        own = None if self.source(name).write_capture else self.data_path(name)
         return own or Path(self.config.results) / name / "capture"
 
     def cameras(self, name: str) -> tuple[str, ...]:
-        """Names of a filmed scenario's cameras, which are known before its capture is made. Raises InputError."""
-        source, path = self.scenarios[name].source, self.data_path(name)
-        if source == "synthetic":
-            return tuple(map(str, range(self.config.synthetic.cameras)))
-        assert path is not None
-        if source in ("phystwin_raw", "phystwin"):
-            return tuple(map(str, range(phystwin_raw.camera_count(path))))
-        return tuple(camera.name for camera in capture.read_description(path / capture.CAPTURE).cameras)
+        """Names of a scenario's cameras, which are known before its capture is made. Raises InputError."""
+        return self.source(name).cameras(location(self._row(name), self.config), self.config)
 
     def _require_data(self) -> None:
         if self.config.images.enabled:
@@ -328,10 +336,8 @@ def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, st
 
 
 def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
-    if method.model != "spring_gaus":
-        return False
-    chosen = model_of(config, method, name)
-    return isinstance(chosen, SpringGaus) and chosen.supervision == "masks"
+    baseline = BASELINES.get(method.model or "")
+    return bool(baseline and baseline.trained and baseline.takes_pictures(section_of(config, method, name)))
 
 
 def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:

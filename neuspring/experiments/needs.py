@@ -9,26 +9,53 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from neuspring.baselines import BASELINES
+from neuspring.config import Config
 from neuspring.config.gpus import Gpus
-from neuspring.config.spring_gaus import SpringGaus
-from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord
-from neuspring.data.cases import released_cases
 from neuspring.experiments import benchmark as benchmarks
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.plan import History, Kind, Planned
+from neuspring.stages import STAGES
 
 TRAIN = 0.7
 """Part of the frames that is for training, where only the count of frames is known."""
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
-ON_GPU = frozenset({"search", "fit", "rollout", "train", "predict", "transfer", "appearance", "render", "tune"})
+ON_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu == "always")})
 """Rules that take a GPU where there is one."""
-EITHER = frozenset({"segment", "track"})
+EITHER = frozenset(name for name, stage in STAGES.items() if stage.gpu == "backend")
 """Rules whose backend decides."""
+FIRST_GUESS = {
+    "capture": (4000, 120),
+    "segment": (8000, 120),
+    "track": (8000, 120),
+    "lift": (8000, 60),
+    "judge": (4000, 30),
+    "observe": (4000, 30),
+    "search": (8000, 240),
+    "fit": (8000, 480),
+    "train": (8000, 480),
+    "rollout": (4000, 60),
+    "predict": (4000, 60),
+    "transfer": (4000, 60),
+    "appearance": (8000, 240),
+    "render": (8000, 120),
+    "score": (4000, 30),
+    "tables": (2000, 10),
+    "study": (2000, 10),
+    "report": (4000, 20),
+    "perception_table": (2000, 10),
+    "track_init": (2000, 10),
+    "log_run": (2000, 10),
+    "tune": (8000, 2880),
+    "sweep": (4000, 20),
+    "log_sweep": (2000, 30),
+}
+"""Rule -> MB and minutes to ask for while no earlier job tells."""
 
 
 def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[str, ...]:
@@ -76,11 +103,21 @@ def check_gpus(rules: Mapping[str, Mapping[str, Any]], pool: tuple[str, ...]) ->
             raise InputError(f"--set-resources {rule}:gpu", limit, wanted, "Ask for fewer.")
 
 
-def check_storage(tune: Tune, *, cluster: bool) -> None:
-    """Raise InputError if workers of a study on several machines would share an SQLite file, whose locks hold within one alone."""
-    if cluster and tune.workers > 1 and tune.storage is None:
-        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
-        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
+def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:
+    """The GPUs of this machine that jobs lease, which Snakemake is told of. Raises InputError.
+
+    Too large a wish is an error here, before any job: Snakemake would clamp it.
+    """
+    wish = workflow.global_resources.get("gpu")
+    limit = wish.value if wish else None
+    pool = gpu_pool(config.gpus, config.device, plan_only=workflow.output_settings.dryrun)
+    check_gpus(workflow.resource_settings.overwrite_resources, pool)
+    if pool:
+        workflow.register_resource("gpu", gpu_slots(pool, config.gpus.jobs_per_gpu, limit))
+    elif limit:
+        remedy = "Leave it out, or set device: cuda where there is one."
+        raise InputError("--resources gpu", "no job of this run can have a GPU", limit, remedy)
+    return pool
 
 
 def planned(jobs: Iterable[Any], results: Path) -> list[Planned]:
@@ -110,49 +147,43 @@ class Needs:
 
     def frames(self, scenario: str) -> int:
         """Frames of a scenario, as far as they are known before its data are read; 1 otherwise."""
-        config, row = self._benchmark.config, self._benchmark.scenarios[scenario]
-        if row.source == "toy":
-            return config.toy.frames
-        if row.source == "mocap":
-            return config.mocap.frames or 1
-        # Synthetic scenes have the names and lengths of the released ones.
-        facts = released_cases().get(Path(row.path).name)
-        frames = int(facts["frames"]) if facts else 1
-        return min(frames, config.synthetic.frames or frames) if row.source == "synthetic" else frames
+        row = self._benchmark.scenarios[scenario]
+        return self._benchmark.source(scenario).frames(row, self._benchmark.config)
 
-    def search(self, wildcards: Any) -> int:
-        """Rollouts x training frames."""
-        row = self._benchmark.searches[wildcards.search]
-        rollouts = benchmarks.search_of(self._benchmark.config, row, wildcards.search).rollouts
-        return rollouts * math.ceil(TRAIN * self.frames(wildcards.scenario))
+    def work(self, rule: str, wildcards: Any) -> int:
+        """How much a job has to do, in units of its rule.
 
-    def fit(self, wildcards: Any) -> int:
-        """Epochs x training frames."""
-        epochs = benchmarks.fit_of(self._benchmark.config, self._benchmark.fits[wildcards.method], wildcards.method).epochs
-        return epochs * math.ceil(TRAIN * self.frames(wildcards.scenario))
+        search: rollouts x training frames; fit: epochs x training frames; train: see `Baseline.work`; appearance: iterations; other
+        jobs of a scenario: frames; jobs of no scenario: 1.
+        """
+        benchmark, config = self._benchmark, self._benchmark.config
+        if rule == "appearance":
+            owner = wildcards.looks.removeprefix("appearance-")
+            own = benchmark.splats.get(owner)
+            settings = benchmarks.appearance_of(config, own, owner) if own else config.images.appearance
+            return settings.iterations
+        if not hasattr(wildcards, "scenario"):
+            return 1
+        frames = self.frames(wildcards.scenario)
+        train_frames = math.ceil(TRAIN * frames)
+        if rule == "search":
+            row = benchmark.searches[wildcards.search]
+            return benchmarks.search_of(config, row, wildcards.search).rollouts * train_frames
+        if rule == "fit":
+            return benchmarks.fit_of(config, benchmark.fits[wildcards.method], wildcards.method).epochs * train_frames
+        if rule == "train":
+            method = benchmark.methods[wildcards.method]
+            section = benchmarks.section_of(config, method, wildcards.method)
+            return BASELINES[method.model or ""].work(section, train_frames)
+        return frames
 
-    def train(self, wildcards: Any) -> int:
-        """Spring-Gaus: iterations x training frames. GS-Dynamics: updates."""
-        method, name = self._benchmark.methods[wildcards.method], wildcards.method
-        chosen = benchmarks.model_of(self._benchmark.config, method, name)
-        if isinstance(chosen, SpringGaus):
-            return chosen.iterations * math.ceil(TRAIN * self.frames(wildcards.scenario))
-        return chosen.epochs * chosen.updates_per_epoch
+    def memory(self, rule: str) -> Callable[..., int]:
+        """MB to ask for: half as much again as earlier jobs of the rule needed with the same scenario.
 
-    def appearance(self, wildcards: Any) -> int:
-        """Iterations, of the splats of all methods or of one method's own."""
-        owner = wildcards.looks.removeprefix("appearance-")
-        if owner not in self._benchmark.splats:
-            return self._benchmark.config.images.appearance.iterations
-        return benchmarks.appearance_of(self._benchmark.config, self._benchmark.splats[owner], owner).iterations
-
-    def scenario(self, wildcards: Any) -> int:
-        """Frames."""
-        return self.frames(wildcards.scenario)
-
-    def memory(self, rule: str, default: int) -> Callable[..., int]:
-        """MB to ask for: half as much again as earlier jobs of the rule needed with the same scenario, else as those with others
-        or `default`, whichever is more. Later attempts ask for at least `default`, times the attempt."""
+        Without such jobs: what jobs with other scenarios needed, or the first guess, whichever is more. Later attempts ask for at
+        least the first guess, times the attempt.
+        """
+        default, _ = FIRST_GUESS[rule]
 
         def known(scenario: str) -> float:
             peaks = self.history.memory
@@ -163,12 +194,13 @@ class Needs:
 
         return needed
 
-    def minutes(self, rule: str, default: int, work: Callable[[Any], int]) -> Callable[..., int]:
+    def minutes(self, rule: str) -> Callable[..., int]:
         """Minutes to ask for: three times what earlier jobs took for as much work; otherwise as for memory."""
+        _, default = FIRST_GUESS[rule]
 
         def expected(scenario: str, wildcards: Any) -> float:
             rate = max(self.history.rates.get((rule, kind, scenario), 0.0) for kind in self._kinds(rule))
-            return HEADROOM_TIME * rate * work(wildcards) / 60 if rate else 0.0
+            return HEADROOM_TIME * rate * self.work(rule, wildcards) / 60 if rate else 0.0
 
         def needed(wildcards: Any, attempt: int) -> int:
             return _asked(wildcards, attempt, default, lambda scenario: expected(scenario, wildcards), LEAST_MINUTES)
@@ -183,7 +215,7 @@ class Needs:
 
 
 def _asked(wildcards: Any, attempt: int, default: int, known: Callable[[str], float], least: int) -> int:
-    """What an attempt asks for, `known` being what earlier jobs of a scenario, or of all (""), tell; 0: nothing."""
+    """What an attempt asks for. `known` maps a scenario, or "" for all, to what its earlier jobs needed; 0 where there are none."""
     own, others = known(getattr(wildcards, "scenario", "")), known("")
     asked = max(math.ceil(own), least) if own else max(math.ceil(others), default)
     # What failed with as little as earlier jobs needed may have failed for want of it.

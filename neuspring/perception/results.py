@@ -78,3 +78,13 @@ def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Mas
             raise InputError(path, f"masks must have the frames and size of camera {name}: {wanted}", masks.labels.shape, remedy)
         loaded[name] = masks
     return loaded
+
+
+def tracks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, PixelTracks]:
+    """Tracks by camera, from records in the capture's order. Raises InputError for too few."""
+    if len(records) != len(capture.cameras):
+        raise InputError("--tracks", f"one record per camera is required: {list(capture.cameras)}", len(records))
+    return {
+        name: PixelTracks.load(StageRecord.load(path).file("tracks", path))
+        for name, path in zip(capture.cameras, records, strict=True)
+    }

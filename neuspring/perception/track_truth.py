@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.data.synthetic.correspond import under_pixels
 from neuspring.data.synthetic.truth import Truth, truth_of
@@ -16,10 +17,10 @@ SEEN = 0.01
 """m by which the depth image may differ from a point's depth for the point to count as seen."""
 
 
-def track(capture: Capture, camera: str, labels: np.ndarray, count: int, seed: int) -> Followed:
-    """Exact places [T, Q, 2] of up to `count` pixels of the masks, and whether depth and mask show them there."""
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
+    """Exact places [T, Q, 2] of up to `settings.points` pixels of the masks, and whether depth and mask show them there."""
     truth, of = truth_of(capture), capture.cameras[camera]
-    start = choose(labels[0], count, seed)
+    start = choose(labels[0], settings.points, seed)
     x, y = start.astype(int).T
     own = labels[0, y, x]
     material = under_pixels(truth, of, start)

@@ -22,12 +22,12 @@ from neuspring import config
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
 from neuspring.core.records import RECORD_FORMAT, StageRecord, canonical, digest_file, read_json
+from neuspring.core.run_record import RESULT_ROLES
 from neuspring.report.tables.cells import accounted, cells, counted, of_study
 from neuspring.report.tables.study import Made
 from neuspring.report.tables.summary import Collected, collect
 from neuspring.scores import paper
 from neuspring.scores.paper import MEASURES
-from neuspring.stages.stages import RESULT_ROLES
 
 CONTENT = ("scenario", "method", "variant", "seed", "status", "reason", "notes", "settings", "data_digest")
 """What the key of a run is taken of, beside its files; see `stages.score`."""

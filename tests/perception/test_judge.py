@@ -37,7 +37,7 @@ def perfect(tmp_path_factory):
     masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
     tracks = {}
     for camera in capture.cameras:
-        found = track_truth.track(capture, camera, masks[camera].labels, 500, 0)
+        found = track_truth.track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
         tracks[camera] = PixelTracks(pixels=found.pixels, visible=found.visible, backend="truth")
     lifted = lift(capture, masks, tracks, SETTINGS)
     return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)

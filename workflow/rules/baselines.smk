@@ -2,70 +2,64 @@
 rule train:
     input:
         observations=rules.observe.output,
-        capture=own_capture,
-        masks=own_masks,
-        appearance=own_splats,
+        capture=where(INPUTS.pictured, INPUTS.capture),
+        masks=where(INPUTS.pictured, masks_of),
+        appearance=where(INPUTS.pictured, INPUTS.appearance),
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/train.json",
     log:
-        f"{RESULTS}/logs/train/{{scenario}}/{{method}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/train/{{scenario}}/{{method}}/{{seed}}.tsv"
+        log_of("train", "{scenario}/{method}/{seed}"),
     wildcard_constraints:
-        method=methods_with("spring_gaus", "gs_dynamics"),
+        method=INPUTS.methods(model=True, trained=True),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=train_work,
-        gpu=GPU,
-        mem_mb=memory("train", 8000),
-        runtime=minutes("train", 480, train_work),
+        work=work("train"),
+        gpu=gpu("train"),
+        mem_mb=NEEDS.memory("train"),
+        runtime=NEEDS.minutes("train"),
     params:
-        settings=train_settings,
-        model=model_of,
-        given=train_options,
-        features=feature_weights,
-        code=train_digest,
+        model=lambda wildcards: BENCHMARK.methods[wildcards.method].model,
+        pictures=lambda wildcards, input: options(
+            input, capture="--capture", masks="--masks", appearance="--appearance"
+        ),
+        features=INPUTS.features,
+        settings=settings_of("train"),
+        code=code_of("train"),
     shell:
         gpu_job(
-            "train --observations {input.observations:q} --model {params.model} {params.given:q}"
-            " --settings {params.settings:q} --seed {wildcards.seed} --threads {threads}"
-            " --output {output:q}"
+            "train --observations {input.observations:q} --model {params.model} {params.pictures:q}"
+            " --settings {params.settings:q} --seed {wildcards.seed} --output {output:q}"
         )
 
 
 rule predict:
     input:
         observations=rules.observe.output,
-        train=train_records,
-        appearance=own_splats,
+        train=INPUTS.train,
+        appearance=where(INPUTS.pictured, INPUTS.appearance),
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:
-        f"{RESULTS}/logs/predict/{{scenario}}/{{method}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/predict/{{scenario}}/{{method}}/{{seed}}.tsv"
+        log_of("predict", "{scenario}/{method}/{seed}"),
     wildcard_constraints:
-        method=methods_with("spring_gaus", "gs_dynamics", "static", "controller_lbs"),
+        method=INPUTS.methods(model=True),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        gpu=GPU,
-        mem_mb=memory("predict", 4000),
-        runtime=minutes("predict", 60, frame_work),
+        work=work("predict"),
+        gpu=gpu("predict"),
+        mem_mb=NEEDS.memory("predict"),
+        runtime=NEEDS.minutes("predict"),
     params:
-        model=model_of,
-        given=predict_options,
-        code=predict_digest,
+        model=lambda wildcards: BENCHMARK.methods[wildcards.method].model,
+        learned=lambda wildcards, input: options(
+            input, train="--train", appearance="--appearance"
+        ),
+        code=code_of("predict"),
     shell:
         gpu_job(
-            "predict --observations {input.observations:q} --model {params.model} {params.given:q}"
-            " --threads {threads} --output {output:q}"
+            "predict --observations {input.observations:q} --model {params.model} {params.learned:q} --output {output:q}"
         )

@@ -1,25 +1,22 @@
+# From raw video to observations, in parallel over the cameras of a scenario.
 rule synthesise:
     output:
         capture=f"{RESULTS}/{{scenario}}/capture/capture.json",
         truth=f"{RESULTS}/{{scenario}}/capture_truth.npz",
     log:
-        f"{RESULTS}/logs/capture/{{scenario}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
+        log_of("capture", "{scenario}"),
     wildcard_constraints:
-        scenario=of_source("synthetic"),
-    retries: 2
+        scenario=INPUTS.scenarios(truth=True),
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        mem_mb=memory("capture", 4000),
-        runtime=minutes("capture", 120, frame_work),
+        work=work("capture"),
+        mem_mb=NEEDS.memory("capture"),
+        runtime=NEEDS.minutes("capture"),
     params:
-        settings=section("synthetic"),
-        row=scenario_row,
-        code=code_digest("neuspring.data.synthetic.make", stage="stages.perceive.make_capture"),
+        row=INPUTS.row,
+        settings=settings_of("capture"),
+        code=code_of("capture"),
     shell:
         scenario_job(
             "capture --row {params.row:q} --settings {params.settings:q} --output {output.capture:q}"
@@ -28,28 +25,24 @@ rule synthesise:
 
 rule capture:
     input:
-        raw_files,
+        INPUTS.imported_files,
     output:
         f"{RESULTS}/{{scenario}}/capture/capture.json",
     log:
-        f"{RESULTS}/logs/capture/{{scenario}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/capture/{{scenario}}.tsv"
+        log_of("capture", "{scenario}"),
     wildcard_constraints:
-        scenario=of_source("phystwin_raw", "phystwin"),
-    retries: 2
+        scenario=INPUTS.scenarios(imported=True),
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        mem_mb=memory("capture", 4000),
-        runtime=minutes("capture", 120, frame_work),
+        work=work("capture"),
+        mem_mb=NEEDS.memory("capture"),
+        runtime=NEEDS.minutes("capture"),
     params:
-        settings=section("data_root"),
-        row=scenario_row,
-        images=image_stamps,
-        code=code_digest("neuspring.data.phystwin_raw", stage="stages.perceive.make_capture"),
+        row=INPUTS.row,
+        images=INPUTS.image_stamps,
+        settings=settings_of("capture"),
+        code=code_of("capture"),
     shell:
         scenario_job(
             "capture --row {params.row:q} --settings {params.settings:q} --output {output:q}"
@@ -58,95 +51,78 @@ rule capture:
 
 rule segment:
     input:
-        capture=capture_file,
+        capture=INPUTS.capture,
     output:
         f"{RESULTS}/{{scenario}}/perception/{{camera}}/masks.json",
     log:
-        f"{RESULTS}/logs/segment/{{scenario}}/{{camera}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/segment/{{scenario}}/{{camera}}.tsv"
+        log_of("segment", "{scenario}/{camera}"),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        gpu=segment_gpu,
-        mem_mb=memory("segment", 8000),
-        runtime=minutes("segment", 120, frame_work),
+        work=work("segment"),
+        gpu=gpu("segment"),
+        mem_mb=NEEDS.memory("segment"),
+        runtime=NEEDS.minutes("segment"),
     params:
-        settings=segment_settings,
-        images=image_stamps,
-        code=segment_digest,
+        images=INPUTS.image_stamps,
+        settings=settings_of("segment"),
+        code=code_of("segment"),
     shell:
         gpu_job(
-            "segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q}"
-            " --threads {threads} --output {output:q}"
+            "segment --capture {input.capture:q} --camera {wildcards.camera} --settings {params.settings:q} --output {output:q}"
         )
 
 
 rule track:
     input:
-        capture=capture_file,
+        capture=INPUTS.capture,
         masks=rules.segment.output,
-        truth=truth_file("track"),
+        truth=INPUTS.truth("track"),
     output:
         f"{RESULTS}/{{scenario}}/perception/{{camera}}/tracks.json",
     log:
-        f"{RESULTS}/logs/track/{{scenario}}/{{camera}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/track/{{scenario}}/{{camera}}.tsv"
+        log_of("track", "{scenario}/{camera}"),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        gpu=track_gpu(),
-        mem_mb=memory("track", 8000),
-        runtime=minutes("track", 120, frame_work),
+        work=work("track"),
+        gpu=gpu("track"),
+        mem_mb=NEEDS.memory("track"),
+        runtime=NEEDS.minutes("track"),
     params:
-        settings=perception_settings("track", "seed"),
-        images=image_stamps,
-        code=backend_digest("track"),
+        images=INPUTS.image_stamps,
+        settings=settings_of("track"),
+        code=code_of("track"),
     shell:
         gpu_job(
             "track --capture {input.capture:q} --camera {wildcards.camera} --masks {input.masks:q}"
-            " --settings {params.settings:q} --threads {threads} --output {output:q}"
+            " --settings {params.settings:q} --output {output:q}"
         )
 
 
 rule lift:
     input:
-        capture=capture_file,
-        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
-        tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
-        truth=truth_file("shape"),
+        capture=INPUTS.capture,
+        masks=masks_of,
+        tracks=tracks_of,
+        truth=INPUTS.truth("shape"),
         mesh=CONFIG.perception.shape.mesh or [],
     output:
         f"{RESULTS}/{{scenario}}/perception/lifted.json",
     log:
-        f"{RESULTS}/logs/lift/{{scenario}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/lift/{{scenario}}.tsv"
-    retries: 2
+        log_of("lift", "{scenario}"),
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        mem_mb=memory("lift", 8000),
-        runtime=minutes("lift", 60, frame_work),
+        work=work("lift"),
+        mem_mb=NEEDS.memory("lift"),
+        runtime=NEEDS.minutes("lift"),
     params:
-        settings=perception_settings("lift", "shape"),
-        images=image_stamps,
-        code=code_digest(
-            "neuspring.perception.lift",
-            "neuspring.perception.shape_prior",
-            stage="stages.perceive.lift",
-        ),
+        images=INPUTS.image_stamps,
+        settings=settings_of("lift"),
+        code=code_of("lift"),
     shell:
         scenario_job(
             "lift --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
@@ -156,28 +132,24 @@ rule lift:
 
 rule judge:
     input:
-        capture=capture_file,
-        masks=lambda wildcards: camera_files(wildcards, "masks.json"),
-        tracks=lambda wildcards: camera_files(wildcards, "tracks.json"),
+        capture=INPUTS.capture,
+        masks=masks_of,
+        tracks=tracks_of,
         lifted=rules.lift.output,
         truth=f"{RESULTS}/{{scenario}}/capture_truth.npz",
     output:
         f"{RESULTS}/{{scenario}}/perception/judged.json",
     log:
-        f"{RESULTS}/logs/judge/{{scenario}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/judge/{{scenario}}.tsv"
-    retries: 2
+        log_of("judge", "{scenario}"),
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        mem_mb=memory("judge", 4000),
-        runtime=minutes("judge", 30, frame_work),
+        work=work("judge"),
+        mem_mb=NEEDS.memory("judge"),
+        runtime=NEEDS.minutes("judge"),
     params:
-        settings=perception_settings("shape"),
-        code=code_digest("neuspring.perception.judge", stage="stages.perceive.judge"),
+        settings=settings_of("judge"),
+        code=code_of("judge"),
     shell:
         scenario_job(
             "judge --capture {input.capture:q} --masks {input.masks:q} --tracks {input.tracks:q}"
@@ -185,24 +157,51 @@ rule judge:
         )
 
 
+rule observe:
+    input:
+        INPUTS.observed_from,
+    output:
+        f"{RESULTS}/{{scenario}}/observations.npz",
+    log:
+        log_of("observe", "{scenario}"),
+    conda:
+        ENVIRONMENT
+    resources:
+        work=work("observe"),
+        mem_mb=NEEDS.memory("observe"),
+        runtime=NEEDS.minutes("observe"),
+    params:
+        row=INPUTS.row,
+        perceived=lambda wildcards, input: (
+            ["--capture", input[0], "--lifted", input[1]]
+            if INPUTS.films(wildcards)
+            else []
+        ),
+        settings=settings_of("observe"),
+        code=code_of("observe"),
+    shell:
+        scenario_job(
+            "observe --row {params.row:q} --settings {params.settings:q} {params.perceived:q} --output {output:q}"
+        )
+
+
 rule perception_table:
     input:
-        judged_records(),
+        [
+            f"{RESULTS}/{name}/perception/judged.json"
+            for name in INPUTS.judged(CONFIG.scenarios)
+        ],
     output:
         PERCEPTION_TABLE,
     log:
-        f"{RESULTS}/logs/{CONFIG.tables}_perception.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/{CONFIG.tables}_perception.tsv"
-    retries: 2
+        log_of("perception_table", CONFIG.tables),
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        mem_mb=memory("perception_table", 2000),
-        runtime=minutes("perception_table", 10),
+        mem_mb=NEEDS.memory("perception_table"),
+        runtime=NEEDS.minutes("perception_table"),
     params:
-        arguments=perception_arguments(),
+        arguments=ARGUMENTS.perception(INPUTS.judged(BENCHMARK.whole.scenarios)),
         code=code_digest("neuspring.report.tables.perception"),
     shell:
         common_job("perception-table {params.arguments:q} --output {output:q}")

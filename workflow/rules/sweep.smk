@@ -1,4 +1,5 @@
-# A tuning study: workers share it; each is a job, and the study is as long as the configuration says, however many there are.
+# A sweep: workers share one Optuna study; each is a job, and the sweep is as long as the configuration says, however many there are.
+SWEEP = ARGUMENTS.sweep_folder
 if CONFIG.tune:
 
     rule tune:
@@ -7,52 +8,43 @@ if CONFIG.tune:
                 f"{RESULTS}/{name}/observations.npz" for name in BENCHMARK.tuned
             ],
         output:
-            f"{TUNE_FOLDER}/worker-{{worker}}.json",
+            f"{SWEEP}/worker-{{worker}}.json",
         log:
-            f"{RESULTS}/logs/tune/{CONFIG.tune.study}/{{worker}}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks/tune/{CONFIG.tune.study}/{{worker}}.tsv"
+            log_of("tune", f"{CONFIG.tune.study}/{{worker}}"),
         wildcard_constraints:
             worker=r"\d+",
         priority: GPU_FIRST
-        retries: 2
         conda:
             ENVIRONMENT
-        threads: 1
         resources:
             gpu=GPU,
-            mem_mb=memory("tune", 8000),
-            runtime=2880,
+            mem_mb=NEEDS.memory("tune"),
+            runtime=NEEDS.minutes("tune"),
         params:
-            settings=tune_settings(),
-            rows=tuned_rows(),
-            code=code_digest(
-                "neuspring.twin.fit", "neuspring.twin.search", stage="experiments.tuning.trial.run"
-            ),
+            settings=ARGUMENTS.sweep(),
+            rows=ARGUMENTS.tuned_rows(),
+            code=code_digest("neuspring.experiments.tuning.trial"),
         shell:
-            common_gpu_job(
+            common_job(
                 "tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
-                " --threads {threads} --output {output:q}"
+                f" --threads {{threads}} --device {CONFIG.device} --output {{output:q}}",
+                gpus=True,
             )
 
     rule sweep_report:
         input:
             workers=expand(rules.tune.output, worker=range(CONFIG.tune.workers)),
         output:
-            sweep_summaries(),
+            f"{SWEEP}/summary.md",
         log:
-            f"{RESULTS}/logs/sweep/{CONFIG.tune.study}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks/sweep/{CONFIG.tune.study}.tsv"
-        retries: 2
+            log_of("sweep", CONFIG.tune.study),
         conda:
             ENVIRONMENT
-        threads: 1
         resources:
-            mem_mb=memory("sweep", 4000),
-            runtime=minutes("sweep", 20),
+            mem_mb=NEEDS.memory("sweep"),
+            runtime=NEEDS.minutes("sweep"),
         params:
-            settings=tune_settings(),
+            settings=ARGUMENTS.sweep(),
             code=code_digest("neuspring.experiments.tuning.report"),
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")
@@ -62,22 +54,18 @@ if CONFIG.tune:
             store=rules.track_init.output,
             summary=rules.sweep_report.output,
         output:
-            f"{TUNE_FOLDER}/mlflow.txt",
+            f"{SWEEP}/mlflow.txt",
         log:
-            f"{RESULTS}/logs/log_sweep/{CONFIG.tune.study}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks/log_sweep/{CONFIG.tune.study}.tsv"
-        retries: 2
+            log_of("log_sweep", CONFIG.tune.study),
         conda:
             ENVIRONMENT
-        threads: 1
         resources:
-            mem_mb=memory("log_sweep", 2000),
-            runtime=minutes("log_sweep", 30),
+            mem_mb=NEEDS.memory("log_sweep"),
+            runtime=NEEDS.minutes("log_sweep"),
         params:
             settings=section("tracking"),
-            results=lambda wildcards, input: str(Path(input.store[0]).parent),
-            folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
+            results=RESULTS,
+            folder=SWEEP,
         shell:
             common_job(
                 "sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
@@ -86,4 +74,4 @@ if CONFIG.tune:
 
 rule sweep:
     input:
-        sweep_targets,
+        lambda wildcards: told(ARGUMENTS.sweep_targets),

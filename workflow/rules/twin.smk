@@ -1,124 +1,107 @@
+# Twins: zero-order stage, first-order stage, prediction; transfer to other recordings.
 rule search:
     input:
         observations=rules.observe.output,
     output:
         f"{RESULTS}/{{scenario}}/search-{{search}}/{{seed}}/search.json",
     log:
-        f"{RESULTS}/logs/search/{{scenario}}/{{search}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/search/{{scenario}}/{{search}}/{{seed}}.tsv"
+        log_of("search", "{scenario}/{search}/{seed}"),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=search_work,
-        gpu=GPU,
-        mem_mb=memory("search", 8000),
-        runtime=minutes("search", 240, search_work),
+        work=work("search"),
+        gpu=gpu("search"),
+        mem_mb=NEEDS.memory("search"),
+        runtime=NEEDS.minutes("search"),
     params:
-        settings=search_settings,
         clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
-        code=code_digest("neuspring.twin.search"),
+        settings=settings_of("search"),
+        code=code_of("search"),
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
-            " --clusters {params.clusters} --seed {wildcards.seed} --threads {threads} --output {output:q}"
+            " --clusters {params.clusters} --seed {wildcards.seed} --output {output:q}"
         )
 
 
 rule fit:
     input:
         observations=rules.observe.output,
-        search=search_record,
+        search=INPUTS.search_of_fit,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/fit.json",
     log:
-        f"{RESULTS}/logs/fit/{{scenario}}/{{method}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/fit/{{scenario}}/{{method}}/{{seed}}.tsv"
+        log_of("fit", "{scenario}/{method}/{seed}"),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=fit_work,
-        gpu=GPU,
-        mem_mb=memory("fit", 8000),
-        runtime=minutes("fit", 480, fit_work),
+        work=work("fit"),
+        gpu=gpu("fit"),
+        mem_mb=NEEDS.memory("fit"),
+        runtime=NEEDS.minutes("fit"),
     params:
-        settings=fit_settings,
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
-        code=code_digest("neuspring.twin.fit"),
+        settings=settings_of("fit"),
+        code=code_of("fit"),
     shell:
         gpu_job(
             "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-            " --kind {params.kind} --threads {threads} --output {output:q}"
+            " --kind {params.kind} --output {output:q}"
         )
 
 
 rule rollout:
     input:
         observations=rules.observe.output,
-        twin=rollout_twins,
+        twin=INPUTS.rolled_out,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:
-        f"{RESULTS}/logs/rollout/{{scenario}}/{{method}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/rollout/{{scenario}}/{{method}}/{{seed}}.tsv"
+        log_of("rollout", "{scenario}/{method}/{seed}"),
     wildcard_constraints:
-        method=methods_with_search(),
+        method=INPUTS.methods(model=False),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        gpu=GPU,
-        mem_mb=memory("rollout", 4000),
-        runtime=minutes("rollout", 60, frame_work),
+        work=work("rollout"),
+        gpu=gpu("rollout"),
+        mem_mb=NEEDS.memory("rollout"),
+        runtime=NEEDS.minutes("rollout"),
     params:
-        carry=carry_option,
-        code=code_digest(
-            "neuspring.twin.rollout", "neuspring.twin.motion", "neuspring.twin.carry", stage="stages.stages.rollout"
+        carry=lambda wildcards: (
+            "--carry-over" if BENCHMARK.methods[wildcards.method].carry_over else ""
         ),
+        code=code_of("rollout"),
     shell:
         gpu_job(
-            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry}"
-            " --threads {threads} --output {output:q}"
+            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry} --output {output:q}"
         )
 
 
 rule transfer:
     input:
-        targets=transfer_targets,
-        twin=learned_record,
+        targets=INPUTS.targets,
+        learned=INPUTS.learned,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/transfer.json",
     log:
-        f"{RESULTS}/logs/transfer/{{scenario}}/{{method}}/{{seed}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/transfer/{{scenario}}/{{method}}/{{seed}}.tsv"
+        log_of("transfer", "{scenario}/{method}/{seed}"),
     priority: GPU_FIRST
-    retries: 2
     conda:
         ENVIRONMENT
-    threads: 1
     resources:
-        work=frame_work,
-        gpu=GPU,
-        mem_mb=memory("transfer", 4000),
-        runtime=minutes("transfer", 60, frame_work),
+        work=work("transfer"),
+        gpu=gpu("transfer"),
+        mem_mb=NEEDS.memory("transfer"),
+        runtime=NEEDS.minutes("transfer"),
     params:
-        settings=section("simulation"),
-        code=transfer_digest,
+        settings=settings_of("transfer"),
+        code=code_of("transfer"),
     shell:
         gpu_job(
-            "transfer --targets {input.targets:q} --twin {input.twin:q} --settings {params.settings:q}"
-            " --method {wildcards.method} --seed {wildcards.seed} --threads {threads}"
-            " --output {output:q}"
+            "transfer --targets {input.targets:q} --twin {input.learned:q} --settings {params.settings:q}"
+            " --method {wildcards.method} --seed {wildcards.seed} --output {output:q}"
         )

@@ -1,8 +1,8 @@
 """`python -m neuspring.experiments.jobs.wrapper ... -- COMMAND`: run one job of the workflow.
 
-Holds the GPUs that the job needs while it runs, keeps its output in its log, watches its time and memory, and writes its record
-(`neuspring.core.job_records`), with the cause if it fails. A job that failed for a reason that trying again cannot mend is not tried
-again. Imports nothing heavy: this is the start of every job.
+Holds the GPUs that the job needs, keeps its output in its log, watches its time and memory, and writes its record
+(`job_records`), with the cause if it fails. A job that failed for a reason that trying again cannot mend is not tried again.
+Imports nothing heavy: this is the start of every job.
 """
 
 from __future__ import annotations

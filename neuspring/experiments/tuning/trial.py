@@ -13,6 +13,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,9 +27,9 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
-from neuspring.core.records import StageRecord, Stopwatch, canonical, digest_file
+from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.experiments.tuning.space import Plan
-from neuspring.stages import stages
+from neuspring.stages import search as search_stage
 from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit
 
 Report = Callable[[int, float, str], None]
@@ -89,11 +90,11 @@ class Outcome:
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Count what is done inside."""
-        clock = Stopwatch()
+        began = time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[stage] += clock.seconds
+            self.seconds[stage] += time.perf_counter() - began
 
     @property
     def value(self) -> float:
@@ -171,7 +172,7 @@ def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: s
             write_text(
                 place / "settings.json", json.dumps({"scenario": scene.name, "clusters": clusters, **values}, indent=1) + "\n"
             )
-            stages.search(scene.head, settings, clusters, seed, device, record)
+            search_stage.run(scene.head, settings, clusters, seed, device, record)
     return record
 
 

@@ -1,0 +1,72 @@
+"""Commands on data: fetch, check-data, verify-released."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from neuspring.stages import options as shared
+
+
+def fetch_options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring fetch`."""
+    parser.add_argument("source", choices=["phystwin"])
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="all 22 by default")
+    parser.add_argument("--data-root", type=Path, required=True, help="folder to write to; data_root of the configuration")
+    parts = "data, results, appearance, images, other; all: these five; extra: more clothes"
+    parser.add_argument("--parts", nargs="+", default=["data", "results"], help=f"{parts} (default: data results)")
+    parser.add_argument("--revision", default="main", help="branch, tag or commit of the data set")
+    parser.add_argument("--dry-run", action="store_true", help="say what would be fetched and the space it takes")
+
+
+def fetch(a: Namespace) -> int:
+    """`neuspring fetch`: 2 where what came is broken."""
+    from neuspring.data import check
+    from neuspring.data.fetch import fetch
+
+    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run)
+    if a.dry_run:
+        return 0
+    print(check.render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
+
+
+def check_data_options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring check-data`."""
+    parser.add_argument("folder", type=Path)
+
+
+def check_data(a: Namespace) -> int:
+    """`neuspring check-data`: 2 where the data cannot be used."""
+    from neuspring.data import check
+
+    departures = check.check(a.folder)
+    print(check.render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
+
+
+def verify_released_options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring verify-released`."""
+    parser.add_argument("data_root", type=Path, help="folder that holds data, experiments and the other released folders")
+    parser.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
+    checks = "2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
+    parser.add_argument("--checks", nargs="+", type=int, help=checks)
+    shared.add_settings(parser)
+    shared.add_device(parser)
+    shared.add_output(parser, "folder to write to")
+
+
+def verify_released(a: Namespace) -> int:
+    """`neuspring verify-released`."""
+    from neuspring.scores.released import run
+
+    report = run.verify_released(
+        a.data_root,
+        a.output,
+        scenarios=a.scenarios,
+        checks=a.checks or tuple(run.CHECKS),
+        device=a.device,
+        lpips=shared.read_settings(a.settings).images.lpips,
+    )
+    print(report.text, end="")
+    return report.status

@@ -1,0 +1,69 @@
+"""What a user is told before and after a run of the workflow."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from neuspring.config import plain
+from neuspring.core.job_records import FOLDER, RUN, failure_lines, read_jobs, this_run
+from neuspring.experiments.arguments import Arguments
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.plan import report as plan
+
+__all__ = ["failed", "finished", "plan"]
+
+
+def failed(benchmark: Benchmark, arguments: Arguments) -> None:
+    """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
+    results = Path(benchmark.config.results)
+    print("\nThe run did not finish. What is done so far:", flush=True)
+    # In a folder of their own: had the tables a file in place, the next run would find nothing to be done.
+    so_far = f"{arguments.folder}/so_far"
+    command = [sys.executable, "-m", "neuspring"]
+    subprocess.run([*command, "tables", *arguments.tables(so_far)], check=False)
+    page = f"{so_far}/report.html"
+    subprocess.run([*command, "report", *arguments.report(page)], check=False, stdout=subprocess.DEVNULL)
+    damaged: list[str] = []
+    jobs = read_jobs(results, damaged)
+    lines = failure_lines([record for record in jobs if record.last.run == this_run(results)], results) + damaged
+    print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
+    if earlier := len(failure_lines(jobs, results)) + len(damaged) - len(lines):
+        print(f"{earlier} jobs that failed in earlier runs have not been run again.")
+    print(f"Report so far: {page}. The same command continues where this one stopped.", flush=True)
+
+
+def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str]) -> None:
+    """After success: the table, what to open, where the runs are in MLflow."""
+    config, folder = benchmark.config, arguments.folder
+    results = shlex.quote(config.results)
+    begun = (Path(config.results) / FOLDER / RUN).stat().st_mtime
+    for study in benchmark.studies:
+        path = Path(folder) / "studies" / f"{study}.md"
+        if path.exists() and path.stat().st_mtime >= begun:
+            cell = f"neuspring explain {study}/ROW/future/chamfer --results {results}"
+            print(f"{study}: {path}; the runs behind a number: {cell}")
+    summary = Path(folder) / "summary.md"
+    if not summary.exists():
+        return
+    print(f"\n{summary.read_text()}")
+    print(f"Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/ (run.json names the twin), tables: {folder}/")
+    print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (videos of every method)")
+    if config.tracking.enabled:
+        _tell_tracking(benchmark, results, logged)
+
+
+def _tell_tracking(benchmark: Benchmark, results: str, logged: Sequence[str]) -> None:
+    neuspring = Path(sys.executable).parent / "neuspring"
+    tracking = json.dumps({"tracking": plain(benchmark.config.tracking)}, sort_keys=True)
+    settings = f" --settings {shlex.quote(tracking)}" if benchmark.config.tracking.uri else ""
+    waiting = [path for path in map(Path, logged) if path.exists() and "logged" not in path.read_text()]
+    if waiting:
+        reason = waiting[0].read_text().strip()
+        print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
+        print(f"  {neuspring} sync --results {results}{settings}")
+    print(f"Look at the runs in MLflow:\n  {neuspring} ui --results {results}{settings}", flush=True)

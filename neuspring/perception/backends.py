@@ -1,0 +1,72 @@
+"""The backends of segmentation and tracking: `BACKENDS` declares them, and stages and workflow ask it.
+
+To add a backend: its module with the function `segment` or `track`, its settings in neuspring/config/perception.py, its line here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from neuspring.config.perception import Perception
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from neuspring.data.capture import Capture
+    from neuspring.perception.track_opencv import Followed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backend:
+    """One way to do a step. Its module is imported when it is used."""
+
+    module: str
+    section: str = ""
+    """Its settings: a field of `perception.segment` or `perception.track`; empty: it has none."""
+    gpu: bool = False
+    """Whether it takes a GPU where there is one; it is then given the device as its last argument."""
+    truth: bool = False
+    """Whether it reads the truth of a synthetic scene: to measure by, never a method."""
+
+    def _own(self, section: Any) -> tuple[Any, ...]:
+        return (getattr(section, self.section),) if self.section else ()
+
+    def _device(self, device: str) -> tuple[str, ...]:
+        from neuspring.core.device import resolve_device
+
+        return (resolve_device(device),) if self.gpu else ()
+
+    def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
+        """Labels [T, H, W] uint8 of one camera."""
+        function = import_module(self.module).segment
+        labels: np.ndarray = function(capture, camera, *self._own(settings.segment), *self._device(device))
+        return labels
+
+    def track(self, capture: Capture, camera: str, labels: np.ndarray, settings: Perception, device: str) -> Followed:
+        """Tracks of pixels of the masks `labels` [T, H, W]."""
+        function = import_module(self.module).track
+        tracks: Followed = function(capture, camera, labels, *self._own(settings.track), settings.seed, *self._device(device))
+        return tracks
+
+
+BACKENDS = {
+    "segment": {
+        "given": Backend(module="neuspring.perception.segment_given"),
+        "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv"),
+        "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
+    },
+    "track": {
+        "opencv": Backend(module="neuspring.perception.track_opencv", section="opencv"),
+        "cotracker3": Backend(module="neuspring.perception.track_cotracker", section="cotracker3", gpu=True),
+        # The truth takes its count of points from the settings of opencv.
+        "truth": Backend(module="neuspring.perception.track_truth", section="opencv", truth=True),
+    },
+}
+
+
+def backend_keys(step: str, name: str) -> tuple[str, ...]:
+    """Keys of the configuration that a backend reads."""
+    section = BACKENDS[step][name].section
+    return (f"perception.{step}.backend", *((f"perception.{step}.{section}",) if section else ()))

@@ -1,0 +1,21 @@
+"""Masks that the capture brings itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.data.capture import CAPTURE, Capture
+
+
+def segment(capture: Capture, camera: str) -> np.ndarray:
+    """Labels [T, H, W] of the folder mask/, 0 in frames that the camera lacks. Raises InputError if there are no masks."""
+    if not capture.description.masks:
+        rule = "perception.segment.backend: given needs masks: true and the folder mask/"
+        raise InputError(capture.folder / CAPTURE, rule, "masks: false", "Choose another backend: opencv or grounded_sam2.")
+    view = capture.cameras[camera]
+    labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
+    for frame in range(capture.frame_count):
+        if capture.has(camera, frame):
+            labels[frame] = capture.mask(camera, frame)
+    return labels

@@ -1,0 +1,78 @@
+"""Twin and controllers of all frames -> trajectory."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.device import resolve_device
+from neuspring.core.records import Recorder, StageRecord
+from neuspring.stages import options as shared
+from neuspring.twin.carry import carry_over
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import mean_trajectory, roll_out
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring rollout`."""
+    shared.add_observations(parser)
+    twins = "search.json or fit.json that names the twin; of several, the mean of the trajectories"
+    parser.add_argument("--twin", type=Path, nargs="+", required=True, help=twins)
+    carry = "correct the state at the last training frame by what was observed there, where training frames say that it helps"
+    parser.add_argument("--carry-over", action="store_true", help=carry)
+    shared.add_device(parser)
+    shared.add_output(parser)
+
+
+def command(a: Namespace) -> None:
+    """`neuspring rollout`."""
+    run(a.observations, a.twin, a.carry_over, a.device, a.output)
+
+
+def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, device: str, output: Path) -> None:
+    """Write trajectory.npz and the record `output`. A rollout that diverges is recorded as a failure.
+
+    Of several records, the mean of their trajectories. `carry` corrects the state at the last training frame by what was observed
+    there, where training frames say that it helps.
+    """
+    device = resolve_device(device)
+    before = {path: StageRecord.load(path) for path in twin_records}
+    inputs = {f"{record.stage}{index or ''}": path for index, (path, record) in enumerate(before.items())}
+    record = Recorder(
+        "rollout",
+        output,
+        inputs={"observations": observations_path} | inputs,
+        settings={"carry_over": carry},
+        device=device,
+    )
+    failed = next((stage for stage in before.values() if stage.status == "failed"), None)
+    if failed:
+        record.save(failure=f"{failed.stage}: {failed.reason}")
+        return
+    observations = Observations.load(observations_path)
+    trajectories, corrections = [], []
+    for path, stage in before.items():
+        twin = Twin.load(stage.file("twin", path))
+        velocity = initial_velocity(observations, twin.simulation.initial_velocity)
+        trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity)
+        if carry:
+            trajectory, correction = carry_over(trajectory, twin, observations, velocity, device)
+            corrections.append(correction)
+        trajectories.append(trajectory)
+    # A diverged rollout ends earlier; the mean would hide that.
+    diverged = next((one for one in trajectories if one.diverged_frame is not None), None)
+    trajectory = diverged or mean_trajectory(trajectories)
+    facts: dict[str, Any] = {"frames": len(trajectory.positions), "averaged": len(trajectories)}
+    if corrections:
+        facts |= {f"carry_over_{name}": float(np.mean([one[name] for one in corrections])) for name in corrections[0]}
+    facts["collision_overflow"] = trajectory.collision_overflow
+    if trajectory.collision_overflow:
+        print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")
+    files = record.beside(trajectory="trajectory.npz")
+    trajectory.save(files["trajectory"])
+    record.save(files, facts, failure=f"rollout: {trajectory.reason}" if diverged else "")

@@ -1,0 +1,79 @@
+"""Observations -> coarse twin, by CMA-ES."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from neuspring.config import Config
+from neuspring.config.select import select
+from neuspring.core.artifacts import Observations
+from neuspring.core.checkpoint import checkpoint_key
+from neuspring.core.device import resolve_device
+from neuspring.core.errors import NumericalFailure
+from neuspring.core.files import write_history
+from neuspring.core.records import Recorder
+from neuspring.stages import STAGES
+from neuspring.stages import options as shared
+from neuspring.twin.search import SearchProblem, search
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring search`."""
+    shared.add_observations(parser)
+    shared.add_settings(parser)
+    parser.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
+    shared.add_seed(parser)
+    shared.add_device(parser)
+    shared.add_output(parser)
+
+
+def command(a: Namespace) -> None:
+    """`neuspring search`."""
+    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output)
+
+
+def run(observations_path: Path, settings: Config, clusters: int, seed: int, device: str, output: Path) -> None:
+    """Write twin.npz, trace.parquet (every candidate with its cost and variables), history.parquet, and the record `output`.
+
+    A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
+    """
+    device = resolve_device(device)
+    values = select(settings, STAGES["search"].reads)
+    record = Recorder(
+        "search",
+        output,
+        inputs={"observations": observations_path},
+        settings=values | {"clusters": clusters, "seed": seed},
+        device=device,
+    )
+    problem = SearchProblem(
+        Observations.load(observations_path),
+        settings.search,
+        settings.simulation,
+        settings.losses,
+        settings.released_quirks,
+        device,
+        clusters,
+    )
+    # The budget is not part of the key: a search with a larger one begins with the same candidates.
+    without_budget = {name: value for name, value in values["search"].items() if name != "rollouts"}
+    key = checkpoint_key(record.inputs, record.settings | {"search": without_budget}, device, "neuspring.twin.search")
+    files = record.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
+    try:
+        result = search(problem, seed, record=files["trace"], key=key)
+    except NumericalFailure as failure:
+        record.save(failure=str(failure))
+        return
+    result.twin.save(files["twin"])
+    costs = result.trace["cost"]
+    write_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}, files["history"])
+    facts = {
+        **result.values,
+        "cost": result.cost,
+        "rollouts": len(result.trace),
+        "failed_rollouts": int((result.trace["reason"] != "").sum()),
+        "collision_overflow": int(result.trace["collision_overflow"].max()),
+        **result.twin.counts,
+    }
+    record.save(files, facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)

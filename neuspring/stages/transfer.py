@@ -1,0 +1,85 @@
+"""What one recording taught -> scores on other recordings of the same object."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from neuspring.baselines import BASELINES
+from neuspring.config import Config
+from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.device import resolve_device
+from neuspring.core.files import write_table
+from neuspring.core.records import Recorder, StageRecord
+from neuspring.scores import metrics
+from neuspring.stages import options as shared
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.transfer import rebase
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the options of `neuspring transfer`."""
+    shared.add_record(parser, "twin", "search.json or fit.json that names the twin, or train.json of a baseline")
+    about = "observations.npz of the other recordings"
+    parser.add_argument("--targets", type=Path, nargs="+", required=True, help=about)
+    parser.add_argument("--method", required=True)
+    shared.add_seed(parser)
+    shared.add_settings(parser)
+    shared.add_device(parser)
+    shared.add_output(parser)
+
+
+def command(a: Namespace) -> None:
+    """`neuspring transfer`."""
+    run(a.targets, a.twin, a.method, a.seed, shared.read_settings(a.settings), a.device, a.output)
+
+
+def run(targets: Sequence[Path], learned_record: Path, method: str, seed: int, settings: Config, device: str, output: Path) -> None:
+    """Write transfer.parquet (task `transfer`) and the record `output`.
+
+    `learned_record` names a twin, or a trained baseline that can be transferred. All frames after the first of a target count; with
+    observed initial velocities the first two of them also set the start. A twin's rest lengths are re-based on the target's rest
+    shape, unless they were trained. A rollout that diverges leaves out its target.
+    """
+    before, device = StageRecord.load(learned_record), resolve_device(device)
+    inputs = {before.stage: learned_record} | {f"target{index}": path for index, path in enumerate(targets)}
+    record = Recorder("transfer", output, inputs=inputs, device=device)
+    tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    if before.status == "ok":
+        predict = _model_elsewhere if before.stage == "train" else _twin_elsewhere
+        predicts = predict(before, learned_record, settings, device)
+        for path in targets:
+            observations = Observations.load(path)
+            trajectory = predicts(observations)
+            if trajectory.diverged_frame is not None:
+                diverged.append(observations.scenario.name)
+            frames = range(1, observations.scenario.frame_count)
+            tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
+    files = record.beside(scores="transfer.parquet")
+    write_table(pd.concat([table for table in tables if len(table)] or tables), files["scores"])
+    record.save(files, {"diverged": diverged, "targets": len(targets)}, failure=before.reason)
+
+
+def _model_elsewhere(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+    """How a baseline's model predicts another recording."""
+    baseline = BASELINES[record.settings["model"]]
+    return lambda observations: baseline.predict(observations, record.file("model", path), None, device).trajectory
+
+
+def _twin_elsewhere(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+    """How a twin predicts another recording."""
+    twin = Twin.load(record.file("twin", path))
+    keep_lengths = bool(record.settings.get("fit", {}).get("rest_length_bound"))
+    keep_frame_time = record.settings["released_quirks"]["frame_time_667"]
+
+    def predict(observations: Observations) -> Trajectory:
+        safety = settings.simulation.safety
+        moved = rebase(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
+        velocity = initial_velocity(observations, moved.simulation.initial_velocity)
+        return roll_out(moved, observations.controller_points, device, velocity=velocity)
+
+    return predict

@@ -1,0 +1,153 @@
+# Scores, tables, report, and MLflow, which is an index of the records: its rules never fail a run, and no number depends on them.
+rule score:
+    input:
+        observations=rules.observe.output,
+        search=INPUTS.search,
+        fit=INPUTS.fit,
+        train=INPUTS.train,
+        rollout=rules.rollout.output,
+        appearance=INPUTS.appearance,
+        render=INPUTS.render,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/run.json",
+    log:
+        log_of("score", "{scenario}/{method}/{seed}"),
+    conda:
+        ENVIRONMENT
+    resources:
+        work=work("score"),
+        mem_mb=NEEDS.memory("score"),
+        runtime=NEEDS.minutes("score"),
+    params:
+        stages=lambda wildcards, input: options(
+            input, **{name: f"--{name}" for name in STAGES if name != "observe"}
+        ),
+        variant=INPUTS.variant,
+        code=code_of("score"),
+    shell:
+        scenario_job(
+            "score --observations {input.observations:q} {params.stages:q} --method {wildcards.method}"
+            " --variant {params.variant:q} --seed {wildcards.seed} --output {output:q}"
+        )
+
+
+rule tables:
+    input:
+        runs=INPUTS.runs(),
+        transfers=INPUTS.transfers(),
+    output:
+        TABLES,
+    log:
+        log_of("tables", CONFIG.tables),
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=NEEDS.memory("tables"),
+        runtime=NEEDS.minutes("tables"),
+    params:
+        arguments=ARGUMENTS.tables(),
+        code=code_digest("neuspring.report.tables.summary", "neuspring.report.gallery"),
+    shell:
+        common_job("tables {params.arguments:q}")
+
+
+rule study:
+    input:
+        lambda wildcards: INPUTS.runs(BENCHMARK.methods_of(wildcards.study)),
+    output:
+        f"{TABLE_FOLDER}/studies/{{study}}.md",
+    log:
+        log_of("study", f"{CONFIG.tables}/{{study}}"),
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=NEEDS.memory("study"),
+        runtime=NEEDS.minutes("study"),
+    params:
+        arguments=lambda wildcards: ARGUMENTS.study(wildcards.study),
+        definition=lambda wildcards: json.dumps(
+            settings.plain(BENCHMARK.studies[wildcards.study])
+        ),
+        code=code_digest("neuspring.report.tables.study"),
+    shell:
+        common_job("study {params.arguments:q}")
+
+
+rule report:
+    input:
+        tables=TABLES,
+        studies=expand(rules.study.output, study=CONFIG.studies),
+        perception=[PERCEPTION_TABLE] if INPUTS.judged(CONFIG.scenarios) else [],
+    output:
+        REPORT,
+    log:
+        log_of("report", CONFIG.tables),
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=NEEDS.memory("report"),
+        runtime=NEEDS.minutes("report"),
+    params:
+        arguments=ARGUMENTS.report(),
+        templates=ARGUMENTS.template_digest(),
+        sweeps=ARGUMENTS.finished_sweeps(),
+        code=code_digest("neuspring.report.page"),
+    shell:
+        common_job("report {params.arguments:q}")
+
+
+rule track_init:
+    output:
+        f"{RESULTS}/mlflow.json",
+    log:
+        log_of("track_init", "mlflow"),
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=NEEDS.memory("track_init"),
+        runtime=NEEDS.minutes("track_init"),
+    params:
+        settings=section("tracking"),
+        results=RESULTS,
+    shell:
+        common_job(
+            "track-init --results {params.results:q} --settings {params.settings:q} --output {output:q}"
+        )
+
+
+rule log_run:
+    input:
+        store=rules.track_init.output,
+        record=rules.score.output,
+    output:
+        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/mlflow.txt",
+    log:
+        log_of("log_run", "{scenario}/{method}/{seed}"),
+    conda:
+        ENVIRONMENT
+    resources:
+        work=work("log_run"),
+        mem_mb=NEEDS.memory("log_run"),
+        runtime=NEEDS.minutes("log_run"),
+    params:
+        settings=section("tracking"),
+        results=RESULTS,
+    shell:
+        scenario_job(
+            "log --record {input.record:q} --results {params.results:q} --settings {params.settings:q} --output {output:q}"
+        )
+
+
+# A study of the paper is a target by its name, which must not be another's.
+for study_name in BENCHMARK.studies:
+    if study_name in {other.name for other in workflow.rules} | {"all", "sweep"}:
+        raise WorkflowError(
+            f"{CONFIG.study_table}, study {study_name}: this is the name of another target; rename the study."
+        )
+
+    rule:
+        name:
+            study_name
+        input:
+            f"{TABLE_FOLDER}/studies/{study_name}.md",
+            INPUTS.logged_runs(BENCHMARK.methods_of(study_name)),
