@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.baselines.untrained import controller_lbs, static
+from neuspring.baselines.controller_lbs import predict as controller_lbs
+from neuspring.baselines.static import predict as static
 from neuspring.core.artifacts import Trajectory
 from neuspring.scores import metrics
 from tests.support import small
@@ -27,7 +28,7 @@ def test_controllers_that_move_as_a_body_carry_the_object_along():
     flat = seen.controller_points[0]
     hand = np.concatenate([flat, flat[:3] + np.array([0.01, 0.02, 0.03])])
     moved = np.stack([turn.apply(hand) + shift for turn, shift in zip(turns, shifts, strict=True)])
-    found = controller_lbs(replace(seen, controller_points=moved), "cpu").trajectory.positions
+    found = controller_lbs(replace(seen, controller_points=moved)).trajectory.positions
     wanted = np.stack([turn.apply(seen.nodes) + shift for turn, shift in zip(turns, shifts, strict=True)])
     np.testing.assert_allclose(found, wanted, atol=2e-4)
 
@@ -35,7 +36,7 @@ def test_controllers_that_move_as_a_body_carry_the_object_along():
 def test_neither_sees_more_than_frame_0_of_the_object():
     seen = small.observations()
     spoiled = replace(seen, object_points=np.concatenate([seen.object_points[:1], seen.object_points[1:] + 1.0]))
-    for method in (static, lambda observations: controller_lbs(observations, "cpu")):
+    for method in (static, controller_lbs):
         np.testing.assert_array_equal(method(seen).trajectory.positions, method(spoiled).trajectory.positions)
 
 

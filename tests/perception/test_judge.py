@@ -14,6 +14,7 @@ from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
 from neuspring.data.synthetic.correspond import at_points, under_pixels
 from neuspring.data.synthetic.truth import truth_of, truth_path
+from neuspring.config.perception import OpenCvTracking
 from neuspring.perception import track_truth
 from neuspring.perception.judge import judge
 from neuspring.perception.lift import lift

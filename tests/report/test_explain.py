@@ -17,7 +17,7 @@ from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.report.tables import study as tables_paper
 from neuspring.scores import paper
 from neuspring.scores.studies import read_studies
-from neuspring.stages import stages
+from neuspring.stages import score
 from tests.support import small
 from tests.support.study_runs import all_scores, write_benchmark, write_run
 
@@ -243,7 +243,7 @@ def test_the_key_is_that_of_a_real_run(tmp_path):
     records = {"search": folder / "search.json", "rollout": folder / "rollout.json"}
     StageRecord(stage="search", status="ok", settings={"seed": 0}, started="2026").save(records["search"])
     StageRecord(stage="rollout", status="ok", files=named, started="2026").save(records["rollout"])
-    stages.score(seen, records, "search_only", {"fit": "none"}, 0, folder / "run.json")
+    score.run(seen, records, "search_only", {"fit": "none"}, 0, folder / "run.json")
     record = json.loads((folder / "run.json").read_text())
     assert check_files(folder / "run.json", record, seen) == (3, [])
     _, problems = check_files(folder / "run.json", record | {"seed": 1}, seen)

@@ -14,7 +14,7 @@ from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
-from neuspring.stages import stages
+from neuspring.stages import fit, observe, rollout, score, search
 from tests.support import small
 
 SETTINGS = config.Config(
@@ -36,15 +36,15 @@ def run_all(folder, name="small", *, method="phystwin", settings=SETTINGS):
     seen, found = folder / name / "observations.npz", folder / name / searched / "0" / "search.json"
     out = folder / name / method / "0"
     if not seen.exists():
-        stages.observe(small.row(name=name), settings, seen)
+        observe.run(small.row(name=name), settings, seen)
     if not found.exists():
-        stages.search(seen, settings, clusters, 0, "cpu", found)
+        search.run(seen, settings, clusters, 0, "cpu", found)
     records = {"search": found}
     if kind:
-        stages.fit(seen, found, settings, kind, "cpu", out / "fit.json")
+        fit.run(seen, found, settings, kind, "cpu", out / "fit.json")
         records["fit"] = out / "fit.json"
-    stages.rollout(seen, list(records.values())[-1:], False, "cpu", out / "rollout.json")
-    stages.score(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
+    rollout.run(seen, list(records.values())[-1:], False, "cpu", out / "rollout.json")
+    score.run(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
     return out / "run.json"
 
 
@@ -116,9 +116,9 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
 def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     seen = finished[0] / "small" / "observations.npz"
     larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
-    stages.search(seen, SETTINGS, 1, 0, "cpu", tmp_path / "search.json")
+    search.run(seen, SETTINGS, 1, 0, "cpu", tmp_path / "search.json")
     before = pd.read_parquet(tmp_path / "trace.parquet")
-    stages.search(seen, larger, 1, 0, "cpu", tmp_path / "search.json")
+    search.run(seen, larger, 1, 0, "cpu", tmp_path / "search.json")
     record, after = StageRecord.load(tmp_path / "search.json"), pd.read_parquet(tmp_path / "trace.parquet")
     assert (record.attempts, record.facts["rollouts"], len(after)) == (2, 14, 14)
     # Candidates that were there are not evaluated again: not even their times change.
@@ -126,7 +126,7 @@ def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     assert record.file("trace", tmp_path / "search.json").exists()
     # Everything else does start a search afresh.
     other = replace(larger, losses=config.Losses(track=2.0))
-    stages.search(seen, other, 1, 0, "cpu", tmp_path / "search.json")
+    search.run(seen, other, 1, 0, "cpu", tmp_path / "search.json")
     assert StageRecord.load(tmp_path / "search.json").attempts == 1
 
 
@@ -153,7 +153,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     def fails(*_arguments, **_options):
         raise NumericalFailure("every candidate diverged")
 
-    monkeypatch.setattr("neuspring.twin.search.search", fails)
+    monkeypatch.setattr("neuspring.stages.search.search", fails)
     run_all(tmp_path, "bad")
     monkeypatch.undo()
     run_all(tmp_path, "good")
@@ -172,11 +172,11 @@ def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
     folder, _, _ = finished
     monkeypatch.setattr("neuspring.twin.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
     found = folder / "small" / "search-uniform" / "0" / "search.json"
-    stages.rollout(folder / "small" / "observations.npz", [found], False, "cpu", tmp_path / "rollout.json")
+    rollout.run(folder / "small" / "observations.npz", [found], False, "cpu", tmp_path / "rollout.json")
     record = StageRecord.load(tmp_path / "rollout.json")
     assert record.status == "failed"
     assert "left the scene in frame" in record.reason
     records = {"search": found, "rollout": tmp_path / "rollout.json"}
-    stages.score(folder / "small" / "observations.npz", records, "search_only", {}, 0, tmp_path / "run.json")
+    score.run(folder / "small" / "observations.npz", records, "search_only", {}, 0, tmp_path / "run.json")
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
     assert len(pd.read_parquet(tmp_path / "scores.parquet")) < 4
