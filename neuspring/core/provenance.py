@@ -2,8 +2,8 @@
 
 Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
 syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
-`fit.py` re-runs fits; editing a docstring, or `tables.py`, re-runs nothing that costs time. Of `stages.py`, which reaches
-everything, the rules that cost little (rollout, transfer, score) follow the function that they call.
+`twin/fit.py` runs fits again; editing a docstring, or a table, runs nothing again that costs time. What a module imports by name
+(backends, readers, baselines) is named beside it (`neuspring.experiments.inputs`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE = "neuspring"
-STAGES = f"{PACKAGE}.stages"
 ROOT = Path(__file__).parents[1]
-NOT_NUMERICS = tuple(f"{PACKAGE}.{name}" for name in ("config", "core.progress", "core.records"))
-"""Declarations and reporting: configured values reach a rule as parameters of their own."""
+NOT_NUMERICS = tuple(
+    f"{PACKAGE}.{name}" for name in ("config", "core.progress", "core.records", "core.run_record", "stages.options")
+)
+"""Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
 
 
 @functools.cache
@@ -93,28 +94,6 @@ def _is_text(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _stage_code(stage: str) -> str:
-    """The function `stage` of `neuspring.stages.stages`, or `module.function` of another module, and what it uses there."""
-    module, _, function = stage.rpartition(".")
-    tree = _tree(f"{PACKAGE}.{module}" if module else STAGES)
-    functions: dict[str, ast.stmt] = {}
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            functions[node.name] = node
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
-            functions |= dict.fromkeys(names, node)
-    found: dict[str, str] = {}
-    waiting = [function]
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found[name] = ast.dump(functions[name])
-            waiting += [node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name) and node.id in functions]
-    return "".join(found[name] for name in sorted(found))
-
-
 def _declares(module: str) -> bool:
     return module in NOT_NUMERICS or module.startswith(tuple(f"{name}." for name in NOT_NUMERICS))
 
@@ -125,14 +104,13 @@ def _module_code(module: str) -> bytes:
 
 
 @functools.cache
-def code_digest(*modules: str, stage: str = "") -> str:
-    """A short SHA-256 over the code that the given package modules use and, if named, a function (see `_stage_code`)."""
+def code_digest(*modules: str) -> str:
+    """A short SHA-256 over the code that the given package modules use."""
     digest = hashlib.sha256()
     used = {name for module in modules for name in used_modules(module) if not _declares(name)}
     for name in sorted(used):
         digest.update(name.encode())
         digest.update(_module_code(name))
-    digest.update(_stage_code(stage).encode() if stage else b"")
     return digest.hexdigest()[:16]
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from neuspring.config import ScenarioRow
-from neuspring.config.perception import Lift, ShapePriorSettings, Synthetic
+from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings, Synthetic
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
 from neuspring.data.synthetic.correspond import at_points, under_pixels
 from neuspring.data.synthetic.truth import truth_of, truth_path
-from neuspring.config.perception import OpenCvTracking
 from neuspring.perception import track_truth
 from neuspring.perception.judge import judge
 from neuspring.perception.lift import lift
