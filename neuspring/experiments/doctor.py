@@ -1,0 +1,286 @@
+"""What this machine can do: interpreter, libraries, devices, weights, disk, MLflow; and the next move where one is missing.
+
+What a configuration asks for and cannot have here is broken; what it does not ask for is merely absent.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring.config import Config
+from neuspring.core.artifacts import Material, Simulation, Topology, Twin
+from neuspring.core.device import resolve_device, start_warp
+from neuspring.core.errors import InputError
+from neuspring.core.uri import masked
+from neuspring.core.weights import hub_folder
+from neuspring.experiments import needs
+from neuspring.experiments.tracking import store
+from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
+from neuspring.scores import lpips_weights
+from neuspring.splats.rasterise import choose_backend, rasterise
+from neuspring.splats.view import View
+
+State = Literal["ok", "absent", "broken"]
+FREE_GB = 20.0
+"""GB that the results of the whole benchmark take at most; less free space is told."""
+PARITY_POSITION, PARITY_COLOR = 2e-5, 2e-5
+"""m and intensity by which CUDA may differ from the CPU: the limits of the tests against golden clips and pictures."""
+DOWNLOAD = "curl -L --create-dirs -o"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    subject: str
+    state: State
+    detail: str
+    remedy: str = ""
+    """The next move, where something is absent or broken."""
+
+
+def examine(settings: Config) -> list[Finding]:
+    """All findings, for what a configuration asks for."""
+    return [
+        *_libraries(settings),
+        *_devices(settings),
+        *_weights(settings),
+        *_storage(settings),
+    ]
+
+
+def text(findings: list[Finding]) -> str:
+    """The report: a line each, its next move below it, and the verdict."""
+    signs = {"ok": "ok     ", "absent": "absent ", "broken": "BROKEN "}
+    width = max(len(finding.subject) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{signs[finding.state]}{finding.subject.ljust(width)}  {finding.detail}")
+        if finding.remedy and finding.state != "ok":
+            lines.append(f"{' ' * (len(signs['ok']) + width + 2)}-> {finding.remedy}")
+    broken = [finding.subject for finding in findings if finding.state == "broken"]
+    verdict = f"Cannot work as configured: {', '.join(broken)}." if broken else "Everything that is configured can work here."
+    return "\n".join([*lines, "", verdict])
+
+
+def _libraries(settings: Config) -> Iterator[Finding]:
+    yield Finding("Python", "ok", sys.version.split()[0])
+    cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "build for the CPU"
+    yield Finding("torch", "ok", f"{torch.__version__}, {cuda}")
+    for package in ("warp-lang", "snakemake", "mlflow", "optuna", "newton"):
+        yield _installed(package)
+    yield _encoder()
+    extras = {
+        "gsplat": ("gpu", settings.images.backend == "gsplat"),
+        "transformers": ("perception", settings.perception.segment.backend == "grounded_sam2"),
+        "torchvision": ("perception", settings.perception.segment.backend == "grounded_sam2"),
+        "snakemake_executor_plugin_slurm": ("slurm", False),
+        "psycopg2": ("postgresql", bool(settings.tune and settings.tune.storage)),
+    }
+    for module, (extra, wanted) in extras.items():
+        if importlib.util.find_spec(module):
+            yield Finding(module, "ok", f"extra {extra}")
+        else:
+            remedy = f'.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[{extra}]"'
+            yield Finding(module, "broken" if wanted else "absent", f"extra {extra} is not installed", remedy)
+
+
+def _installed(package: str) -> Finding:
+    try:
+        return Finding(package, "ok", version(package))
+    except PackageNotFoundError:
+        return Finding(package, "broken", "not installed", "make install")
+
+
+def _encoder() -> Finding:
+    import av
+
+    try:
+        av.codec.Codec("libx264", "w")
+    except (ValueError, LookupError) as error:
+        return Finding(
+            "H.264 encoder", "broken", str(error), "Install av from its wheel: .venv/bin/pip install --force-reinstall av"
+        )
+    return Finding("H.264 encoder", "ok", f"libx264, av {av.__version__}")
+
+
+def _devices(settings: Config) -> Iterator[Finding]:
+    try:
+        device = resolve_device(settings.device)
+    except InputError as error:
+        yield Finding("device", "broken", str(error), "Set device: cpu, or install what the message names.")
+        return
+    import warp as wp
+
+    start_warp()
+    names = ", ".join(str(one.alias) for one in wp.get_devices())
+    yield Finding("Warp devices", "ok", names)
+    try:
+        pool = needs.gpu_pool(settings.gpus, settings.device)
+        lease = ", ".join(pool) or "none: jobs run on the CPU"
+        yield Finding("GPUs that jobs may lease", "ok" if pool else "absent", lease, "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
+    except InputError as error:
+        yield Finding("GPUs that jobs may lease", "broken", str(error))
+    try:
+        yield Finding("rasterizer", "ok", choose_backend(settings.images.backend, device))
+    except InputError as error:
+        yield Finding("rasterizer", "broken", str(error))
+    if device.startswith("cuda"):
+        yield from _parity(device)
+
+
+def _parity(device: str) -> Iterator[Finding]:
+    """Simulator and rasterizer on CUDA against the CPU, in about two seconds after kernels are compiled."""
+    from neuspring.twin.rollout import roll_out
+
+    twin, hands = _small_twin()
+    positions = [roll_out(twin, hands, where).positions for where in ("cpu", device)]
+    difference = float(np.abs(positions[0] - positions[1]).max())
+    good = difference <= PARITY_POSITION
+    detail = f"{difference:.1e} m in 10 frames from the CPU's (limit {PARITY_POSITION:.0e})"
+    yield Finding(f"simulator on {device}", "ok" if good else "broken", detail, "Use device: cpu, and report this.")
+    pictures = [_small_picture(where) for where in ("cpu", device)]
+    difference = float((pictures[0] - pictures[1]).abs().max())
+    good = difference <= PARITY_COLOR
+    detail = f"{difference:.1e} in color from the CPU's (limit {PARITY_COLOR:.0e})"
+    yield Finding(f"rasterizer on {device}", "ok" if good else "broken", detail, "Use device: cpu, and report this.")
+
+
+def _small_twin() -> tuple[Twin, np.ndarray]:
+    """A sheet of 8 x 8 nodes that hangs from two controllers, which lift it."""
+    side, spacing = 8, 0.02
+    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
+    nodes = np.concatenate([spacing * grid, np.full((len(grid), 1), 0.3)], axis=1)
+    gaps = np.linalg.norm(grid[:, None] - grid[None], axis=-1)
+    pairs = np.argwhere(np.triu((gaps > 0) & (gaps < 1.5)))
+    hands = nodes[[0, side - 1]] + np.array([0.0, -spacing, 0.0])
+    held = np.array([[0, len(nodes)], [side - 1, len(nodes) + 1]])
+    springs = np.concatenate([pairs, held]).astype(np.int32)
+    points = np.concatenate([nodes, hands])
+    lengths = np.linalg.norm(points[springs[:, 0]] - points[springs[:, 1]], axis=1)
+    topology = Topology(
+        nodes=nodes.astype(np.float32),
+        controllers=hands.astype(np.float32),
+        springs=springs,
+        rest_lengths=lengths.astype(np.float32),
+        labels=np.zeros(len(nodes), np.int32),
+    )
+    material = Material(
+        stiffness=np.full(len(springs), 500.0, np.float32),
+        dashpot=np.full(len(springs), 1.0, np.float32),
+        drag=1.0,
+        ground_elasticity=0.5,
+        ground_friction=0.3,
+        contact_elasticity=0.5,
+        contact_friction=0.3,
+        contact_distance=0.01,
+    )
+    twin = Twin(topology=topology, material=material, simulation=Simulation(frame_time=1 / 30, substeps=67))
+    lifted = hands[None] + np.linspace(0, 0.05, 11)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    return twin, lifted.astype(np.float32)
+
+
+def _small_picture(device: str) -> torch.Tensor:
+    """RGB [H, W, 3] of 50 random splats."""
+    random, size = np.random.default_rng(0), 64
+
+    def tensor(values: Any) -> torch.Tensor:
+        return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+    intrinsics = tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    return rasterise(
+        tensor(random.uniform([-0.4, -0.4, 0.8], [0.4, 0.4, 1.2], (50, 3))),
+        tensor(random.normal(size=(50, 4))),
+        tensor(random.uniform(0.01, 0.1, (50, 3))),
+        tensor(random.uniform(0.2, 0.9, 50)),
+        tensor(random.uniform(0, 1, (50, 3))),
+        View(torch.eye(4, device=device), intrinsics, size, size),
+        backend="warp",
+    ).rgb.cpu()
+
+
+def _weights(settings: Config) -> Iterator[Finding]:
+    yield from _checked_weights(settings)
+    yield from _hub_weights(settings)
+
+
+def _checked_weights(settings: Config) -> Iterator[Finding]:
+    """Weight files that are known by their checksum."""
+    hub = hub_folder()
+    checked = {
+        "LPIPS (AlexNet)": (
+            lambda: lpips_weights.configured(settings.images.lpips),
+            f"{DOWNLOAD} {hub / lpips_weights.BACKBONE} {lpips_weights.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
+        ),
+        "VGG16 (Spring-Gaus' features)": (
+            lambda: vgg16_weights.find(settings.baselines.spring_gaus.vgg16),
+            f"{DOWNLOAD} {hub / vgg16_weights.FILE} https://download.pytorch.org/models/{vgg16_weights.FILE}",
+        ),
+    }
+    for subject, (find, remedy) in checked.items():
+        try:
+            place = find()
+        except InputError as error:
+            yield Finding(subject, "broken", str(error))
+            continue
+        if isinstance(place, str):
+            yield Finding(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
+        else:
+            yield Finding(subject, "ok", "checksum is right")
+
+
+def _hub_weights(settings: Config) -> Iterator[Finding]:
+    """Weights of perception, which their libraries keep in caches of their own."""
+    from huggingface_hub import try_to_load_from_cache
+
+    segment, track = settings.perception.segment, settings.perception.track
+    for subject, name in {
+        "GroundingDINO": segment.grounded_sam2.detector,
+        "SAM 2": segment.grounded_sam2.video_model,
+    }.items():
+        there = Path(name).is_dir() or isinstance(try_to_load_from_cache(name, "config.json"), str)
+        wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
+        remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"
+        detail = name if there else f"{name} is not in the cache of the Hugging Face hub"
+        yield Finding(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
+    code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
+    there = bool(code) and (hub_folder() / WEIGHTS).is_file()
+    wanted = track.backend == "cotracker3" and not track.cotracker3.download
+    remedy = (
+        f"perception.track.cotracker3.download: true (not for commercial use), or {DOWNLOAD} {hub_folder() / WEIGHTS} {ADDRESS}"
+    )
+    detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
+    yield Finding("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
+
+
+def _storage(settings: Config) -> Iterator[Finding]:
+    results = Path(settings.results)
+    place = next(folder for folder in (results.resolve(), *results.resolve().parents) if folder.is_dir())
+    free = shutil.disk_usage(place).free / 1e9
+    remedy = "Choose another folder: --config results=..."
+    yield Finding("disk", "ok" if free >= FREE_GB else "absent", f"{free:.0f} GB free for {settings.results}", remedy)
+    if settings.data_root is not None:
+        there = Path(settings.data_root).is_dir()
+        yield Finding("data_root", "ok" if there else "broken", str(settings.data_root), "Give the folder of the data.")
+    if not settings.tracking.enabled:
+        yield Finding("MLflow store", "absent", "tracking.enabled: false")
+        return
+    uri = masked(store.uri_of(results, settings.tracking))
+    try:
+        state = "it answers" if store.find(results, settings.tracking) else "made by the first run"
+        yield Finding("MLflow store", "ok", f"{uri}: {state}")
+    except Exception as error:  # whatever MLflow or a database raises
+        reason = str(error).partition("\n")[0]
+        remedy = "Start the server, or correct tracking.uri; runs wait on disk meanwhile (neuspring sync)."
+        yield Finding("MLflow store", "broken", f"{uri}: {reason}", remedy)
