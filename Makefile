@@ -20,8 +20,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 install: $(INSTALLED)
 
 demo: $(INSTALLED)
-	$(SNAKEMAKE) --cores $(CORES) --quiet rules
-	@echo "The table once more: cat results/tables/summary.md"
+	$(SNAKEMAKE) --cores $(CORES) --quiet all
 
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

@@ -37,8 +37,8 @@ def failed(benchmark: Benchmark, arguments: Arguments) -> None:
     print(f"Report so far: {page}. The same command continues where this one stopped.", flush=True)
 
 
-def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str]) -> None:
-    """After success: the table, what to open, where the runs are in MLflow."""
+def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str], seconds: float) -> None:
+    """After success: a table, what to open, where the runs are in MLflow, how long it took."""
     config, folder = benchmark.config, arguments.folder
     results = shlex.quote(config.results)
     begun = (Path(config.results) / FOLDER / RUN).stat().st_mtime
@@ -50,11 +50,20 @@ def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str]) 
     summary = Path(folder) / "summary.md"
     if not summary.exists():
         return
-    print(f"\n{summary.read_text()}")
-    print(f"Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/ (run.json names the twin), tables: {folder}/")
+    print(f"\n{first_table(summary.read_text())}\n")
+    print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (videos of every method)")
     if config.tracking.enabled:
         _tell_tracking(benchmark, results, logged)
+    print(f"It took {seconds / 60:.1f} minutes." if seconds >= 60 else f"It took {seconds:.0f} s.", flush=True)
+
+
+def first_table(summary: str) -> str:
+    """The first table of a summary, with the lines above it but not the heading."""
+    lines = summary.splitlines()
+    rows = [index for index, line in enumerate(lines) if line.startswith("|")]
+    end = next((index for index in rows if index + 1 not in rows), len(lines) - 1)
+    return "\n".join(line for line in lines[: end + 1] if not line.startswith("#")).strip()
 
 
 def _tell_tracking(benchmark: Benchmark, results: str, logged: Sequence[str]) -> None:
@@ -66,4 +75,4 @@ def _tell_tracking(benchmark: Benchmark, results: str, logged: Sequence[str]) ->
         reason = waiting[0].read_text().strip()
         print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
         print(f"  {neuspring} sync --results {results}{settings}")
-    print(f"Look at the runs in MLflow:\n  {neuspring} ui --results {results}{settings}", flush=True)
+    print(f"Look at the runs in MLflow: {neuspring} ui --results {results}{settings}", flush=True)

@@ -4,6 +4,8 @@ import gc
 import json
 import shlex
 import sys
+import tempfile
+import uuid
 from pathlib import Path
 
 from neuspring import config as settings
@@ -13,7 +15,7 @@ from neuspring.experiments import needs
 from neuspring.experiments.arguments import Arguments
 from neuspring.experiments.benchmark import checked
 from neuspring.experiments.inputs import Inputs, one_of, options
-from neuspring.experiments.jobs import wrapper
+from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
 
 # The graph of jobs stays until the end. To look for garbage in it again and again, at last at the exit, is a fifth of a dry run.
@@ -50,6 +52,10 @@ NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 GPU_FIRST = 10 * GPU
 # Only for `--software-deployment-method conda`; without it the running environment is used.
 ENVIRONMENT = str(ROOT / "workflow" / "envs" / "neuspring.yaml")
+# `--quiet all`: jobs write to their logs alone, and a line per rule is told.
+QUIET = "all" in {level.name.lower() for level in workflow.output_settings.quiet or ()}
+# Where jobs find the warm process of this run.
+WARM = Path(tempfile.gettempdir()) / f"neuspring-{uuid.uuid4().hex[:16]}" / "socket"
 TABLE_FOLDER = f"{RESULTS}/{CONFIG.tables}"
 TABLES = f"{TABLE_FOLDER}/summary.md"
 REPORT = f"{TABLE_FOLDER}/report.html"
@@ -67,6 +73,8 @@ def job_prefix():
         wrapper.POOL: wrapper.GIVEN if workflow.remote_exec else ",".join(POOL),
         wrapper.SHARE: str(CONFIG.gpus.jobs_per_gpu),
     }
+    if not CLUSTER:
+        values[warm.SOCKET] = str(WARM)
     exports = "".join(
         f"export {name}={shlex.quote(value)}; " for name, value in values.items()
     )
@@ -131,7 +139,8 @@ def section(name):
 
 def wrapped(flags, command):
     """A command in the wrapper that every job runs in: GPU lease, log, record, cause of failure."""
-    return f"python -m {wrapper.__name__} --log {{log:q}} {flags} -- python -m neuspring {command}"
+    quiet = "--quiet " if QUIET and "--quiet" not in flags else ""
+    return f"python -m {wrapper.__name__} --log {{log:q}} {quiet}{flags} -- python -m neuspring {command}"
 
 
 def common_job(command, gpus=False):

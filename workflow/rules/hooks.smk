@@ -1,6 +1,13 @@
-# What is told before and after a run.
+# What is told before, during and after a run; the warm process of its jobs.
+import shutil
+import time
+from types import SimpleNamespace
+
 from neuspring.core.job_records import begin_run
 from neuspring.experiments import messages
+from neuspring.experiments.overview import Overview
+
+RUN = SimpleNamespace(begun=0.0, overview=None, warm=None)
 
 
 def plan_of_run():
@@ -29,7 +36,29 @@ def begin():
             str(InputError("--cores", reason, workflow.resource_settings.cores, remedy))
         )
     begin_run(Path(RESULTS))
-    plan_of_run()
+    RUN.begun = time.monotonic()
+    if not QUIET:
+        plan_of_run()
+    else:
+        jobs = [
+            job
+            for job in workflow.dag.needrun_jobs(exclude_finished=False)
+            if len(job.log)
+        ]
+        RUN.overview = Overview(Path(RESULTS), [Path(job.log[0]) for job in jobs])
+        RUN.overview.start()
+    if not CLUSTER:
+        WARM.parent.mkdir(mode=0o700)
+        RUN.warm = warm.serve_while_running(WARM)
+
+
+def end():
+    if RUN.overview:
+        RUN.overview.stop()
+    if RUN.warm:
+        RUN.warm.stdin.close()
+        RUN.warm.wait()
+        shutil.rmtree(WARM.parent)
 
 
 def plan_of_dry_run():
@@ -43,8 +72,12 @@ if workflow.is_main_process:
 
 
 def finish():
-    messages.finished(BENCHMARK, ARGUMENTS, INPUTS.logged_runs())
+    end()
+    messages.finished(
+        BENCHMARK, ARGUMENTS, INPUTS.logged_runs(), time.monotonic() - RUN.begun
+    )
 
 
 def give_up():
+    end()
     messages.failed(BENCHMARK, ARGUMENTS)

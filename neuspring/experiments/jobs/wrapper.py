@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import ctypes
 import os
 import platform
 import shlex
@@ -26,7 +25,7 @@ from typing import IO
 
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import LOGS, Attempt, JobRecord, alone, this_run
-from neuspring.experiments.jobs import faults, gpus
+from neuspring.experiments.jobs import faults, gpus, warm
 from neuspring.experiments.jobs.watch import Watch
 
 GIVEN = "given"
@@ -223,9 +222,11 @@ def _execute(
     return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(kept)), fault
 
 
-def _start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[str, str]) -> subprocess.Popen[str]:
+def _start(
+    command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[str, str]
+) -> subprocess.Popen[str] | warm.WarmProcess:
     """Start a command, which inherits `held`; signals that we get are passed on to it. Raises OSError."""
-    process = subprocess.Popen(
+    process = warm.start(command, held, environment) or subprocess.Popen(
         command,
         env=environment,
         stdout=subprocess.PIPE,
@@ -234,14 +235,14 @@ def _start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping
         errors="replace",
         bufsize=1,
         pass_fds=[file.fileno() for file in held],
-        preexec_fn=_die_with_parent,
+        preexec_fn=warm.die_with_parent,
     )
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda received, frame: process.send_signal(received))
     return process
 
 
-def _follow(process: subprocess.Popen[str], log: _Log, *, quiet: bool) -> tuple[int, list[str]]:
+def _follow(process: subprocess.Popen[str] | warm.WarmProcess, log: _Log, *, quiet: bool) -> tuple[int, list[str]]:
     """(exit status, last lines of the output) of a command, once it has ended."""
     kept: collections.deque[str] = collections.deque(maxlen=KEPT)
     assert process.stdout is not None
@@ -295,13 +296,6 @@ class _Log:
 
     def __exit__(self, *_: object) -> None:
         self._drop()
-
-
-def _die_with_parent() -> None:
-    """A job whose wrapper was killed must not write on while the next run makes the same files (Linux)."""
-    if sys.platform == "linux":
-        PR_SET_PDEATHSIG = 1
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 if __name__ == "__main__":
