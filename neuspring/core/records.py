@@ -114,14 +114,15 @@ def read_json(path: Path, version: int) -> dict[str, Any]:
 class Recorder:
     """Measures a stage and writes its record.
 
-    Make it when the stage begins; `inputs` are digested at once, so that the record names what was read.
+    Make it when the stage begins; `inputs` are digested at once, so that the record names what was read. Raises InputError for an
+    input that cannot be read.
     """
 
     def __init__(
         self, stage: str, output: Path, *, inputs: Mapping[str, Path] | None = None, settings: Any = None, device: str = "cpu"
     ) -> None:
         self.stage, self.output = stage, output
-        self.inputs = {role: digest_file(path) for role, path in (inputs or {}).items()}
+        self.inputs = {role: _digest_input(path) for role, path in (inputs or {}).items()}
         self.settings: dict[str, Any] = dict(settings or {})
         self.device = device
         self._started, self._start = now(), time.perf_counter()
@@ -163,3 +164,10 @@ class Recorder:
             machine=f"{platform.machine()}, Python {platform.python_version()}",
             versions={name: version(name) for name in COMPUTING},
         ).save(self.output)
+
+
+def _digest_input(path: Path) -> str:
+    try:
+        return digest_file(path)
+    except OSError as error:
+        raise InputError(path, "this file must be readable", error.strerror, "Run the step that makes it first.") from error

@@ -100,7 +100,7 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
             raise InputError(where, "scenario names must differ")
         row = parse(ScenarioRow, values, where)
         if row.source not in SOURCES:
-            raise InputError(f"{where}, source", f"must be one of {', '.join(SOURCES)}", row.source)
+            raise InputError(f"{where}, source", f"must be one of {', '.join(SOURCES)}", repr(row.source))
         rows[cells[0]] = row
     return rows
 

@@ -82,7 +82,7 @@ def test_words_that_are_no_option_end_with_status_2(arguments, capsys):
         (["observe", "--row", "{}", "--output", "x.npz"], "scenario: required, but missing"),
         (["observe", "--scenario", "x", "--settings", '{"toy": {"framez": 3}}', "--output", "x.npz"], "toy.framez: unknown key"),
         (["observe", "--scenario", "x", "--settings", "no.yaml", "--output", "x.npz"], "no.yaml: this file must be readable"),
-        (["search", "--observations", "no.npz", "--output", "x.json"], "no.npz: this file must be of kind observations"),
+        (["search", "--observations", "no.npz", "--output", "x.json"], "no.npz: this file must be readable; received No such file"),
         (["check-data", "no-such-folder"], "no-such-folder"),
     ],
 )

@@ -11,7 +11,7 @@ from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.experiments import needs, plan
-from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.benchmark import Benchmark, check_storage
 from tests.support.project import ROOT, config_with
 
 
@@ -76,7 +76,7 @@ def test_work_is_rollouts_or_epochs_times_training_frames(benchmark):
     wanted = needs.Needs(benchmark, "cpu")
     names = SimpleNamespace(scenario=benchmark.config.scenarios[0], search="uniform", method="baseline")
     # 8 frames, of which 70 % are for training.
-    assert (wanted.search(names), wanted.fit(names), wanted.scenario(names)) == (100 * 6, 30 * 6, 8)
+    assert [wanted.work(rule, names) for rule in ("search", "fit", "rollout")] == [100 * 6, 30 * 6, 8]
 
 
 def test_lengths_of_released_and_synthetic_scenes_are_known(tmp_path):
@@ -88,14 +88,15 @@ def test_lengths_of_released_and_synthetic_scenes_are_known(tmp_path):
     assert [wanted.frames(name) for name in names] == [39, 30]
 
 
-def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(benchmark, tmp_path):
+def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(benchmark, tmp_path, monkeypatch):
+    monkeypatch.setattr(needs.Needs, "work", lambda self, rule, wildcards: 4800)
     wanted = needs.Needs(benchmark, "cpu")
-    memory, minutes = wanted.memory("fit", 8000), wanted.minutes("fit", 480, lambda _: 6000)
+    memory, minutes = wanted.memory("fit"), wanted.minutes("fit")
     assert [memory(None, attempt) for attempt in (1, 2)] == [8000, 16000]
     assert [minutes(None, attempt) for attempt in (1, 2)] == [480, 960]
     record("fit", "rope", 125, 1000, memory=2000.0).save(tmp_path)
     wanted = needs.Needs(benchmark, "cpu")
-    memory, minutes = wanted.memory("fit", 8000), wanted.minutes("fit", 480, lambda _: 4800)
+    memory, minutes = wanted.memory("fit"), wanted.minutes("fit")
     rope, cloth = SimpleNamespace(scenario="rope"), SimpleNamespace(scenario="cloth")
     # 0.125 s per unit: 600 s, times three. A second attempt is not held to what may have been too little.
     assert [memory(rope, attempt) for attempt in (1, 2, 3)] == [3000, 16000, 24000]
@@ -103,11 +104,11 @@ def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_at
     # Of another scenario no more is known than that it may need as much.
     assert [memory(cloth, 1), minutes(cloth, 1)] == [8000, 480]
     record("fit", "sloth", 125, 1000, memory=20000.0).save(tmp_path)
-    memory = needs.Needs(benchmark, "cpu").memory("fit", 8000)
+    memory = needs.Needs(benchmark, "cpu").memory("fit")
     assert [memory(cloth, 1), memory(rope, 1)] == [30000, 3000]
     # A job on the CPU says nothing of one on a GPU.
     on_gpu = needs.Needs(benchmark, "gpu")
-    assert [on_gpu.memory("fit", 8000)(rope, 1), on_gpu.minutes("fit", 480, lambda _: 4800)(rope, 1)] == [8000, 480]
+    assert [on_gpu.memory("fit")(rope, 1), on_gpu.minutes("fit")(rope, 1)] == [8000, 480]
 
 
 @pytest.mark.parametrize(
@@ -159,11 +160,11 @@ def test_workers_on_several_machines_need_a_database_that_locks_across_them():
     space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}
     study = {"study": "rate", "method": "baseline", "workers": 2, "space": space}
     tune = config.parse(Tune, study, "test")
-    needs.check_storage(tune, cluster=False)
+    check_storage(tune, cluster=False)
     with pytest.raises(InputError, match="workers on several machines need storage"):
-        needs.check_storage(tune, cluster=True)
-    needs.check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
-    needs.check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
+        check_storage(tune, cluster=True)
+    check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
+    check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
 
 
 def test_only_takes_a_part_by_scenario_category_method_and_seed():

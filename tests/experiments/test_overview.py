@@ -1,0 +1,37 @@
+"""Lines that tell how far a run is."""
+
+import io
+
+from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
+from neuspring.experiments.messages import first_table
+from neuspring.experiments.overview import Overview
+
+
+def save(results, name: str, **facts) -> None:
+    record = JobRecord.of_log(results, results / "logs" / f"{name}.log")
+    attempt = Attempt(started="2026-11-22T10:00:00.000+00:00", **({"outcome": "ok", "run": this_run(results)} | facts))
+    JobRecord(**{**record.__dict__, "attempts": [attempt]}).save(results)
+
+
+def test_a_rule_is_told_once_when_its_last_job_of_this_run_has_succeeded(tmp_path):
+    begin_run(tmp_path)
+    stream = io.StringIO()
+    logs = [tmp_path / "logs" / name for name in ("fit/a.log", "fit/b.log", "search/a.log")]
+    overview = Overview(tmp_path, logs, stream)
+    save(tmp_path, "fit/a", seconds=2.0)
+    save(tmp_path, "search/a", run="an earlier run", seconds=9.0)
+    overview._look()
+    assert stream.getvalue() == ""
+    save(tmp_path, "fit/b", seconds=3.0, outcome="transient")
+    overview._look()
+    assert stream.getvalue() == ""
+    save(tmp_path, "fit/b", seconds=3.0)
+    overview.start()
+    overview.stop()
+    assert stream.getvalue().split() == ["fit", "2", "jobs", "5", "s"]
+
+
+def test_the_first_table_of_a_summary_is_a_table_and_what_stands_above_it():
+    text = "# Scores\n\nErrors in mm.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\nPaired:\n\n| c |\n|---|\n| 3 |\n"
+    assert first_table(text) == "Errors in mm.\n\n| a | b |\n|---|---|\n| 1 | 2 |"
+    assert first_table("# Scores\n\nNo run has finished.\n") == "No run has finished."

@@ -1,0 +1,102 @@
+"""Jobs that start in a child of the warm process behave as jobs in a process of their own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from neuspring.experiments.jobs import warm
+from tests.support import small
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """A warm process without libraries, which take seconds to import."""
+    path = tmp_path_factory.mktemp("warm") / "socket"
+    code = f"from neuspring.experiments.jobs import warm; warm.LIBRARIES = (); warm.main({str(path)!r})"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    deadline = time.monotonic() + 60
+    while not path.exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    yield path
+    process.stdin.close()
+    assert process.wait(timeout=60) == 0
+
+
+def begin(server, *words: str, **environment: str) -> warm.WarmProcess | None:
+    return warm.start([*warm.COMMAND, *words], [], os.environ | {warm.SOCKET: str(server), "OMP_NUM_THREADS": "1"} | environment)
+
+
+def ended(process: warm.WarmProcess) -> tuple[int, str]:
+    return process.wait(), process.stdout.read()
+
+
+def test_output_and_exit_status_are_those_of_the_command(server, tmp_path):
+    status, text = ended(begin(server, "--version"))
+    assert status == 0 and text.strip().count(".") == 2
+    output = tmp_path / "observations.npz"
+    status, text = ended(begin(server, "observe", "--scenario", "nothing", "--output", str(output)))
+    assert status == 2 and "--scenario: must be a row" in text
+    row = json.dumps(small.row().__dict__)
+    settings = '{"toy": {"frames": 5}}'
+    status, text = ended(begin(server, "observe", "--row", row, "--settings", settings, "--output", str(output)))
+    assert status == 0, text
+    cold = tmp_path / "cold.npz"
+    command = [sys.executable, "-m", "neuspring", "observe", "--row", row, "--settings", settings, "--output", str(cold)]
+    subprocess.run(command, check=True)
+    assert output.read_bytes() == cold.read_bytes()
+
+
+def test_a_signal_reaches_the_job_and_is_its_status(server):
+    process = begin(server, "ui", "--port", "0", MLFLOW_DISABLE_TELEMETRY="true")
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == -signal.SIGTERM
+
+
+def test_a_job_ends_with_its_wrapper(server):
+    code = (
+        "import os, sys, time; from neuspring.experiments.jobs import warm;"
+        "process = warm.start([*warm.COMMAND, 'ui', '--port', '0'], [], dict(os.environ));"
+        "print(process.pid, flush=True); time.sleep(600)"
+    )
+    environment = os.environ | {warm.SOCKET: str(server), "OMP_NUM_THREADS": "1"}
+    wrapper = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    pid = int(wrapper.stdout.readline())
+    wrapper.kill()
+    wrapper.wait()
+    deadline = time.monotonic() + 60
+    while _lives(pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_what_the_warm_process_cannot_run_starts_by_itself(server, tmp_path):
+    environment = os.environ | {warm.SOCKET: str(server)}
+    assert warm.start(["ls"], [], environment) is None
+    assert warm.start([*warm.COMMAND, "--version"], [], environment | {"OMP_NUM_THREADS": "4"}) is None
+    assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: str(tmp_path / "none")}) is None
+    assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: ""}) is None
+
+
+def test_files_that_a_job_must_hold_are_inherited(server, tmp_path):
+    """A lock is free only when wrapper and job have both let it go."""
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w") as held:
+        process = warm.start([*warm.COMMAND, "--version"], [held], os.environ | {warm.SOCKET: str(server), "OMP_NUM_THREADS": "1"})
+    assert process.wait() == 0
+    # Both ends that could write are closed now: reading ends instead of waiting.
+    with os.fdopen(reading) as stream:
+        assert stream.read() == ""
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
