@@ -1,7 +1,6 @@
 """The wrapper of every job: log, record, GPUs, causes, signals."""
 
 import errno
-import fcntl
 import json
 import os
 import signal
@@ -11,10 +10,12 @@ import time
 
 import pytest
 
+from neuspring.core import lock as locks
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import Attempt, JobRecord, alone, begin_run, failure_lines, read_jobs
+from neuspring.core.job_records import GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
+from neuspring.experiments.jobs.wrapper import alone
 
 NAME = "search/rope/uniform/0"
 
@@ -198,7 +199,7 @@ if device == '0': sys.exit('RuntimeError: No CUDA GPUs are available')"""
     told.append(again.communicate(timeout=60)[1])
     assert again.returncode == 0
     assert (uses.read_text().count("0"), uses.read_text().count("1")) == (1, jobs)
-    assert "passed over: GPU 0 (lost at" in told[-1]
+    assert "passed over: GPU 0 (lost)" in told[-1]
     ended = [[attempt.outcome for attempt in found.attempts] for found in read_jobs(results)]
     assert sorted(ended) == [["ok"]] * (jobs - 1) + [["transient", "ok"]]
 
@@ -208,7 +209,7 @@ def test_where_all_gpus_are_lost_the_next_job_says_so(results, monkeypatch):
     assert run(results, "import sys; sys.exit('GPU is lost')", "--gpus", "1").returncode == 1
     again = run(results, "print('ran')", "--gpus", "1")
     assert (again.returncode, again.stdout) == (2, "")
-    assert "too few are left; received GPU 0 (lost at" in again.stderr and "nvidia-smi" in again.stderr
+    assert "too few are left; received GPU 0 (lost)" in again.stderr and "nvidia-smi" in again.stderr
     assert (record(results).last.outcome, record(results).last.cause) == ("permanent", "no GPU")
 
 
@@ -218,7 +219,7 @@ def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_jo
     assert run(results, code, "--gpus", "1").returncode == 1
     assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n"
     # It worked, so nothing is left against it.
-    assert [path.stat().st_size for path in (results.parent / "locks").glob("*.lost")] == [0]
+    assert gpus.Notes.load(results / "jobs" / GPU_NOTES).failures == {}
 
 
 def wrap(results, code, *options):
@@ -281,14 +282,14 @@ def test_a_command_inherits_the_locks_of_its_job(results, monkeypatch):
 def test_a_lock_whose_file_its_last_holder_removed_is_no_lock(tmp_path, monkeypatch):
     lock, calls = tmp_path / "a.lock", []
 
-    def flock(*arguments):
+    def lock_descriptor(*arguments, **options):
         if not calls:
             lock.unlink()  # between our opening the file and locking it
         calls.append(arguments)
-        real(*arguments)
+        return real(*arguments, **options)
 
-    real = fcntl.flock
-    monkeypatch.setattr(fcntl, "flock", flock)
+    real = locks.lock_descriptor
+    monkeypatch.setattr(locks, "lock_descriptor", lock_descriptor)
     with alone(tmp_path / "a.json", pytest.fail):
         assert lock.exists()
     assert len(calls) == 2
@@ -301,10 +302,10 @@ def test_a_lock_that_is_deleted_is_waited_for_no_longer(tmp_path):
 
 
 def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
-    def unsupported(*_):
+    def unsupported(*_, **__):
         raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
-    monkeypatch.setattr(fcntl, "flock", unsupported)
+    monkeypatch.setattr(locks, "lock_descriptor", unsupported)
     with alone(tmp_path / "a.json", pytest.fail) as lock:
         assert lock is None
 
