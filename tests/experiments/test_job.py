@@ -332,20 +332,20 @@ def test_a_command_that_cannot_be_started_ends_with_its_cause_and_is_not_tried_a
 def test_a_job_with_a_gpu_that_computes_on_the_cpu_says_so(monkeypatch, capsys, held, device, told):
     import torch
 
-    from neuspring.physics import solver
+    from neuspring.core import device as devices
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setenv(gpus.VISIBLE, held)
-    solver._warn_of_idle_gpu.cache_clear()
-    assert [solver.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
+    devices._warn_of_idle_gpu.cache_clear()
+    assert [devices.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == told
     assert all("holds GPU 1, but this torch is a build for the CPU alone" in line for line in lines)
     with pytest.raises(InputError, match="this torch is a build for the CPU alone"):
-        solver.resolve_device("cuda")
+        devices.resolve_device("cuda")
     # A torch that could use the GPU and does not find it: it is lost, and no reason to compute for hours without it.
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     for wanted in {"cuda", device if held else "cuda"} - {"cpu"}:
         with pytest.raises(InputError, match="this machine has 0 CUDA devices"):
-            solver.resolve_device(wanted)
+            devices.resolve_device(wanted)

@@ -1,4 +1,4 @@
-"""Pictures of a tuning study: how the loss fell, what each setting does to it, what was pruned when."""
+"""Pictures of a sweep: how the loss fell, what each setting does to it, which trials were pruned when."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from neuspring.config.tuning import Dimension
 from neuspring.core.records import canonical
 from neuspring.report.figures.views import save
 
-LOSS = "loss of held-back frames [m²]"
-COLOURS = {"complete": "tab:blue", "pruned": "tab:orange", "failed": "tab:red"}
+LOSS = "loss of the tail [m²]"
+COLORS = {"complete": "tab:blue", "pruned": "tab:orange", "failed": "tab:red"}
 PANELS_PER_ROW = 4
 LOG_FROM = 3.0
 """A loss has a log axis if its largest value is at least this many times its smallest."""
 
 
 def history_figure(table: pd.DataFrame, path: Path) -> Path:
-    """Loss of every trial, and the least so far; a line at the baseline's, trial 0."""
+    """Loss of every trial, the smallest loss so far, and a line at that of the baseline, trial 0."""
     figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
     _points(axis, table, table["trial"].to_numpy(float))
     done = table[table["state"] == "complete"]
@@ -42,7 +42,7 @@ def history_figure(table: pd.DataFrame, path: Path) -> Path:
 
 def slices_figure(table: pd.DataFrame, space: Mapping[str, Dimension], path: Path) -> Path:
     """Loss against each setting by itself."""
-    table = table[table["state"].isin(list(COLOURS))]
+    table = table[table["state"].isin(list(COLORS))]
     columns = min(len(space), PANELS_PER_ROW)
     rows = math.ceil(len(space) / columns)
     size = (2.9 * columns + 0.8, 2.8 * rows)
@@ -61,22 +61,22 @@ def slices_figure(table: pd.DataFrame, space: Mapping[str, Dimension], path: Pat
 
 
 def parallel_figure(table: pd.DataFrame, space: Mapping[str, Dimension], path: Path) -> Path:
-    """A line per finished trial through its settings, coloured by its loss, the best ones on top."""
+    """A line per finished trial through its settings, colored by its loss, the best ones on top."""
     done = table[table["state"] == "complete"].sort_values("loss", ascending=False)
     figure, axis = plt.subplots(figsize=(1.6 * len(space) + 2.4, 3.8), layout="constrained")
     heights = np.stack([_heights(done[name], dimension) for name, dimension in space.items()], axis=1)
     low, high = (done["loss"].min(), done["loss"].max()) if len(done) else (1.0, 1.0)
     norm = LogNorm(low, high) if 0 < low < high else Normalize(low, high)
-    colours = matplotlib.colormaps["viridis"]
+    colors = matplotlib.colormaps["viridis"]
     for line, loss in zip(heights, done["loss"], strict=True):
-        axis.plot(range(len(space)), line, color=colours(norm(loss)), lw=1.2)
+        axis.plot(range(len(space)), line, color=colors(norm(loss)), lw=1.2)
     for place, dimension in enumerate(space.values()):
         axis.axvline(place, color="0.3", lw=0.8)
         for text, height in _marks(dimension):
             axis.annotate(text, (place, height), xytext=(3, 0), textcoords="offset points", fontsize=7, va="center", color="0.2")
     axis.set_xticks(range(len(space)), list(space), rotation=20, ha="right", fontsize=8)
     axis.set(ylim=(-0.05, 1.05), yticks=[])
-    figure.colorbar(matplotlib.cm.ScalarMappable(norm, colours), ax=axis, label=LOSS)
+    figure.colorbar(matplotlib.cm.ScalarMappable(norm, colors), ax=axis, label=LOSS)
     return save(figure, path)
 
 
@@ -92,17 +92,17 @@ def importances_figure(importances: Mapping[str, float], path: Path) -> Path:
 def steps_figure(
     table: pd.DataFrame, steps: Mapping[int, Sequence[tuple[int, float]]], scenes: Sequence[str], epochs: int, path: Path
 ) -> Path:
-    """What pruning sees: the mean loss of the scenarios begun so far, epoch by epoch, scenario after scenario."""
+    """The values that pruning compares: mean loss of the scenarios begun so far, epoch by epoch, scenario after scenario."""
     figure, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
     states = dict(zip(table["trial"], table["state"], strict=True))
     for trial, values in steps.items():
         state = states.get(trial)
-        if state not in COLOURS or not values:
+        if state not in COLORS or not values:
             continue
-        colour, label = COLOURS[state], "finished" if state == "complete" else state
+        color, label = COLORS[state], "finished" if state == "complete" else state
         if trial == 0:
-            colour, label = "black", "unchanged configuration"
-        axis.plot(*zip(*values, strict=True), color=colour, lw=1.0, alpha=0.8, marker=".", ms=3, label=label)
+            color, label = "black", "unchanged configuration"
+        axis.plot(*zip(*values, strict=True), color=color, lw=1.0, alpha=0.8, marker=".", ms=3, label=label)
     for index, name in enumerate(scenes):
         if index:
             axis.axvline(index * epochs - 0.5, color="0.8", lw=0.8)
@@ -116,14 +116,14 @@ def steps_figure(
 
 
 def _points(axis: Axes, table: pd.DataFrame, places: np.ndarray) -> None:
-    """Finished trials at their loss; others, which have none that can be compared, on the upper edge."""
+    """Finished trials at their loss; others on the upper edge, since their losses cannot be compared."""
     done = (table["state"] == "complete").to_numpy()
-    axis.scatter(places[done], table.loc[done, "loss"], color=COLOURS["complete"], s=16, label="finished")
+    axis.scatter(places[done], table.loc[done, "loss"], color=COLORS["complete"], s=16, label="finished")
     for state in ("pruned", "failed"):
-        chosen = places[(table["state"] == state).to_numpy()]
-        if len(chosen):
+        ended = places[(table["state"] == state).to_numpy()]
+        if len(ended):
             edge = axis.get_xaxis_transform()
-            axis.plot(chosen, np.ones(len(chosen)), "x", color=COLOURS[state], ms=4, transform=edge, clip_on=False, label=state)
+            axis.plot(ended, np.ones(len(ended)), "x", color=COLORS[state], ms=4, transform=edge, clip_on=False, label=state)
 
 
 def _baseline(axis: Axes, table: pd.DataFrame) -> None:
@@ -133,13 +133,13 @@ def _baseline(axis: Axes, table: pd.DataFrame) -> None:
 
 
 def _scale(axis: Axes, losses: pd.Series) -> None:
-    known = losses.dropna()
-    if len(known) and known.min() > 0 and known.max() >= LOG_FROM * known.min():
+    losses = losses.dropna()
+    if len(losses) and losses.min() > 0 and losses.max() >= LOG_FROM * losses.min():
         axis.set_yscale("log")
 
 
 def _places(values: pd.Series, dimension: Dimension, axis: Axes) -> np.ndarray:
-    """Where values stand on an axis, which is set up for them; choices side by side."""
+    """Positions of values on an axis, which is set up for them; choices stand side by side."""
     if dimension.choices:
         labels = [_text(value) for value in dimension.choices]
         shown = [*labels, *dict.fromkeys(text for text in map(_text, values) if text not in labels)]
