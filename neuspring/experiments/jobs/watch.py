@@ -40,7 +40,7 @@ class Watch:
         self._thread.join()
 
     def facts(self) -> dict[str, Any]:
-        """The fields of an `Attempt` that describe the use of the machine. Call this after the block, when the command has ended."""
+        """The fields of an `Attempt` that describe the use of the machine. Call this after the block."""
         # Samples miss short peaks; the kernel remembers the peak of the largest ended process.
         largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 if sys.platform != "darwin" else MIB)
         shares = [row[3] for row in self._rows if row[3] is not None]
