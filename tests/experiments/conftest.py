@@ -1,11 +1,24 @@
-"""Fixtures that several files of sweep tests share."""
+"""Fixtures that several files share."""
 
 from pathlib import Path
 
 import pytest
 
 from neuspring.config.tuning import Tune
+from neuspring.core.job_records import begin_run
+from neuspring.experiments.jobs import gpus
+from neuspring.experiments.jobs import wrapper as job
 from tests.support import sweeps
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A results folder in which a run of the workflow has begun; no GPU is leased to anybody."""
+    for name in (job.POOL, job.SHARE, gpus.VISIBLE):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
+    begin_run(tmp_path / "results")
+    return tmp_path / "results"
 
 
 @pytest.fixture

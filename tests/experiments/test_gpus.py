@@ -144,10 +144,10 @@ def fail_on(device, run, failure=gpus.LOST):
 
 def test_a_lost_device_is_passed_over_and_not_waited_for(run):
     fail_on("0", run)
-    told = []
-    lease = run(1, ("0", "1"), affinity="rope", passing=told.append)
+    messages = []
+    lease = run(1, ("0", "1"), affinity="rope", say=messages.append)
     assert lease.devices == ("1",)
-    assert told == [{"0": gpus.LOST}]
+    assert messages == ["passed over: GPU 0 (lost)"]
     # Device 0 has no holder; the next job waits for the other one all the same.
     with pytest.raises(TimeoutError):
         run(1, ("0", "1"), timeout=0)
@@ -180,12 +180,12 @@ def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(run)
 def test_a_device_lost_while_others_wait_for_it_ends_their_wait(run):
     lease = run(1, ("0",))
 
-    def lose():
+    def lose(text):
         lease.note(gpus.LOST)
         lease.release()
 
     with pytest.raises(InputError, match="too few are left"):
-        run(1, ("0",), timeout=20, waiting=lose)
+        run(1, ("0",), timeout=20, say=lose)
 
 
 def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(run):

@@ -37,7 +37,7 @@ def execute(
 
     `quiet`: the output goes to the log alone, unless the command fails.
     """
-    with _Log(log) as file:
+    with contextlib.closing(_Log(log)) as file:
         file.write(f"# {begun.started} {shlex.join(command)}\n")
         start = time.monotonic()
         try:
@@ -109,38 +109,25 @@ class _Log:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-
-    def __enter__(self) -> _Log:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._file: IO[str] | None = self._path.open("a", encoding="utf-8", buffering=1)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: IO[bytes] = path.open("ab", buffering=0)  # unbuffered: nothing is left to fail when it is closed
         except OSError as error:
-            self._warn(error)
-            self._file = None
-        return self
+            self._drop(error)
 
     def write(self, text: str) -> None:
-        if self._file is None:
-            return
         try:
-            self._file.write(text)
+            self._file.write(text.encode())
         except OSError as error:
-            self._warn(error)
-            self._close()
+            self._file.close()
+            self._drop(error)
 
-    def _warn(self, error: OSError) -> None:
+    def _drop(self, error: OSError) -> None:
         print(f"warning: {self._path}: {error.strerror}", file=sys.stderr)
+        self._file = open(os.devnull, "wb")  # noqa: SIM115 - closed by `close`
 
-    def _close(self) -> None:
-        file, self._file = self._file, None
-        try:
-            if file is not None:
-                file.close()
-        except OSError:
-            pass  # its last lines could not be written either
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
+    def close(self) -> None:
+        self._file.close()
 
 
 def _die_with_parent() -> None:

@@ -11,6 +11,7 @@ such a device at once and leave it free for the next one.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -160,91 +161,78 @@ def acquire(
     timeout: float = float("inf"),
     folder: Path | None = None,
     notes: Path | None = None,
-    waiting: Callable[[], object] = lambda: None,
-    passing: Callable[[Mapping[str, str]], object] = lambda failures: None,
+    say: Callable[[str], object] = lambda text: None,
 ) -> Lease:
-    """Hold `count` different devices of `pool`; waits until they are free, calling `waiting` once if it must.
+    """Hold `count` different devices of `pool`; waits until they are free.
 
-    Of the free devices, one that worked last on the scenario `affinity` comes first: data and kernels of the scenario are still
-    in its caches. Then comes the one with the fewest jobs. `passing` receives the devices that are passed over because of
-    `notes`, and how they failed. Raises InputError if the pool, or what is left of it, is too small; TimeoutError.
+    Of the free devices, one that worked last on the scenario `affinity` comes first: data and kernels of the scenario are still in
+    its caches. Devices without a job come before shared ones. `say` is told once that we wait, and which devices are passed over
+    because of `notes`. Raises InputError if the pool, or what is left of it, is too small; TimeoutError.
     """
     if count > len(pool):
         rule = f"a job needs {count} GPUs, more than there are"
         raise InputError("GPUs", rule, f"{len(pool)} ({', '.join(pool) or 'none'})", "Ask for fewer, or allow more.")
     folder = folder or lock_folder()
     gate, names = folder / "allocation.lock", _slot_names(pool)
-    start, reported, told = time.monotonic(), dict[str, str](), False
+    start, messages = time.monotonic(), set[str]()
+
+    def say_once(text: str) -> None:
+        if text not in messages:
+            messages.add(text)
+            say(text)
+
     while True:
         try:
             with wait_for_lock(gate):
                 # Read anew each time: a device may fail while we wait for it.
                 record = Notes.load(notes)
-                ranks = _ranks(count, pool, record)
-                slots = _take(count, ranks, record, affinity, names, jobs_per_gpu, folder)
+                devices = _usable(count, pool, record)
+                if affinity:
+                    devices.sort(key=lambda device: (device in record.failures, record.scenarios.get(device) != affinity))
+                slots = _take(count, [(device, names[device]) for device in devices], jobs_per_gpu, folder)
                 if slots and affinity:
                     record.scenarios.update(dict.fromkeys(slots, affinity))
                     record.save(notes)
         except OSError as error:
             raise _unusable(folder, error) from error
-        failures = {device: failure for device, failure in record.failures.items() if device in pool and device not in ranks}
-        if failures and failures != reported:
-            passing(failures)
-        reported = failures
+        if passed := [f"GPU {device} ({record.failures[device]})" for device in pool if device not in devices]:
+            say_once(f"passed over: {', '.join(passed)}")
         waited = time.monotonic() - start
         if slots:
             return Lease(tuple(slots), tuple(slots.values()), waited, gate, notes)
         if waited > timeout:
             raise TimeoutError(f"no {count} of the GPUs {', '.join(pool)} became free within {timeout:.0f} s")
-        if not told:
-            waiting()
-            told = True
+        say_once(f"waiting for {count} of the GPUs {', '.join(pool)}")
         time.sleep(POLL)
 
 
-def _ranks(count: int, pool: Sequence[str], notes: Notes) -> dict[str, int]:
-    """Device that a job may take -> 0 if nothing speaks against it, else its place among the suspects, the oldest failure first.
+def _usable(count: int, pool: Sequence[str], notes: Notes) -> list[str]:
+    """The devices that a job may take, best first: those without a failure, then suspects, the oldest failure first.
 
     A suspect is the last choice and no error: one bad job must not stop all others. Too few devices that are not lost are an error:
     waiting would not bring one back. Raises InputError.
     """
-    ranks = {device: 0 for device in pool if device not in notes.failures}
-    if len(ranks) < count:
-        suspects = [device for device, failure in notes.failures.items() if device in pool and failure == SUSPECT]
-        ranks |= {device: place for place, device in enumerate(suspects, 1)}
-    if len(ranks) < count:
+    devices = [device for device in pool if device not in notes.failures]
+    if len(devices) < count:
+        devices += [device for device, failure in notes.failures.items() if device in pool and failure == SUSPECT]
+    if len(devices) < count:
         lost = ", ".join(f"GPU {device} (lost)" for device in pool if notes.failures.get(device) == LOST)
         remedy = (
             "Look at nvidia-smi. Reset a GPU that it does not show as working (nvidia-smi --gpu-reset), or restart the machine. "
             "Then start the same command again, or let gpus.devices name other GPUs."
         )
         raise InputError("GPUs", f"a job needs {count} of the GPUs {', '.join(pool)}, and too few are left", lost, remedy)
-    return ranks
+    return devices
 
 
-def _take(
-    count: int,
-    ranks: Mapping[str, int],
-    notes: Notes,
-    affinity: str,
-    names: Mapping[str, str],
-    jobs_per_gpu: int,
-    folder: Path,
-) -> dict[str, IO[str]]:
-    """Lock a slot of each of the `count` best devices: device -> its file. Empty, and nothing locked, if there are too few."""
+def _take(count: int, devices: Sequence[tuple[str, str]], jobs_per_gpu: int, folder: Path) -> dict[str, IO[str]]:
+    """Lock a slot of `count` of the (device, name), best first: device -> its file; empty, and none locked, if too few are free."""
     slots: dict[str, IO[str]] = {}
-    order: dict[str, tuple[int, bool, int]] = {}
-    for device, rank in ranks.items():
-        files = [try_lock(folder / f"{names[device]}.{slot}.lock") for slot in range(jobs_per_gpu)]
-        free = [file for file in files if file]
-        if free:
-            slots[device] = free[0]
-            order[device] = (rank, not affinity or notes.scenarios.get(device) != affinity, len(files) - len(free))
-        for file in free[1:]:
-            file.close()
-    # `sorted` is stable: of equal devices the first of the pool is taken.
-    best = sorted(slots, key=lambda device: order[device])[:count] if len(slots) >= count else []
-    for device, file in slots.items():
-        if device not in best:
-            file.close()
-    return {device: slots[device] for device in best}
+    for slot, (device, name) in itertools.product(range(jobs_per_gpu), devices):
+        if len(slots) < count and device not in slots and (file := try_lock(folder / f"{name}.{slot}.lock")):
+            slots[device] = file
+    if len(slots) == count:
+        return slots
+    for file in slots.values():
+        file.close()
+    return {}

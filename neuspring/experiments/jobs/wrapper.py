@@ -13,7 +13,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -188,22 +188,8 @@ def _lease(job: Job, notes: Path | None) -> gpus.Lease | None:
     if not job.gpus or pool == GIVEN:
         return None
     names = [name for name in pool.split(",") if name] or gpus.visible_devices()
-
-    def waiting() -> None:
-        say(f"waiting for {job.gpus} of the GPUs {', '.join(names)}")
-
-    def passing(failures: Mapping[str, str]) -> None:
-        say("passed over: " + ", ".join(f"GPU {device} ({failure})" for device, failure in failures.items()))
-
-    return gpus.acquire(
-        job.gpus,
-        names,
-        jobs_per_gpu=int(os.environ.get(SHARE, "1")),
-        affinity=job.record.scenario,
-        notes=notes,
-        waiting=waiting,
-        passing=passing,
-    )
+    share = int(os.environ.get(SHARE, "1"))
+    return gpus.acquire(job.gpus, names, jobs_per_gpu=share, affinity=job.record.scenario, notes=notes, say=say)
 
 
 def _judge(lease: gpus.Lease, fault: faults.Fault | None) -> None:

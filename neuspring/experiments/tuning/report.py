@@ -82,7 +82,10 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
         (folder / name).unlink(missing_ok=True)
     write_text(folder / "trials.csv", findings.table.to_csv(index=False))
     write_best(findings, settings, folder, root)
-    _draw(findings, folder)
+    if findings.table["state"].isin(["complete", "pruned"]).any():
+        from neuspring.experiments.tuning import figures
+
+        figures.draw(study, folder, importances=bool(findings.importances))
     write_text(output, summary(findings, folder))
     files = [folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file()]
     losses = {"best": findings.best.trials[-1].value if findings.best else None, "baseline": findings.baseline}
@@ -169,23 +172,6 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 def _write_yaml(path: Path, values: Mapping[str, Any]) -> None:
     write_text(path, yaml.safe_dump(dict(values), sort_keys=False, width=120))
-
-
-def _draw(findings: Findings, folder: Path) -> None:
-    from neuspring.experiments.tuning import figures
-
-    table, space = findings.table, findings.plan.tune.space
-    if not table["state"].isin(["complete", "pruned"]).any():
-        return
-    figures.history_figure(table, folder / "history.png")
-    figures.slices_figure(table, space, folder / "slices.png")
-    if findings.best is not None:
-        figures.parallel_figure(table, space, folder / "parallel.png")
-    if findings.importances:
-        figures.importances_figure(findings.importances, folder / "importances.png")
-    steps = {slot.number: sorted(slot.trials[-1].intermediate_values.items()) for slot in findings.slots}
-    if findings.plan.method.fit:
-        figures.steps_figure(table, steps, findings.scenes, findings.plan.epochs, folder / "steps.png")
 
 
 def summary(findings: Findings, folder: Path) -> str:

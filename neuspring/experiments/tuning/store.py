@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -72,39 +72,31 @@ class Store:
             connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:number)"), {"number": number})
             yield
 
-    def open(self, facts: Mapping[str, Any], sampler: BaseSampler, pruner: BasePruner) -> Study:
+    def open(self, facts: Mapping[str, Any], pruner: BasePruner) -> Study:
         """The sweep, made if there is none. Raises InputError if it was begun with other `facts`."""
         import optuna
 
         # Several processes must not create the tables at once.
         with self.lock():
-            storage = self._storage()
             study = optuna.create_study(
-                storage=storage, study_name=self.study, sampler=sampler, pruner=pruner, load_if_exists=True, direction="minimize"
+                storage=self._storage(), study_name=self.study, pruner=pruner, load_if_exists=True, direction="minimize"
             )
             if DEFINITION not in study.user_attrs:
                 study.set_user_attr(DEFINITION, dict(facts))
-            self._require_same(study, facts)
-            return study
+        return self._checked(study, facts)
 
     def load(self, facts: Mapping[str, Any]) -> Study:
         """The sweep for reading. Raises InputError if there is none, or if it was begun with other `facts`."""
         import optuna
 
-        missing = InputError(f"sweep {self.study}", "must have been begun", None, "Run neuspring tune first.")
-        if self.uri is None and not (self.folder / DATABASE).is_file():
-            raise missing
-        try:
-            with self.lock():
+        if self.uri or (self.folder / DATABASE).is_file():
+            with contextlib.suppress(KeyError), self.lock():
                 study = optuna.load_study(storage=self._storage(), study_name=self.study)
-        except KeyError as error:
-            raise missing from error
-        if DEFINITION not in study.user_attrs:
-            raise missing
-        self._require_same(study, facts)
-        return study
+                if DEFINITION in study.user_attrs:
+                    return self._checked(study, facts)
+        raise InputError(f"sweep {self.study}", "must have been begun", None, "Run neuspring tune first.")
 
-    def _require_same(self, study: Study, facts: Mapping[str, Any]) -> None:
+    def _checked(self, study: Study, facts: Mapping[str, Any]) -> Study:
         definition = {name: study.user_attrs[DEFINITION].get(name) for name in facts}
         if canonical(definition) != canonical(facts):
             raise InputError(
@@ -113,6 +105,7 @@ class Store:
                 f"another {', '.join(_differences(definition, facts))}",
                 f"Name a new sweep (tune.study), or delete this one{'' if self.uri else f' ({self.folder})'}.",
             )
+        return study
 
     def _storage(self) -> RDBStorage:
         from optuna import logging
@@ -148,8 +141,7 @@ class Slot:
 
         last = self.trials[-1]
         if last.state != TrialState.FAIL:
-            names = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.RUNNING: "running"}
-            return names.get(last.state, "waiting")  # type: ignore[return-value]
+            return last.state.name.lower()  # type: ignore[return-value]
         return "failed" if REASON in last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
 
     @property
@@ -170,8 +162,8 @@ def slots(study: Study) -> dict[int, Slot]:
     return {number: Slot(number, tuple(trials[number])) for number in sorted(trials)}
 
 
-def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any]) -> Trial | None:
-    """A trial of the lowest free slot, None if there is none. `first` are the values of slot 0.
+def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampler: Callable[[int], BaseSampler]) -> Trial | None:
+    """A trial of the lowest free slot, None if there is none. `first` are the values of slot 0; each slot has its `sampler`.
 
     The caller holds the sweep's lock, is the only process that is `worker`, and runs no other trial.
     """
@@ -185,12 +177,14 @@ def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any]) -> Tr
             study.tell(running.number, state=TrialState.FAIL)
     begun = slots(study)
     # A trial that waits was left between being queued and being taken.
-    if not any(slot.state == "waiting" for slot in begun.values()):
+    number = next((n for n, slot in begun.items() if slot.state == "waiting"), None)
+    if number is None:
         number = next((n for n in range(tune.trials) if n not in begun or begun[n].state == "free"), None)
         if number is None:
             return None
         values = begun[number].trials[-1].params if number in begun else {}
         study.enqueue_trial((dict(first) if number == 0 else {}) | values, user_attrs={SLOT: number})
+    study.sampler = sampler(number)
     trial = study.ask()
     trial.set_user_attr(WORKER, worker)
     return trial

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import hashlib
 import json
 import math
@@ -37,37 +38,15 @@ from neuspring.experiments.tuning.store import CRASH, DEFINITION, REASON, SLOT, 
 from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
 
 if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
     from optuna.study import Study
 
 
-class Seeded(BaseSampler):
-    """TPE with a seed of its own for every slot."""
-
-    def __init__(self, tune: Tune, *, grouped: bool) -> None:
-        """`grouped`: the baseline has values that the space cannot hold, so that its trial lacks them."""
-        self._tune, self._grouped = tune, grouped
-        self._sampler = self._of_slot(0)
-
-    def _of_slot(self, slot: int) -> TPESampler:
-        seed = int.from_bytes(hashlib.sha256(f"{self._tune.seed} {slot}".encode()).digest()[:4], "big")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            return TPESampler(
-                seed=seed, n_startup_trials=self._tune.startup_trials, multivariate=True, group=self._grouped, constant_liar=True
-            )
-
-    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        self._sampler = self._of_slot(trial.user_attrs[SLOT])
-
-    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return self._sampler.infer_relative_search_space(study, trial)
-
-    def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        return self._sampler.sample_relative(study, trial, search_space)
-
-    def sample_independent(self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution) -> Any:
-        return self._sampler.sample_independent(study, trial, param_name, param_distribution)
+def sampler_of(tune: Tune, slot: int, *, grouped: bool) -> BaseSampler:
+    """TPE with the seed of a slot. `grouped`: the baseline has values that the space cannot hold, so that its trial lacks them."""
+    seed = int.from_bytes(hashlib.sha256(f"{tune.seed} {slot}".encode()).digest()[:4], "big")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return TPESampler(seed=seed, n_startup_trials=tune.startup_trials, multivariate=True, group=grouped, constant_liar=True)
 
 
 class MedianOfStep(BasePruner):
@@ -134,15 +113,15 @@ def work(
     if names != required:
         raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
     first = labels({name: value for name, value in plan.baseline.items() if holds(tune.space[name], value)})
-    sampler = Seeded(tune, grouped=len(first) < len(tune.space))
+    sampler = functools.partial(sampler_of, tune, grouped=len(first) < len(tune.space))
     facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
     store = Store(folder, tune.storage, tune.study)
-    study = store.open(facts, sampler, pruner_of(tune, len(scenes), plan.epochs))
+    study = store.open(facts, pruner_of(tune, len(scenes), plan.epochs))
     finished: list[int] = []
     with _only(folder, worker):
         while True:
             with store.lock():
-                trial = claim(study, worker, tune, first)
+                trial = claim(study, worker, tune, first, sampler)
             if trial is None:
                 break
             slot = trial.user_attrs[SLOT]
