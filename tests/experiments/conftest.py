@@ -1,13 +1,16 @@
 """Fixtures that several files share."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
+from neuspring.config import Tracking
 from neuspring.config.tuning import Tune
 from neuspring.core.job_records import begin_run
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
+from neuspring.experiments.tracking import log as tracking
 from tests.support import sweeps
 
 
@@ -36,3 +39,20 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tune]:
     sweeps.work(folder, tune)
     sweeps.report(folder, tune)
     return folder, tune
+
+
+@pytest.fixture(scope="session")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A migrated MLflow database. Making one takes seconds, copying it does not; it holds no experiment of a test."""
+    results = tmp_path_factory.mktemp("template")
+    assert tracking.init(results, Tracking(experiment="template"))["outcome"] == "ready"
+    return results / "mlflow.db"
+
+
+@pytest.fixture
+def tracked(tmp_path: Path, template: Path) -> Path:
+    """A results folder with a migrated MLflow database."""
+    folder = tmp_path / "results"
+    folder.mkdir()
+    shutil.copy(template, folder / "mlflow.db")
+    return folder
