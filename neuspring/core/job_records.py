@@ -51,14 +51,14 @@ class Attempt:
     run: str = ""
     """The run of the workflow that it belongs to (`begin_run`); empty for a job started by hand."""
     devices: list[str] = field(default_factory=list)
-    """GPUs held, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
+    """GPUs of the job, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
     device_names: list[str] = field(default_factory=list)
     peak_memory_mb: float = 0.0
     """Resident memory of all its processes, MiB."""
     peak_gpu_memory_mb: float | None = None
-    """Memory in use on the held GPUs, MiB; None where it cannot be read."""
+    """Memory in use on its GPUs, MiB; None where it cannot be read."""
     gpu_utilisation: float | None = None
-    """Mean over time and held GPUs, %."""
+    """Mean over time and GPUs, %."""
     cpu_seconds: float = 0.0
     samples: list[list[float | None]] = field(default_factory=list)
     """[s since the start, CPU %, resident MiB, GPU %, GPU MiB], at most 120 rows."""

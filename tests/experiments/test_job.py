@@ -171,13 +171,15 @@ if device == '0': sys.exit('RuntimeError: No CUDA GPUs are available')"""
     assert sorted(outcomes) == [["ok"]] * (jobs - 1) + [["transient", "ok"]]
 
 
-def test_where_all_gpus_are_lost_the_next_job_says_so(results, monkeypatch):
+def test_where_all_gpus_are_lost_the_next_job_says_so_and_the_next_run_tries_again(results, monkeypatch):
     monkeypatch.setenv(job.POOL, "0")
     assert run(results, "import sys; sys.exit('GPU is lost')", "--gpus", "1").returncode == 1
     again = run(results, "print('ran')", "--gpus", "1")
     assert (again.returncode, again.stdout) == (2, "")
     assert "too few are left; received GPU 0 (lost)" in again.stderr and "nvidia-smi" in again.stderr
     assert (record(results).last.outcome, record(results).last.cause) == ("permanent", "no GPU")
+    begin_run(results)
+    assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n", "the next run tries the GPU again"
 
 
 def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_job(results, monkeypatch):

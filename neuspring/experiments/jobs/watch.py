@@ -101,7 +101,7 @@ class Watch:
 
 
 def _gpu(library: Any, handles: Sequence[Any]) -> tuple[float | None, float | None]:
-    """(mean utilisation %, memory in use MiB) of the held devices."""
+    """(mean utilization %, memory in use MiB) of the leased devices."""
     if not handles:
         return None, None
     try:
