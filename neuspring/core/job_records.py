@@ -1,37 +1,32 @@
-"""What happened to a job of the workflow: its attempts, causes of failure, time, memory, GPU. Written by the wrapper of jobs.
+"""The record of a job of the workflow: its attempts, causes of failure, time, memory and GPU use. The wrapper of jobs writes it.
 
 One JSON file per job at results/jobs/<rule>/<wildcards>.json, beside its log at results/logs/<rule>/<wildcards>.log.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import functools
 import json
-import os
-import platform
-import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from neuspring.config.types import STRICT
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, read_json
 
+STRICT = ConfigDict(extra="forbid", strict=True)
 FOLDER, LOGS = "jobs", "logs"
 RUN = ".run"
-"""File in FOLDER that names the run of the workflow that goes on, or went on last."""
-POLL = 0.2
-"""s between two looks whether an earlier run of a job has ended."""
+"""File in FOLDER that names the current run of the workflow, or the last one."""
+GPU_NOTES = ".gpus"
+"""File in FOLDER in which the jobs of that run note which GPUs failed."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
-"""How an attempt ended. transient: may be tried again. running: it runs, or its wrapper was killed before it could say more."""
+"""How an attempt ended. transient: trying again may help. running: it runs, or its wrapper was killed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,21 +44,21 @@ class Attempt:
     cause: str = ""
     """Why it failed, in words; empty if it did not."""
     message: str = ""
-    """The last line of the output that says something; empty if it did not fail."""
+    """The line of the output that names the error; empty if it did not fail."""
     exit: int | None = None
     """Exit status; negative: the signal that ended it."""
     host: str = ""
     run: str = ""
-    """The run of the workflow that it belongs to (`begin_run`); empty where a job ran by itself."""
+    """The run of the workflow that it belongs to (`begin_run`); empty for a job started by hand."""
     devices: list[str] = field(default_factory=list)
-    """GPUs held, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
+    """GPUs of the job, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
     device_names: list[str] = field(default_factory=list)
     peak_memory_mb: float = 0.0
     """Resident memory of all its processes, MiB."""
     peak_gpu_memory_mb: float | None = None
-    """Memory in use on the held GPUs, MiB; None where it cannot be read."""
+    """Memory in use on its GPUs, MiB; None where it cannot be read."""
     gpu_utilisation: float | None = None
-    """Mean over time and held GPUs, %."""
+    """Mean over time and GPUs, %."""
     cpu_seconds: float = 0.0
     samples: list[list[float | None]] = field(default_factory=list)
     """[s since the start, CPU %, resident MiB, GPU %, GPU MiB], at most 120 rows."""
@@ -82,7 +77,7 @@ class JobRecord:
     attempts: list[Attempt]
     scenario: str = ""
     work: float = 1.0
-    """How much it had to do, in units of its rule (see `neuspring.experiments.plan`)."""
+    """Amount of work, in units of its rule (see `neuspring.experiments.plan`)."""
 
     @property
     def last(self) -> Attempt:
@@ -106,8 +101,8 @@ class JobRecord:
             name = log.relative_to(results / LOGS).with_suffix("").as_posix()
         except ValueError as error:
             raise InputError(log, f"logs of jobs must lie in {results / LOGS}") from error
-        where = {"name": name, "log": log.relative_to(results).as_posix()}
-        return cls(rule=name.partition("/")[0], attempts=[], scenario=scenario, work=work, **where)
+        rule, place = name.partition("/")[0], log.relative_to(results).as_posix()
+        return cls(rule=rule, name=name, log=place, attempts=[], scenario=scenario, work=work)
 
     def path(self, results: Path) -> Path:
         """Where the record lies."""
@@ -127,84 +122,31 @@ class JobRecord:
 
 
 def begin_run(results: Path) -> None:
-    """Give the run of the workflow that begins a name, by which jobs tell its attempts from earlier ones.
+    """Name the run of the workflow that begins, so that its attempts can be told from earlier ones.
 
     A name and not a time: clocks of machines differ.
     """
-    write_text(Path(results) / FOLDER / RUN, uuid.uuid4().hex)
+    folder = Path(results) / FOLDER
+    (folder / GPU_NOTES).unlink(missing_ok=True)
+    write_text(folder / RUN, uuid.uuid4().hex)
 
 
 def this_run(results: Path) -> str:
-    """The name of the run that goes on; empty where there has been none."""
+    """The name of the current run, or of the last one; empty where there was none."""
     try:
         return (Path(results) / FOLDER / RUN).read_text().strip()
     except OSError:
         return ""
 
 
-@contextlib.contextmanager
-def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | None]:
-    """Hold a job against other wrappers of it while its record at `record` is read and written and its command runs.
-
-    Where another one holds it, `waiting` is told once which, and we wait. Gives the file whose lock this is, for the command to
-    inherit: the job is then held until both have ended. None where files cannot be made or locked: then nothing is held.
-    """
-    # Snakemake removes a job's log before it starts the job, so that the log cannot be what is locked.
-    path = record.with_name(f"{record.name.removesuffix('.json')}.lock")
-    file = _held(path, waiting)
-    try:
-        yield file
-    finally:
-        if file:
-            # While it is held: whoever opened it meanwhile sees that it is no longer the one at this path.
-            with contextlib.suppress(OSError):
-                path.unlink()
-            file.close()
-
-
-def _held(path: Path, waiting: Callable[[str], object]) -> IO[str] | None:
-    told = False
-    while True:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("a+", encoding="utf-8")
-        except OSError:  # a disk that is full or read-only ends the job itself, with its name
-            return None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                _sign(file)
-                return file
-        except BlockingIOError:
-            if not told:
-                file.seek(0)
-                holder = file.read().strip() or "not known"
-                waiting(f"an earlier run of this job still goes on ({holder}); waiting for its end. If it is gone, delete {path}")
-                told = True
-            time.sleep(POLL)
-        except FileNotFoundError:
-            pass  # its holder has just ended and removed it
-        except OSError:  # some file systems of a network have no such locks
-            file.close()
-            return None
-        file.close()
-
-
-def _sign(file: IO[str]) -> None:
-    """Say who holds it."""
-    with contextlib.suppress(OSError):  # unbuffered: what a full disk does not take must not come back when it is closed
-        os.ftruncate(file.fileno(), 0)
-        os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
-
-
 @functools.cache
 def _adapter() -> TypeAdapter[JobRecord]:
-    """Building it takes longer than using it for a thousand records."""
+    """Building this takes longer than reading a thousand records with it."""
     return TypeAdapter(JobRecord)
 
 
 def failure_lines(records: Iterable[JobRecord], results: Path) -> list[str]:
-    """What failed and why, a line a job, and where its log lies. A job that still says that it runs has lost its wrapper."""
+    """One line per failed job: its cause, and where its log lies. A job still marked as running counts: its wrapper was killed."""
     lines = []
     for record in records:
         last = record.last
@@ -217,7 +159,7 @@ def failure_lines(records: Iterable[JobRecord], results: Path) -> list[str]:
 def read_jobs(results: Path, damaged: list[str] | None = None) -> list[JobRecord]:
     """The records of all jobs of a results folder, by name.
 
-    What is wrong with damaged ones is added to `damaged`. Raises InputError for a damaged one where that is not given.
+    Errors of damaged records are added to `damaged`. Without that list, a damaged record raises InputError.
     """
     records = []
     for path in sorted((Path(results) / FOLDER).rglob("*.json")):

@@ -16,8 +16,8 @@ import numpy as np
 
 from neuspring import config
 from neuspring.config.tuning import Tune
-from tests.experiments.test_tune import furnish, settings, slots, study, work
 from tests.support import stores
+from tests.support.sweeps import furnish, settings, slots, sweep, work
 
 WORKERS, TRIALS, KILLS = 4, 24, 8
 PAUSE = (6.0, 12.0)
@@ -38,7 +38,7 @@ def one_worker(folder: Path, chosen: Tune, number: int) -> None:
 def run(folder: Path, storage: str | None, seed: int = 0) -> str:
     """Make a study in `folder`; says how it went. Raises AssertionError for a trial too many or too few."""
     place = furnish(folder)
-    chosen = study(trials=TRIALS, workers=WORKERS, pruner="none", storage=storage)
+    chosen = sweep(trials=TRIALS, workers=WORKERS, pruner="none", storage=storage)
     processes, rng = multiprocessing.get_context("spawn"), np.random.default_rng(seed)
 
     def begin(number: int) -> multiprocessing.process.BaseProcess:

@@ -37,7 +37,7 @@ def run(commit: str, error: float, scenario: str = "rope", seed: int = 0, method
 
 
 @pytest.fixture
-def known(monkeypatch: pytest.MonkeyPatch) -> list[LoggedRun]:
+def logged(monkeypatch: pytest.MonkeyPatch) -> list[LoggedRun]:
     """What MLflow holds, for `compare.compare`."""
     runs: list[LoggedRun] = []
     monkeypatch.setattr(compare, "logged_runs", lambda results, settings: runs)
@@ -45,8 +45,8 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[LoggedRun]:
 
 
 def compared(runs: list[LoggedRun], first: str = OLD, second: str = NEW) -> tuple[pd.DataFrame, str]:
-    found = compare.pair(runs, first, second)
-    return found.differences, compare.to_markdown(found)
+    comparison = compare.pair(runs, first, second)
+    return comparison.differences, compare.to_markdown(comparison)
 
 
 def test_scores_are_paired_by_scenario_method_and_seed() -> None:
@@ -111,22 +111,22 @@ def test_times_of_stages_that_ran_again_are_compared() -> None:
     assert "fit, s" in text and "search, s" not in text
 
 
-def test_commits_are_found_by_their_beginnings_and_changed_copies_are_others(known: list[LoggedRun]) -> None:
-    known += [run(OLD, 0.01), run(f"{OLD}-dirty", 0.02), run(NEW, 0.03)]
+def test_commits_are_found_by_their_beginnings_and_changed_copies_are_others(logged: list[LoggedRun]) -> None:
+    logged += [run(OLD, 0.01), run(f"{OLD}-dirty", 0.02), run(NEW, 0.03)]
     assert "minus 1111111aaaaa\n" in compare.compare(Path(), Tracking(), "1111", "222")
     assert "# 1111111aaaaa-dirty minus 1111111aaaaa\n" in compare.compare(Path(), Tracking(), OLD, "111-dirty")
     with pytest.raises(InputError, match="two different ones"):
         compare.compare(Path(), Tracking(), "111", OLD)
 
 
-def test_a_commit_without_runs_is_an_error_that_lists_the_known_ones(known: list[LoggedRun]) -> None:
-    known += [run(OLD, 0.01, commits={OLD: 1}), run(NEW, 0.01, commits={NEW: 2}), run(NEW, 0.01, seed=1, commits={NEW: 3})]
+def test_a_commit_without_runs_is_an_error_that_lists_the_known_ones(logged: list[LoggedRun]) -> None:
+    logged += [run(OLD, 0.01, commits={OLD: 1}), run(NEW, 0.01, commits={NEW: 2}), run(NEW, 0.01, seed=1, commits={NEW: 3})]
     with pytest.raises(InputError, match=rf"commit '333'.*Known, newest first: {NEW} \(2 runs\), {OLD} \(1 run\)"):
         compare.compare(Path(), Tracking(), "333", "222")
     for name in ("111-dirty", "-dirty", ""):
         with pytest.raises(InputError, match="must have complete runs"):
             compare.compare(Path(), Tracking(), name, "222")
-    known.append(run("2222222c", 0.01))
+    logged.append(run("2222222c", 0.01))
     with pytest.raises(InputError, match="one commit only"):
         compare.compare(Path(), Tracking(), "111", "2222")
 

@@ -1,41 +1,18 @@
 """The wrapper of every job: log, record, GPUs, causes, signals."""
 
-import errno
-import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import Attempt, JobRecord, alone, begin_run, failure_lines, read_jobs
+from neuspring.core.job_records import GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
-
-NAME = "search/rope/uniform/0"
-
-
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    for name in (job.POOL, job.SHARE, gpus.VISIBLE):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
-    begin_run(tmp_path / "results")
-    return tmp_path / "results"
-
-
-def run(results, code, *options, **keywords):
-    command = [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", "--log", str(results / "logs" / f"{NAME}.log"), *options]
-    return subprocess.run([*command, "--", sys.executable, "-c", code], capture_output=True, text=True, check=False, **keywords)
-
-
-def record(results):
-    (found,) = read_jobs(results)
-    return found
+from tests.support.jobs import NAME, record, run, wait_for, wrapped
 
 
 def test_a_job_leaves_its_output_in_the_log_and_a_record(results):
@@ -43,13 +20,15 @@ def test_a_job_leaves_its_output_in_the_log_and_a_record(results):
     done = run(results, code, "--scenario", "rope", "--work", "88")
     assert (done.returncode, done.stdout) == (0, "to see\n")
     assert (results / "logs" / f"{NAME}.log").read_text().endswith("to see\n")
-    found = record(results)
-    assert (found.rule, found.name, found.log, found.scenario, found.work) == ("search", NAME, f"logs/{NAME}.log", "rope", 88)
-    assert not found.failed
-    assert (found.last.outcome, found.last.exit, found.last.devices, found.last.cause) == ("ok", 0, [], "")
-    assert found.last.seconds >= 0.4
-    assert found.last.peak_memory_mb > 50
-    assert all(len(row) == 5 for row in found.last.samples)
+    job_record = record(results)
+    assert (job_record.rule, job_record.name, job_record.log) == ("search", NAME, f"logs/{NAME}.log")
+    assert (job_record.scenario, job_record.work) == ("rope", 88)
+    assert not job_record.failed
+    last = job_record.last
+    assert (last.outcome, last.exit, last.devices, last.cause) == ("ok", 0, [], "")
+    assert last.seconds >= 0.4
+    assert last.peak_memory_mb > 50
+    assert all(len(row) == 5 for row in last.samples)
 
 
 def test_a_permanent_failure_is_not_tried_again_but_the_next_run_tries(results):
@@ -74,9 +53,9 @@ def test_a_transient_failure_is_tried_again(results):
 def test_a_job_sees_the_gpu_that_it_holds_and_no_other(results, monkeypatch):
     monkeypatch.setenv(job.POOL, "3,5")
     code = f"import os; print(os.environ['{gpus.VISIBLE}'], os.environ['CUDA_DEVICE_ORDER'])"
-    held = gpus.acquire(1, ("3",))
+    lease = gpus.acquire(1, ("3",))
     assert run(results, code, "--gpus", "1").stdout == "5 PCI_BUS_ID\n"
-    held.release()
+    lease.release()
     assert record(results).last.devices == ["5"]
     assert run(results, f"import os; print(repr(os.environ['{gpus.VISIBLE}']))").stdout == "''\n"
 
@@ -96,20 +75,10 @@ def test_a_job_that_needs_more_gpus_than_there_are_is_refused(results, monkeypat
     assert "a job needs 2 GPUs, more than there are; received 1 (0)" in done.stderr
 
 
-def wait_for(condition):
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_wrapper_ends_its_command(results, tmp_path, number):
-    log = results / "logs" / f"{NAME}.log"
     code = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-    wrapper = subprocess.Popen(
-        [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", "--log", str(log), "--", sys.executable, "-c", code]
-    )
+    wrapper = subprocess.Popen([*wrapped(results), sys.executable, "-c", code])
     wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
     wrapper.send_signal(number)
     wrapper.wait(20)
@@ -136,9 +105,9 @@ def test_a_damaged_record_is_named_and_replaced_by_the_next_run(results):
 
 def test_records_come_back_as_they_were_written(tmp_path):
     attempt = Attempt(started="2026-01-01T00:00:00+00:00", outcome="transient", cause="x", samples=[[0.1, 2.0, 3.0, None, None]])
-    kept = JobRecord(rule="fit", name="fit/a/b/0", log="logs/fit/a/b/0.log", attempts=[attempt], scenario="a", work=3.0)
-    kept.save(tmp_path)
-    assert read_jobs(tmp_path) == [kept]
+    original = JobRecord(rule="fit", name="fit/a/b/0", log="logs/fit/a/b/0.log", attempts=[attempt], scenario="a", work=3.0)
+    original.save(tmp_path)
+    assert read_jobs(tmp_path) == [original]
 
 
 def test_a_job_by_itself_runs_whenever_it_is_asked_to(results):
@@ -148,10 +117,9 @@ def test_a_job_by_itself_runs_whenever_it_is_asked_to(results):
 
 
 def test_a_full_disk_behind_the_output_does_not_end_the_job(results):
-    command = [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", "--log", str(results / "logs" / f"{NAME}.log"), "--"]
     code = "print('x' * 100_000, flush=True); print('the end')"
     with open("/dev/full", "w") as full:
-        done = subprocess.run([*command, sys.executable, "-c", code], stdout=full, check=False)
+        done = subprocess.run([*wrapped(results), sys.executable, "-c", code], stdout=full, check=False)
     assert done.returncode == 0
     assert (results / "logs" / f"{NAME}.log").read_text().endswith("the end\n")
 
@@ -183,33 +151,35 @@ open({str(uses)!r}, 'a').write(device)
 time.sleep(0.05)
 if device == '0': sys.exit('RuntimeError: No CUDA GPUs are available')"""
 
-    def start(number):
+    def start_job(number):
         log = results / "logs" / "fit" / f"{number}.log"
         options = ["--log", str(log), "--gpus", "1", "--scenario", "rope"]
         command = [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", *options, "--", sys.executable, "-c", code]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     jobs = 5
-    running = [start(number) for number in range(jobs)]
-    told = [process.communicate(timeout=60)[1] for process in running]
+    running = [start_job(number) for number in range(jobs)]
+    messages = [process.communicate(timeout=60)[1] for process in running]
     failed = [number for number, process in enumerate(running) if process.returncode]
     assert len(failed) == 1
-    again = start(failed[0])
-    told.append(again.communicate(timeout=60)[1])
+    again = start_job(failed[0])
+    messages.append(again.communicate(timeout=60)[1])
     assert again.returncode == 0
     assert (uses.read_text().count("0"), uses.read_text().count("1")) == (1, jobs)
-    assert "passed over: GPU 0 (lost at" in told[-1]
-    ended = [[attempt.outcome for attempt in found.attempts] for found in read_jobs(results)]
-    assert sorted(ended) == [["ok"]] * (jobs - 1) + [["transient", "ok"]]
+    assert "passed over: GPU 0 (lost)" in messages[-1]
+    outcomes = [[attempt.outcome for attempt in each.attempts] for each in read_jobs(results)]
+    assert sorted(outcomes) == [["ok"]] * (jobs - 1) + [["transient", "ok"]]
 
 
-def test_where_all_gpus_are_lost_the_next_job_says_so(results, monkeypatch):
+def test_where_all_gpus_are_lost_the_next_job_says_so_and_the_next_run_tries_again(results, monkeypatch):
     monkeypatch.setenv(job.POOL, "0")
     assert run(results, "import sys; sys.exit('GPU is lost')", "--gpus", "1").returncode == 1
     again = run(results, "print('ran')", "--gpus", "1")
     assert (again.returncode, again.stdout) == (2, "")
-    assert "too few are left; received GPU 0 (lost at" in again.stderr and "nvidia-smi" in again.stderr
+    assert "too few are left; received GPU 0 (lost)" in again.stderr and "nvidia-smi" in again.stderr
     assert (record(results).last.outcome, record(results).last.cause) == ("permanent", "no GPU")
+    begin_run(results)
+    assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n", "the next run tries the GPU again"
 
 
 def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_job(results, monkeypatch):
@@ -218,107 +188,18 @@ def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_jo
     assert run(results, code, "--gpus", "1").returncode == 1
     assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n"
     # It worked, so nothing is left against it.
-    assert [path.stat().st_size for path in (results.parent / "locks").glob("*.lost")] == [0]
-
-
-def wrap(results, code, *options):
-    command = [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", "--log", str(results / "logs" / f"{NAME}.log"), *options]
-    return subprocess.Popen([*command, "--", sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-
-
-def test_a_job_waits_for_the_end_of_its_earlier_run_before_it_takes_a_gpu(results, monkeypatch, tmp_path):
-    """As when Snakemake was killed and started again."""
-    monkeypatch.setenv(job.POOL, "0,1")
-    trace, end = tmp_path / "trace", tmp_path / "end"
-    code = f"""import os, time
-def note(text): open({str(trace)!r}, 'a').write(text + os.environ['{gpus.VISIBLE}'] + ' ')
-note('begin')
-while not os.path.exists({str(end)!r}): time.sleep(0.02)
-note('end')"""
-    first = wrap(results, code, "--gpus", "1")
-    wait_for(lambda: trace.exists() and trace.read_text())
-    # Snakemake removes the log of a job before it starts it.
-    (results / "logs" / f"{NAME}.log").unlink()
-    second = wrap(results, code, "--gpus", "1")
-    line = second.stderr.readline()
-    assert f"an earlier run of this job still goes on (pid {first.pid} on " in line
-    # While it waits it holds no GPU.
-    gpus.acquire(1, ("1",), timeout=0).release()
-    end.touch()
-    assert (first.wait(20), second.wait(20)) == (0, 0)
-    assert trace.read_text() == "begin0 end0 begin0 end0 "
-    assert second.stderr.read() == "", "told once"
-    assert [attempt.outcome for attempt in record(results).attempts] == ["ok", "ok"]
-    assert [path.name for path in (results / "jobs" / NAME).parent.iterdir()] == ["0.json"], "no lock is left"
-
-
-def test_a_job_is_held_while_its_command_lives_even_without_its_wrapper(results, tmp_path):
-    path = results / "jobs" / "fit" / "a.json"
-    with alone(path, pytest.fail) as lock:
-        child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=[lock.fileno()])
-        # As if the wrapper was killed: its descriptor is closed, its file stays.
-        os.link(path.with_name("a.lock"), tmp_path / "kept")
-    os.link(tmp_path / "kept", path.with_name("a.lock"))
-    told = []
-
-    def free(text):
-        told.append(text)
-        child.communicate(b"\n")
-
-    with alone(path, free) as lock:
-        assert lock is not None
-    assert len(told) == 1 and f"pid {os.getpid()} on " in told[0]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_a_command_inherits_the_locks_of_its_job(results, monkeypatch):
-    monkeypatch.setenv(job.POOL, "3")
-    code = "import glob, os; print(*sorted(os.path.realpath(fd) for fd in glob.glob('/proc/self/fd/*')), sep='\\n')"
-    held = [line for line in run(results, code, "--gpus", "1").stdout.splitlines() if line.endswith(".lock")]
-    assert held == [str(results.parent / "locks" / "3.0.lock"), str(results / "jobs" / f"{NAME}.lock")]
-
-
-def test_a_lock_whose_file_its_last_holder_removed_is_no_lock(tmp_path, monkeypatch):
-    lock, calls = tmp_path / "a.lock", []
-
-    def flock(*arguments):
-        if not calls:
-            lock.unlink()  # between our opening the file and locking it
-        calls.append(arguments)
-        real(*arguments)
-
-    real = fcntl.flock
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with alone(tmp_path / "a.json", pytest.fail):
-        assert lock.exists()
-    assert len(calls) == 2
-
-
-def test_a_lock_that_is_deleted_is_waited_for_no_longer(tmp_path):
-    path = tmp_path / "a.json"
-    with alone(path, pytest.fail), alone(path, lambda text: path.with_name("a.lock").unlink()) as lock:
-        assert lock is not None
-
-
-def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
-    def unsupported(*_):
-        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
-
-    monkeypatch.setattr(fcntl, "flock", unsupported)
-    with alone(tmp_path / "a.json", pytest.fail) as lock:
-        assert lock is None
+    assert gpus.Notes.load(results / "jobs" / GPU_NOTES).failures == {}
 
 
 def test_a_command_that_cannot_be_started_ends_with_its_cause_and_is_not_tried_again(results, tmp_path):
     there = tmp_path / "there"
     there.write_text("no program")
-    wrapper = [sys.executable, "-m", "neuspring.experiments.jobs.wrapper", "--log", str(results / "logs" / f"{NAME}.log"), "--"]
     for command, status, cause in (
         (str(tmp_path / "nowhere"), 127, "the command was not found"),
         (str(there), 126, "the command cannot be executed"),
     ):
         begin_run(results)
-        done = subprocess.run([*wrapper, command], capture_output=True, text=True, check=False)
+        done = subprocess.run([*wrapped(results), command], capture_output=True, text=True, check=False)
         last = record(results).last
         assert (done.returncode, last.exit, last.outcome, last.cause) == (status, status, "permanent", cause)
         assert command in last.message and cause in done.stderr and "Traceback" not in done.stderr
@@ -331,20 +212,20 @@ def test_a_command_that_cannot_be_started_ends_with_its_cause_and_is_not_tried_a
 def test_a_job_with_a_gpu_that_computes_on_the_cpu_says_so(monkeypatch, capsys, held, device, told):
     import torch
 
-    from neuspring.physics import solver
+    from neuspring.core import device as devices
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setenv(gpus.VISIBLE, held)
-    solver._warn_of_idle_gpu.cache_clear()
-    assert [solver.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
+    devices._warn_of_idle_gpu.cache_clear()
+    assert [devices.resolve_device(device) for _ in range(2)] == ["cpu", "cpu"]
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == told
     assert all("holds GPU 1, but this torch is a build for the CPU alone" in line for line in lines)
     with pytest.raises(InputError, match="this torch is a build for the CPU alone"):
-        solver.resolve_device("cuda")
+        devices.resolve_device("cuda")
     # A torch that could use the GPU and does not find it: it is lost, and no reason to compute for hours without it.
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     for wanted in {"cuda", device if held else "cuda"} - {"cpu"}:
         with pytest.raises(InputError, match="this machine has 0 CUDA devices"):
-            solver.resolve_device(wanted)
+            devices.resolve_device(wanted)

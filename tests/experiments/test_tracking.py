@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
-import shutil
 import signal
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -19,63 +13,28 @@ import pytest
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
+from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import query as tracking_query
 from neuspring.experiments.tracking import store as tracking_store
-from neuspring.experiments.tracking.payload import RunRecord, _system_metrics
+from neuspring.experiments.tracking.payload import _system_metrics
 from tests.support import loggers
-from tests.support.stores import STEPS, write_run
+from tests.support.stores import STEPS, client_of, python, runs_of, write_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = Tracking()
 STARTED_MS, ENDED_MS = 1795255200000, 1795255530000
 
 
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A migrated database. Making one takes seconds, copying it does not; its only experiment is not the one under test."""
-    results = tmp_path_factory.mktemp("template")
-    assert tracking.init(results, Tracking(experiment="template"))["outcome"] == "ready"
-    return results / "mlflow.db"
-
-
 @pytest.fixture
-def results(tmp_path: Path, template: Path) -> Path:
-    folder = tmp_path / "results"
-    folder.mkdir()
-    shutil.copy(template, folder / "mlflow.db")
-    return folder
-
-
-def client_of(results: Path) -> Any:
-    from mlflow import MlflowClient
-
-    return MlflowClient(tracking_uri=tracking.default_uri(results))
-
-
-def runs_of(results: Path) -> list[Any]:
-    client = client_of(results)
-    return list(client.search_runs([client.get_experiment_by_name(SETTINGS.experiment).experiment_id]))
+def results(tracked: Path) -> Path:
+    return tracked
 
 
 def artifacts_of(results: Path, run: Any) -> set[str]:
     client = client_of(results)
     top = [item.path for item in client.list_artifacts(run.info.run_id)]
     return {item.path for name in top for item in client.list_artifacts(run.info.run_id, name)} | set(top)
-
-
-def python(code: str, *arguments: object, **options: Any) -> subprocess.Popen[str]:
-    """Start a process that can import neuspring."""
-    environment = {name: value for name, value in os.environ.items() if name not in tracking_store.ENVIRONMENT}
-    environment["PYTHONPATH"] = str(ROOT)
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, **options)
-
-
-def output(process: subprocess.Popen[str]) -> list[str]:
-    text, _ = process.communicate(timeout=240)
-    assert process.returncode == 0
-    return text.splitlines()
 
 
 def test_a_run_is_logged_completely_and_once(results: Path) -> None:
@@ -127,11 +86,13 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
 
     (run,) = runs_of(results)
-    found = {name.removeprefix("system/"): value for name, value in run.data.metrics.items() if name.startswith("system/")}
+    metrics = {name.removeprefix("system/"): value for name, value in run.data.metrics.items() if name.startswith("system/")}
     peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
     whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
     last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
-    assert found == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, "no rollout: it has no job record"
+    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, (
+        "no rollout: it has no job record"
+    )
     history = client_of(results).get_metric_history(run.info.run_id, "system/search.memory_mb")
     begin = STARTED_MS - 30 * 60_000
     assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
@@ -246,44 +207,6 @@ def test_sync_leaves_runs_of_other_results_folders_alone(results: Path, tmp_path
     assert client.get_run(running).info.status == "RUNNING"
 
 
-def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    away = Tracking(uri=f"http://secret@127.0.0.1:{port}")
-    records = [write_run(results, seed=seed) for seed in range(3)]
-    start = time.monotonic()
-    outcome = tracking.log_run(records[0], results, away)
-    assert outcome.startswith("unreachable: ")
-    assert tracking.init(results, away)["outcome"].startswith("unreachable: ")
-    ((word, names),) = tracking.sync(results, away).items()
-    assert word.startswith("unreachable: ") and len(names) == 3
-    assert time.monotonic() - start < 15
-    text = capsys.readouterr().err
-    assert "warning: tracking: unreachable" in text and "secret" not in text + outcome
-
-    said = records[0].with_name("mlflow.txt")
-    said.write_text(f"{outcome}\n")
-    assert tracking.sync(results, SETTINGS) == {"logged": [f"rope/ours/{seed}" for seed in range(3)]}
-    assert said.read_text() == "logged\n", "the workflow must not count the run as waiting for ever"
-    assert not records[1].with_name("mlflow.txt").exists()
-
-
-@pytest.mark.parametrize("damage", ["text", "postgres"])
-def test_a_damaged_database_or_absent_host_fails_at_once(results: Path, damage: str) -> None:
-    """MLflow itself would retry these for about two minutes."""
-    settings = SETTINGS
-    if damage == "text":
-        (results / "mlflow.db").write_text("not a database " * 100)
-    else:
-        settings = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
-    start = time.monotonic()
-    assert tracking.log_run(write_run(results), results, settings).startswith("unreachable: ")
-    assert tracking.init(results, settings)["outcome"].startswith("unreachable: ")
-    assert "secret" not in tracking.init(results, settings)["uri"]
-    assert time.monotonic() - start < 10
-
-
 def test_a_server_that_fails_midway_leaves_nothing_double(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mlflow import MlflowClient
 
@@ -365,72 +288,3 @@ def test_damaged_records_are_input_errors(results: Path) -> None:
     assert tracking.sync(results, SETTINGS, lines.append) == {"damaged": ["rope/ours/0"], "logged": ["rope/ours/1"]}
     assert lines == ["rope/ours/0: damaged", "rope/ours/1: logged"]
     assert len(runs_of(results)) == 1, "nothing was sent of the damaged ones"
-
-
-def test_init_twice_and_by_two_processes_at_once(tmp_path: Path) -> None:
-    code = """
-import sys
-from pathlib import Path
-from neuspring.experiments.tracking import log as tracking
-from neuspring.config import Tracking
-print(tracking.init(Path(sys.argv[1]), Tracking()))
-"""
-    (tmp_path / "mlflow.db.part").write_text("left by a killed init")
-    first, second = (output(process) for process in [python(code, tmp_path) for _ in range(2)])
-    assert first == second and "'outcome': 'ready'" in first[0]
-    assert str(tracking.init(tmp_path, SETTINGS)) == first[0]
-    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
-    assert not (tmp_path / "mlflow.db.part").exists()
-
-
-def test_init_upgrades_an_older_database(tmp_path: Path) -> None:
-    from alembic import command
-    from mlflow.store.tracking.dbmodels.initial_models import Base
-
-    utils: Any = importlib.import_module("mlflow.store.db.utils")
-    engine = utils.create_sqlalchemy_engine(tracking.default_uri(tmp_path))
-    Base.metadata.create_all(engine)
-    settings = utils._get_alembic_config(str(engine.url))
-    with engine.begin() as connection:
-        settings.attributes["connection"] = connection
-        command.upgrade(settings, "451aebb31d03")  # MLflow 1.0
-    engine.dispose()
-    assert tracking.init(tmp_path, SETTINGS)["outcome"] == "ready"
-    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
-
-
-def test_a_moved_results_folder_is_refused_with_a_way_out(results: Path, tmp_path: Path) -> None:
-    """Its index would write artifacts to the old place."""
-    tracking.log_run(write_run(results), results, SETTINGS)
-    moved = results.rename(tmp_path / "moved")
-    ((word, _),) = tracking.sync(moved, SETTINGS).items()
-    assert word.startswith("unreachable: ") and "has moved" in word
-    assert not results.exists()
-
-
-def test_disabled_touches_nothing(tmp_path: Path) -> None:
-    off = Tracking(enabled=False)
-    record = write_run(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    assert tracking.init(tmp_path, off)["outcome"] == "disabled"
-    assert tracking.log_run(record, tmp_path, off) == "disabled"
-    assert tracking.sync(tmp_path, off) == {"disabled": ["rope/ours/0"]}
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_mlflow_is_imported_late_with_telemetry_off(results: Path) -> None:
-    code = """
-import os, sys
-from pathlib import Path
-os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = "7"
-from neuspring.experiments.tracking import log as tracking
-from neuspring.config import Tracking
-assert not {"mlflow", "pandas", "filelock"} & set(sys.modules)
-tracking.init(Path(sys.argv[1]), Tracking())
-import mlflow.telemetry.client
-print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"],
-      mlflow.telemetry.client.get_telemetry_client())
-"""
-    process = python(code, results, stderr=subprocess.PIPE)
-    text, errors = process.communicate(timeout=240)
-    assert (text.split(), errors) == (["true", "true", "7", "None"], "")

@@ -21,6 +21,9 @@ from typing import Any
 
 import pandas
 
+from neuspring.config import Tracking
+from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri
+
 STARTED, ENDED = "2026-11-21T10:00:00+00:00", "2026-11-21T10:05:30+00:00"
 STEPS = 1100
 """Points of the longest history: more than one call of `log_batch` takes."""
@@ -68,6 +71,27 @@ def write_run(results: Path, scenario: str = "rope", seed: int = 0, **changes: A
     path = folder / "run.json"
     path.write_text(json.dumps(record | changes))
     return path
+
+
+def client_of(results: Path) -> Any:
+    """A client of the results folder's own index."""
+    from mlflow import MlflowClient
+
+    return MlflowClient(tracking_uri=default_uri(results))
+
+
+def runs_of(results: Path) -> list[Any]:
+    """All runs in the results folder's own index."""
+    client = client_of(results)
+    return list(client.search_runs([client.get_experiment_by_name(Tracking().experiment).experiment_id]))
+
+
+def python(code: str, *arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """Start a process that can import neuspring, in an environment that says nothing of MLflow."""
+    environment = {name: value for name, value in os.environ.items() if name not in ENVIRONMENT}
+    environment["PYTHONPATH"] = str(Path(__file__).resolve().parents[2])
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, **options)
 
 
 def wait_until(done: Callable[[], bool], process: subprocess.Popen[Any], what: str) -> None:
@@ -125,16 +149,16 @@ class Postgres:
 
     @staticmethod
     def _program(name: str) -> str:
-        found = programs()
-        assert found is not None
-        return str(found / name)
+        folder = programs()
+        assert folder is not None
+        return str(folder / name)
 
 
 def programs() -> Path | None:
     """The folder of PostgreSQL's programs, those of the newest version: Debian leaves them out of PATH."""
     folders = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
-    found = shutil.which("initdb") or next((str(path / "initdb") for path in folders[::-1] if (path / "initdb").exists()), None)
-    return Path(found).resolve().parent if found else None
+    program = shutil.which("initdb") or next((str(path / "initdb") for path in folders[::-1] if (path / "initdb").exists()), None)
+    return Path(program).resolve().parent if program else None
 
 
 def without_postgres() -> str:

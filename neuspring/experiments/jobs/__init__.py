@@ -1,1 +1,5 @@
-"""The wrapper of every job of the workflow: its GPU lease, log, measured use, record, and the cause if it fails."""
+"""The wrapper of every job of the workflow. All other modules serve it.
+
+`wrapper`: one job, from its GPU lease to its record. `command`: run its command, follow its output. `gpus`: leases of GPUs.
+`faults`: why a command failed, and whether trying again can help. `watch`: time, memory and GPU use of a running command.
+"""

@@ -1,7 +1,7 @@
 """Why a command failed, and whether trying again can help.
 
-The verdict is read off the exit status and the end of the output, since most causes (CUDA, the system's out-of-memory killer, a
-database) end a process from outside Python.
+The exit status and the end of the output decide: most causes (CUDA, the system's out-of-memory killer, a database) end a process
+from outside Python.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Literal
 TAIL = 40
 """Lines of output that are searched for a cause."""
 WARNING = re.compile(r"\s*warning\b", re.IGNORECASE)
-"""What a command went on after is not what ended it."""
+"""A warning did not end the command, so it names no cause."""
 BAD_INPUT = 2
-"""Exit status of `neuspring` for input that only another input can mend."""
+"""Exit status of `neuspring` for input that it cannot use."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Fault:
     cause: str
     remedy: str = ""
     device: Literal["", "suspect", "lost"] = ""
-    """What it says about the GPUs that were held; suspect: a job of its own making can end like this on a sound GPU too."""
+    """What the failure says about the job's GPUs. suspect: an error of the job itself can look like this on a sound GPU."""
 
 
 FULL = Fault("permanent", "no space left on the disk", "Free some space; the same command continues.")
@@ -78,9 +78,9 @@ def diagnose(status: int, output: Sequence[str]) -> Fault | None:
     if number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         return STOPPED
     text = "\n".join(line for line in output[-TAIL:] if not WARNING.match(line))
-    named = next((fault for pattern, fault in PATTERNS if re.search(pattern, text, re.IGNORECASE)), None)
-    if named:
-        return named
+    for pattern, fault in PATTERNS:
+        if re.search(pattern, text, re.IGNORECASE):
+            return fault
     if status == BAD_INPUT:
         return INPUT
     if number == signal.SIGKILL:
@@ -100,7 +100,7 @@ def not_started(error: OSError) -> tuple[int, Fault]:
 
 
 def last_words(output: Sequence[str]) -> str:
-    """The last line of the output that says something, short."""
+    """The last line of the output that names an error, else the last line; shortened."""
     lines = [line.strip() for line in output if line.strip()]
     words = [line for line in lines if not WARNING.match(line)]
     errors = [line for line in words if "error" in line.lower() or "exception" in line.lower()]

@@ -15,12 +15,12 @@ import psutil
 from neuspring.experiments.jobs import gpus
 
 INTERVAL, MOST = 1.0, 120
-"""s between samples at first; the number of rows at which every second one is dropped and the interval doubles."""
+"""s between the first samples; the number of rows at which every second one is dropped and the interval doubles."""
 MIB = 2**20
 
 
 class Watch:
-    """Samples a process tree and GPUs in a thread, from `with` to its end; `facts` are the fields of an `Attempt`."""
+    """Samples a process tree and GPUs in a thread, for the length of a `with` block."""
 
     def __init__(self, pid: int, devices: Sequence[str]) -> None:
         self._pid, self._devices = pid, tuple(devices)
@@ -40,10 +40,10 @@ class Watch:
         self._thread.join()
 
     def facts(self) -> dict[str, Any]:
-        """Once the command has been waited for: the fields of an `Attempt` from `peak_memory_mb` on."""
-        # Between two samples much can happen; the kernel remembers the largest of the ended processes.
+        """The fields of an `Attempt` that describe the use of the machine. Call this after the block."""
+        # Samples miss short peaks; the kernel remembers the peak of the largest ended process.
         largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 if sys.platform != "darwin" else MIB)
-        used = [row[3] for row in self._rows if row[3] is not None]
+        shares = [row[3] for row in self._rows if row[3] is not None]
         memory = [row[4] for row in self._rows if row[4] is not None]
         return {
             "peak_memory_mb": round(max(self._peak, largest), 1),
@@ -51,7 +51,7 @@ class Watch:
             "samples": self._rows,
             "device_names": self._names,
             "peak_gpu_memory_mb": max(memory) if memory else None,
-            "gpu_utilisation": round(sum(used) / len(used), 1) if used else None,
+            "gpu_utilisation": round(sum(shares) / len(shares), 1) if shares else None,
         }
 
     def _sample(self) -> None:
@@ -88,7 +88,7 @@ class Watch:
         return handles
 
     def _tree(self) -> tuple[float, float]:
-        """(resident MiB, CPU seconds) of the process and its children, ended ones included in the latter."""
+        """(resident MiB, CPU seconds) of the process and its children. The seconds include ended children."""
         memory = 0.0
         with contextlib.suppress(psutil.Error):
             root = psutil.Process(self._pid)
@@ -101,7 +101,7 @@ class Watch:
 
 
 def _gpu(library: Any, handles: Sequence[Any]) -> tuple[float | None, float | None]:
-    """(mean utilisation %, memory in use MiB) of the held devices."""
+    """(mean utilization %, memory in use MiB) of the leased devices."""
     if not handles:
         return None, None
     try:

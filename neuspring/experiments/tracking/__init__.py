@@ -1,1 +1,5 @@
-"""MLflow as an index of the run records. Only this package imports it."""
+"""MLflow as an index of the run records. No other package imports mlflow.
+
+`log`: create the index (`init`), log a run (`log_run`), log all runs that are missing (`sync`). `payload`: what is sent for a run.
+`store`: where the index is, and how it is created. `query`: complete runs as plain data. `compare`: the runs of two commits.
+"""

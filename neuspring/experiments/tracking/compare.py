@@ -1,7 +1,7 @@
-"""The runs of two commits beside each other, from MLflow: paired differences of scores and times, and what else differs.
+"""Compare the runs of two commits in MLflow: paired differences of scores and times, and what else differs.
 
-A run belongs to the commit that scored it; its earlier stages may be an older one's, if their code is the same. Results that both
-commits made alike are one run of both. An index that was rebuilt from the files knows the newest commit of a run alone.
+A run belongs to the commit that scored it. Its earlier stages may have been run by an older commit with the same code. Results that
+are equal in both commits are one run of both. An index that was rebuilt from the files knows only the newest commit of a run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neuspring.scores.metrics import TASKS, UNITS
 
 DIRTY = "-dirty"
 SECONDS = "seconds"
-"""The `task` of timings, whose `metric` is the stage."""
+"""The `task` of timings; their `metric` is the stage."""
 KEYS = ("method", "task", "metric")
 MEANS = ("mean_first", "mean_second")
 INTERVALS = ("difference", "low", "high", "relative", "scenarios", "ratio", "ratio_low", "ratio_high")
@@ -82,16 +82,16 @@ def _newest(runs: list[LoggedRun], commit: str) -> dict[tuple[str, str, int], Lo
 
 def _resolve(runs: list[LoggedRun], text: str) -> str:
     """The one known commit that begins with `text` (before `-dirty`)."""
-    known = Counter(commit for run in runs for commit in run.commits if commit)
+    counts = Counter(commit for run in runs for commit in run.commits if commit)
     stem, dirty = text.removesuffix(DIRTY), text.endswith(DIRTY)
-    found = [name for name in known if name.startswith(stem) and name.endswith(DIRTY) == dirty] if stem else []
-    if text in known or len(found) == 1:
-        return text if text in known else found[0]
-    latest = {commit: max(run.commits[commit] for run in runs if commit in run.commits) for commit in known}
-    recent = sorted(known, key=lambda commit: latest[commit], reverse=True)[:LISTED]
-    listed = ", ".join(f"{name} ({known[name]} run{'s' * (known[name] > 1)})" for name in recent) or "none"
-    rule = "must begin the name of one commit only" if found else "this commit must have complete runs in MLflow"
-    raise InputError(f"commit {text!r}", rule, ", ".join(found) or "none", f"Known, newest first: {listed}.")
+    matches = [name for name in counts if name.startswith(stem) and name.endswith(DIRTY) == dirty] if stem else []
+    if text in counts or len(matches) == 1:
+        return text if text in counts else matches[0]
+    latest = {commit: max(run.commits[commit] for run in runs if commit in run.commits) for commit in counts}
+    recent = sorted(counts, key=lambda commit: latest[commit], reverse=True)[:LISTED]
+    listed = ", ".join(f"{name} ({counts[name]} run{'s' * (counts[name] > 1)})" for name in recent) or "none"
+    rule = "must begin the name of one commit only" if matches else "this commit must have complete runs in MLflow"
+    raise InputError(f"commit {text!r}", rule, ", ".join(matches) or "none", f"Known, newest first: {listed}.")
 
 
 def _differences(pairs: list[Pair], first: str, second: str) -> pd.DataFrame:
@@ -100,26 +100,25 @@ def _differences(pairs: list[Pair], first: str, second: str) -> pd.DataFrame:
     for method, part in scores.groupby("method", sort=False):
         # To the bootstrap the commits are what methods are in a table.
         part = part.assign(method=part["commit"])
-        found = paired_differences(part, first)
-        for row in found.to_dict("records"):
-            here = part[(part["task"] == row["task"]) & (part["metric"] == row["metric"])]
-            wide = here.pivot_table(index=["scenario", "seed"], columns="commit", values="value").dropna()
-            means = wide.groupby("scenario").mean().mean()
-            own = {"method": method, "unit": _unit(str(row["task"]), str(row["metric"])), "first": first, "second": second}
-            rows.append(row | own | {"pairs": len(wide), "mean_first": means[first], "mean_second": means[second]})
+        for row in paired_differences(part, first).to_dict("records"):
+            values = part[(part["task"] == row["task"]) & (part["metric"] == row["metric"])]
+            by_commit = values.pivot_table(index=["scenario", "seed"], columns="commit", values="value").dropna()
+            means = by_commit.groupby("scenario").mean().mean()
+            row |= {"method": method, "unit": _unit(str(row["task"]), str(row["metric"])), "first": first, "second": second}
+            rows.append(row | {"pairs": len(by_commit), "mean_first": means[first], "mean_second": means[second]})
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def _scores(pairs: list[Pair], first: str, second: str) -> Iterator[tuple[object, ...]]:
-    """Rows of scores and times of the pairs that succeeded in both. Equal times are one measurement: the stage ran once."""
+    """Rows of scores and times of the pairs that succeeded in both. Equal times are left out: the stage ran only once."""
     for a, b in pairs:
         if (a.status, b.status) != ("ok", "ok"):
             continue
         for commit, run, other in ((first, a, b), (second, b, a)):
             for name, value in run.metrics.items():
                 task, _, metric = name.partition(".")
-                again = task == SECONDS and value != other.metrics.get(name)
-                if again or (task in TASKS and metric in UNITS and math.isfinite(value)):
+                ran_again = task == SECONDS and value != other.metrics.get(name)
+                if ran_again or (task in TASKS and metric in UNITS and math.isfinite(value)):
                     yield commit, run.scenario, run.seed, run.method, task, metric, value
 
 
@@ -128,7 +127,7 @@ def _unit(task: str, metric: str) -> str:
 
 
 def to_markdown(comparison: Comparison) -> str:
-    """Everything that a reader must know of two commits, as Markdown; errors in mm."""
+    """A comparison as Markdown; errors in mm."""
     (first, second), pairs = comparison.commits, comparison.pairs
     same = sum(a.run_key == b.run_key for a, b in pairs)
     failed = [(a, b) for a, b in pairs if "failed" in (a.status, b.status)]
@@ -139,7 +138,7 @@ def to_markdown(comparison: Comparison) -> str:
     else:
         lines += ["", "No pair succeeded in both: nothing to compare."]
     lines += _other_lines(pairs)
-    lines += _list("Failed, and not in the table", [f"{_name(a)}: {_said(a, first)}, {_said(b, second)}" for a, b in failed])
+    lines += _list("Failed, and not in the table", [f"{_name(a)}: {_outcome(a, first)}, {_outcome(b, second)}" for a, b in failed])
     for commit, runs in zip(comparison.commits, comparison.only, strict=True):
         lines += _list(f"Only in {_short(commit)}", [_name(run) for run in runs])
     return "\n".join([*lines, *_parameter_lines(pairs, _short(first), _short(second))]) + "\n"
@@ -169,7 +168,7 @@ def _cells(row: Any) -> list[str]:
 
 
 def _other_lines(pairs: list[Pair]) -> list[str]:
-    """What differs beside the code."""
+    """What differs besides the code: data and devices."""
     data = sorted({a.scenario for a, b in pairs if a.data_digest != b.data_digest})
     devices = Counter((a.device, b.device) for a, b in pairs if a.device != b.device)
     lines = []
@@ -182,7 +181,7 @@ def _other_lines(pairs: list[Pair]) -> list[str]:
 
 
 def _parameter_lines(pairs: list[Pair], first: str, second: str) -> list[str]:
-    """Settings that differ. Parameters with `.result.` in their names are facts that came out."""
+    """Settings that differ. Parameters with `.result.` in their names are results, not settings."""
     changed: dict[tuple[str, str, str], Counter[str]] = {}
     for a, b in pairs:
         for name in sorted(a.params.keys() | b.params.keys()):
@@ -206,7 +205,7 @@ def _name(run: LoggedRun) -> str:
     return f"{run.scenario} / {run.method} / seed {run.seed}"
 
 
-def _said(run: LoggedRun, commit: str) -> str:
+def _outcome(run: LoggedRun, commit: str) -> str:
     return f"{_short(commit)} {run.status}" + (f" ({run.reason})" if run.reason else "")
 
 

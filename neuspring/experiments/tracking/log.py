@@ -4,7 +4,7 @@ Only the tracking modules import mlflow, and only when it is used. An MLflow, ne
 becomes the outcome `unreachable: <reason>` and a warning, and `sync` logs the run later.
 
 A run in MLflow is complete when it carries the tag `logged = complete`, which is set after everything else was sent. A run
-without that tag, whose record's lock (`<results>/.locks/<run key>.lock`) nobody holds, is what a killed logger left behind.
+without that tag was left behind by a killed logger, if nobody holds the lock of its record (`<results>/.locks/<run key>.lock`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, TypeVar
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.core.uri import masked
-from neuspring.experiments.tracking.payload import Payload, RunRecord, cut, milliseconds, payload
+from neuspring.experiments.tracking.payload import Payload, cut, milliseconds, payload
 from neuspring.experiments.tracking.query import AGAIN, is_complete, search
 from neuspring.experiments.tracking.store import ARTIFACTS, connect, default_uri, lock, lock_path, prepare, uri_of
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RunRecord", "default_uri", "init", "log_run", "sync"]
 T = TypeVar("T")
-RECORD, OUTCOME = "run.json", "mlflow.txt"
-"""A run's record, and beside it the outcome of logging it, which the workflow's rule writes."""
+OUTCOME = "mlflow.txt"
+"""The outcome of logging a record, beside it; the workflow's rule writes it."""
 METRICS_PER_CALL, PARAMS_PER_CALL = 1000, 100
 """Limits of MLflow's API."""
 
@@ -64,7 +65,7 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     run_json, results = Path(run_json), Path(results)
     record = RunRecord.load(run_json)
     try:
-        # Held to the end, not only while the run is created: a held lock is how others tell a live logger from a killed one.
+        # Locked to the end, not only while the run is created: the lock tells a live logger from a killed one.
         with lock(lock_path(results, record.run_key)):
             client, experiment = connect(results, settings)
             return _log(client, experiment, record, run_json, results)
@@ -77,12 +78,11 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
 def sync(
     results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None, under: Path | None = None
 ) -> dict[str, list[str]]:
-    """Bring the index up to date with every run.json under `results`, or under its folder `under`; on an empty database this
-    rebuilds it.
+    """Log every run.json under `results`, or under its folder `under`, that MLflow lacks; an empty database is rebuilt like this.
 
-    Also closes, as KILLED, the runs that killed loggers left RUNNING, and corrects the mlflow.txt beside a record that says
-    that it was not logged. `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged"
-    (details on stderr) and "closed" (leftovers).
+    Runs that killed loggers left RUNNING are closed as KILLED. An mlflow.txt beside a record that says "unreachable" is corrected.
+    `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged" (details on stderr) and
+    "closed" (leftovers).
     """
     results, under = Path(results).resolve(), Path(under or results).resolve()
     if not under.is_relative_to(results):
@@ -105,9 +105,9 @@ def sync(
             _warn(f"{name} is not logged: {error}")
             outcome = "damaged"
         note(name, outcome)
-        said = path.with_name(OUTCOME)
-        if outcome in ("logged", "already logged") and said.is_file() and said.read_text().startswith("unreachable"):
-            write_text(said, f"{outcome}\n")
+        file = path.with_name(OUTCOME)
+        if outcome in ("logged", "already logged") and file.is_file() and file.read_text().startswith("unreachable"):
+            write_text(file, f"{outcome}\n")
         if outcome.startswith("unreachable"):
             # One bad run must not stop the others, but a server that is down must not cost its timeout once per run.
             down = _close_leftovers(results, settings, note)
@@ -118,11 +118,11 @@ def sync(
 
 
 def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path, results: Path) -> str:
-    """Log a record whose lock is held."""
-    known = search(client, experiment, run_key=record.run_key)
-    complete = next(filter(is_complete, known), None)
-    # A killed logger may also have ended its run and died before the last tag: then it is FINISHED, but not complete.
-    for run in known:
+    """Log a record whose lock the caller holds."""
+    runs = search(client, experiment, run_key=record.run_key)
+    complete = next(filter(is_complete, runs), None)
+    # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
+    for run in runs:
         if not is_complete(run) and "superseded" not in run.data.tags:
             _close(client, run)
     if complete:
@@ -195,8 +195,8 @@ def _records(results: Path) -> Iterator[Path]:
     """Every run.json under `results`, in order, but not the copies among MLflow's artifacts, and no hidden folders."""
     for folder, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
-        if RECORD in files:
-            yield Path(folder) / RECORD
+        if RUN_RECORD in files:
+            yield Path(folder) / RUN_RECORD
 
 
 def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str], None]) -> str | None:

@@ -2,72 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from pydantic import AwareDatetime, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
-
-from neuspring.config.types import Name
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import FOLDER as JOBS
 from neuspring.core.job_records import JobRecord
-from neuspring.core.records import RECORD_FORMAT, read_json
+from neuspring.core.run_record import RunRecord
 
 PARAM_LENGTH, TAG_LENGTH = 500, 5000
 """These keep MLflow's tables readable. The full text stays in run.json."""
 METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
-RUN_KEY = re.compile(r"[0-9a-f]{8,64}")
 SAMPLES = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
 """Columns of a job record's samples, after the time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunRecord:
-    """What the index needs of results/{scenario}/{method}/{seed}/run.json. Other keys are the writer's own and are not read."""
-
-    __pydantic_config__ = ConfigDict(extra="ignore", strict=True)
-    run_key: Annotated[str, StringConstraints(pattern=f"^{RUN_KEY.pattern}$")]
-    scenario: Name
-    source: str
-    category: str
-    method: Name
-    variant: dict[str, str | bool | int | float | None]
-    seed: int
-    status: Literal["ok", "failed"]
-    reason: str
-    attempt: Annotated[int, Field(ge=1)]
-    commit: Annotated[str, StringConstraints(pattern=r"^[\w.-]{0,100}$")]
-    data_digest: str
-    device: str
-    started: AwareDatetime
-    ended: AwareDatetime
-    params: dict[str, Any]
-    timings: dict[str, float]
-    scores_file: str | None = None
-    """None or empty where a failed run has no scores."""
-    histories: dict[str, str] = field(default_factory=dict)
-    artifacts: dict[str, list[str]] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """The run's name in MLflow."""
-        return f"{self.scenario}/{self.method}/{self.seed}"
-
-    @classmethod
-    def load(cls, path: Path) -> RunRecord:
-        """Read a record. Raises InputError if it is missing or damaged."""
-        try:
-            return TypeAdapter(cls).validate_json(json.dumps(read_json(path, RECORD_FORMAT)), strict=True)
-        except ValidationError as error:
-            problems = [f"{'.'.join(map(str, p['loc']))}: {p['msg'].lower()}, received {p['input']!r:.80}" for p in error.errors()]
-            raise InputError(path, "\n  " + "\n  ".join(problems), remedy="Delete it and run again.") from error
 
 
 class Point(NamedTuple):
@@ -97,22 +50,22 @@ def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
     files: list[tuple[Path, str | None]] = [(run_json, None)]
     for target, names in record.artifacts.items():
         files += [(_named_file(run_json, folder / name), target) for name in names]
-    taken = [(target, path.name) for path, target in files]
-    if doubled := [pair for pair in taken if taken.count(pair) > 1]:
-        raise InputError(run_json, "artifacts of one folder must have different file names", doubled[0])
+    targets = [(target, path.name) for path, target in files]
+    if doubles := [target for target in targets if targets.count(target) > 1]:
+        raise InputError(run_json, "artifacts of one folder must have different file names", doubles[0])
     metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
     for name in {point.name for point in metrics}:
         _checked_name(run_json, name)
     return Payload(tags=_tags(record), params=_params(record, run_json), metrics=metrics, files=files)
 
 
-def milliseconds(time: datetime) -> int:
-    """ms since 1970, as MLflow counts."""
-    return round(time.timestamp() * 1000)
+def milliseconds(time: str) -> int:
+    """ms since 1970, as MLflow counts, of an ISO 8601 time with a zone."""
+    return round(datetime.fromisoformat(time).timestamp() * 1000)
 
 
 def cut(text: str, length: int) -> str:
-    """The text, its end replaced by dots where it is longer than `length`."""
+    """The text; one longer than `length` is cut short and ends in dots."""
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
@@ -145,28 +98,29 @@ def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
 def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Point]:
     """Use of processor, memory and GPU as `system/{stage}.{what}`, which MLflow shows as system metrics; steps are seconds.
 
-    From the last attempt of each job, the one that made the result. Jobs without a record, as of stages run by hand, have none.
+    They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
+    metrics.
     """
     for stage, path in _jobs(record, run_json, results).items():
         attempts = JobRecord.load(path).attempts if path.is_file() else []
         for attempt in attempts[-1:]:
-            start = milliseconds(datetime.fromisoformat(attempt.started))
+            start = milliseconds(attempt.started)
             for seconds, *values in attempt.samples:
                 for what, value in zip(SAMPLES, values, strict=True):
                     if seconds is not None and value is not None:
                         yield Point(f"system/{stage}.{what}", value, round(seconds), start + round(1000 * seconds))
-            whole = {
+            totals = {
                 "peak_memory_mb": attempt.peak_memory_mb,
                 "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
                 "mean_gpu_percent": attempt.gpu_utilisation,
             }
-            for what, value in whole.items():
+            for what, value in totals.items():
                 if value is not None:
                     yield Point(f"system/{stage}.{what}", value, 0, start)
 
 
 def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
-    """Stage -> where its job record lies, if it has one: jobs are filed by stage, and then as their results are."""
+    """Stage -> path of its job record, which need not exist: jobs/<rule>/, then the path of the results."""
     folders = {"score": run_json.parent}
     folders |= {Path(name).stem: run_json.parent / Path(name).parent for name in record.artifacts.get("records", [])}
     jobs = {}
@@ -176,7 +130,7 @@ def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
             scenario, row, seed = parts
             # A search's row is its folder without `search-`.
             row = row.removeprefix("search-") if stage == "search" else row
-            # A baseline's model has a rule of its own for its rollout.
+            # A trained baseline writes the same rollout.json as a twin, but its rule is called predict.
             rule = "predict" if stage == "rollout" and "model" in record.variant else stage
             jobs[stage] = results / JOBS / rule / scenario / row / f"{seed}.json"
     return jobs

@@ -50,8 +50,8 @@ def logged_runs(results: Path, settings: Tracking) -> list[LoggedRun]:
     """All complete runs of the experiment. Raises InputError where MLflow does not answer or has no such experiment."""
     uri = masked(uri_of(Path(results), settings))
     try:
-        found = find(Path(results), settings)
-        runs = search(*found, logged="complete") if found else None
+        store = find(Path(results), settings)
+        runs = search(*store, logged="complete") if store else None
     except Exception as error:
         reason = masked(str(error).partition("\n")[0])
         raise InputError(

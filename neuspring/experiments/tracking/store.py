@@ -27,8 +27,8 @@ ENVIRONMENT = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
-"""Defaults set before mlflow is imported, where the user has not set them. No telemetry; no tracebacks beside our own one-line
-warnings; and a server that is away costs seconds, where MLflow's own defaults (7 retries of 120 s) would cost minutes."""
+"""Set before mlflow is imported, where the user has not set them: no telemetry; no tracebacks beside our own one-line warnings;
+and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 PATIENCE = 600.0
@@ -86,7 +86,7 @@ def lock(path: Path, timeout: float = PATIENCE) -> BaseFileLock:
 
 
 def _set_environment() -> None:
-    """Call this before every import of mlflow, which reads these once."""
+    """Set ENVIRONMENT. Call this before every import of mlflow, which reads it once."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
 

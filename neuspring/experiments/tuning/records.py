@@ -1,13 +1,13 @@
-"""Records of trials and of a whole study, in the form of run records: `neuspring sync` sends them to MLflow as they are.
+"""Run records of trials and of a whole sweep; `neuspring sync` sends them to MLflow like those of any run.
 
-A trial's record is made from the study's storage alone, so one that a killed worker did not write is made later.
+A trial's record is made from the sweep's storage alone, so one that a killed worker did not write is made later.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,19 @@ from typing import Any
 import pandas as pd
 
 from neuspring.config.tuning import Tune
-from neuspring.core.files import write_table, write_text
-from neuspring.core.records import RECORD_FORMAT, canonical, read_json
+from neuspring.core.files import write_table
+from neuspring.core.records import canonical
+from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
 from neuspring.experiments.tuning.space import Plan
 from neuspring.experiments.tuning.store import Slot
 
-RECORD = "run.json"
 FACTS, VALUES = "facts", "values"
-"""Attributes of a trial: how it went, and its values, of the baseline those too that the space cannot hold."""
+"""Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
 SOURCE = "tune"
+KEYED = ("scenario", "source", "category", "method", "variant", "seed", "status", "reason", "data_digest", "params")
+"""Fields that the key of a record is made of, beside its scores and results."""
+UNKNOWN = "0" * 8
+"""Stands for a key until the record is complete."""
 
 
 def label(value: Any) -> Any:
@@ -36,91 +40,92 @@ def labels(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: label(value) for name, value in values.items()}
 
 
-def write_trial(plan: Plan, definition: Mapping[str, Any], slot: Slot, folder: Path) -> Path:
-    """Write trials/<slot>/run.json and what it names, unless it is there; returns its path."""
+def write_trial(plan: Plan, definition: Mapping[str, Any], slot: Slot, folder: Path) -> None:
+    """Write trials/<slot>/run.json and the files that it names, unless they are there."""
     trial, tune = slot.trials[-1], plan.tune
     facts, values = trial.user_attrs.get(FACTS, {}), trial.user_attrs.get(VALUES, {})
-    losses = facts.get("losses", {})
-    rows = {"loss": trial.value} if slot.state == "complete" else {}
-    rows |= {f"loss/{name}": value for name, value in losses.items()}
+    scores = {"loss": trial.value} if slot.state == "complete" else {}
+    scores |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
     steps = sorted(trial.intermediate_values.items())
-    content = {
-        "scenario": f"trial-{slot.number}",
-        "variant": {"study": tune.study, "method": tune.method, "state": slot.state, **labels(values)},
-        "status": "failed" if slot.state == "failed" else "ok",
-        "reason": slot.reason,
-        "params": labels(plan.flat(values)),
-        **_common(tune, definition),
-    }
-    place = folder / "trials" / str(slot.number)
-    ended = trial.datetime_complete or trial.datetime_start
-    record = content | {
-        "attempt": len(slot.trials),
-        "commit": facts.get("commit", ""),
-        "device": facts.get("device", ""),
-        "started": facts.get("started", _utc(trial.datetime_start)),
-        "ended": facts.get("ended", _utc(ended)),
-        "timings": facts.get("seconds", {}),
-        "histories": {"steps": "history.parquet"},
-        "artifacts": {},
-    }
     history = pd.DataFrame([(step, "tail_loss", value) for step, value in steps], columns=["step", "metric", "value"])
-    return _write(place, record, [content, rows, steps], rows, {"history.parquet": history})
-
-
-def write_study(
-    tune: Tune, definition: Mapping[str, Any], slots: Sequence[Slot], rows: Mapping[str, float], files: Sequence[Path], folder: Path
-) -> Path:
-    """Write the run.json of a study: `rows` are its figures, `files` its tables and pictures, which lie in `folder`."""
-    facts = [slot.trials[-1].user_attrs.get(FACTS, {}) for slot in slots]
-    known = [fact for fact in facts if fact] or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
-    states = [slot.state for slot in slots]
-    content = {
-        "scenario": "study",
-        "variant": {"study": tune.study, "method": tune.method, "pruner": tune.pruner},
-        "status": "ok" if "complete" in states else "failed",
-        "reason": "" if "complete" in states else "no trial has finished",
-        "params": {"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
+    record = RunRecord(
+        run_key=UNKNOWN,
+        scenario=f"trial-{slot.number}",
+        variant={"study": tune.study, "method": tune.method, "state": slot.state, **labels(values)},
+        status="failed" if slot.state == "failed" else "ok",
+        reason=slot.reason,
+        params=labels(plan.flat(values)),
+        attempt=len(slot.trials),
+        commit=facts.get("commit", ""),
+        device=facts.get("device", ""),
+        started=facts.get("started", _utc(trial.datetime_start)),
+        ended=facts.get("ended", _utc(trial.datetime_complete or trial.datetime_start)),
+        timings=facts.get("seconds", {}),
+        histories={"steps": "history.parquet"},
         **_common(tune, definition),
-    }
-    record = content | {
-        "attempt": 1,
-        "commit": known[-1].get("commit", ""),
-        "device": known[-1].get("device", ""),
-        "started": min(fact["started"] for fact in known),
-        "ended": max(fact["ended"] for fact in known),
-        "timings": {name: sum(fact["seconds"].get(name, 0.0) for fact in known) for name in ("search", "fit")},
-        "histories": {},
-        "artifacts": {
+    )
+    _write(record, scores, steps, folder / "trials" / str(slot.number), {"history.parquet": history})
+
+
+def write_sweep(
+    tune: Tune,
+    definition: Mapping[str, Any],
+    slots: Sequence[Slot],
+    scores: Mapping[str, float],
+    files: Sequence[Path],
+    folder: Path,
+) -> None:
+    """Write the run.json of a sweep. `files`, its tables and pictures, lie in `folder`."""
+    facts = [slot.trials[-1].user_attrs[FACTS] for slot in slots if slot.trials[-1].user_attrs.get(FACTS)]
+    facts = facts or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
+    complete = any(slot.state == "complete" for slot in slots)
+    record = RunRecord(
+        run_key=UNKNOWN,
+        scenario="study",
+        variant={"study": tune.study, "method": tune.method, "pruner": tune.pruner},
+        status="ok" if complete else "failed",
+        reason="" if complete else "no trial has finished",
+        params={"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
+        attempt=1,
+        commit=facts[-1].get("commit", ""),
+        device=facts[-1].get("device", ""),
+        started=min(fact["started"] for fact in facts),
+        ended=max(fact["ended"] for fact in facts),
+        timings={name: sum(fact["seconds"].get(name, 0.0) for fact in facts) for name in ("search", "fit")},
+        artifacts={
             "tables": [path.name for path in files if path.suffix != ".png"],
             "plots": [path.name for path in files if path.suffix == ".png"],
         },
-    }
-    decided = [[slot.number, slot.state, slot.trials[-1].value] for slot in slots]
-    return _write(folder, record, [content, rows, decided], rows, {})
+        **_common(tune, definition),
+    )
+    states = [[slot.number, slot.state, slot.trials[-1].value] for slot in slots]
+    _write(record, scores, states, folder, {})
 
 
 def _common(tune: Tune, definition: Mapping[str, Any]) -> dict[str, Any]:
-    digest = hashlib.sha256(canonical(definition.get("frames", {})).encode()).hexdigest()
-    return {"source": SOURCE, "category": SOURCE, "method": f"tune-{tune.study}", "seed": tune.seed, "data_digest": digest}
+    return {
+        "source": SOURCE,
+        "category": SOURCE,
+        "method": f"tune-{tune.study}",
+        "seed": tune.seed,
+        "data_digest": hashlib.sha256(canonical(definition.get("frames", {})).encode()).hexdigest(),
+        "scores_file": "scores.parquet",
+    }
 
 
-def _write(
-    folder: Path, record: Mapping[str, Any], content: Any, rows: Mapping[str, Any], tables: Mapping[str, pd.DataFrame]
-) -> Path:
-    path = folder / RECORD
-    # The content without timings: the same results have the same key.
-    key = hashlib.sha256(canonical(content).encode()).hexdigest()
-    if path.is_file() and read_json(path, RECORD_FORMAT)["run_key"] == key:
-        return path
-    scores = pd.DataFrame([("tail", name, value) for name, value in rows.items()], columns=["task", "metric", "value"])
-    for name, table in {"scores.parquet": scores, **tables}.items():
-        write_table(table.astype({"value": "float64"}), folder / name)
-    whole = {"format": RECORD_FORMAT, "run_key": key, "scores_file": "scores.parquet", **record}
-    write_text(path, json.dumps(whole, indent=1, sort_keys=True, allow_nan=False) + "\n")
-    return path
+def _write(record: RunRecord, scores: Mapping[str, Any], results: Any, folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
+    """Write a record under its key, with its scores and tables, unless a record of that key is there."""
+    path = folder / RUN_RECORD
+    # Without timings: the same results have the same key.
+    key = key_of({name: getattr(record, name) for name in KEYED}, scores, results)
+    if path.is_file() and RunRecord.load(path).run_key == key:
+        return
+    table = pd.DataFrame([("tail", name, value) for name, value in scores.items()], columns=["task", "metric", "value"])
+    for name, values in {"scores.parquet": table, **tables}.items():
+        write_table(values.astype({"value": "float64"}), folder / name)
+    replace(record, run_key=key).save(path)
 
 
-def _utc(moment: datetime | None) -> str:
-    """A time of Optuna's, which has none of the zone, in UTC, ISO 8601; now if there is none."""
-    return (moment or datetime.now()).astimezone(UTC).isoformat(timespec="seconds")
+def _utc(time: datetime | None) -> str:
+    """A time of Optuna's, which is local and names no zone, in UTC, ISO 8601; now if there is none."""
+    return (time or datetime.now()).astimezone(UTC).isoformat(timespec="seconds")

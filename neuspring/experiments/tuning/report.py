@@ -1,4 +1,4 @@
-"""What a study found: a table of its trials, the best one as an overlay, pictures, a summary; the last is written last."""
+"""The report of a sweep: a table of its trials, the best one as an overlay, pictures, and a summary, which is written last."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_text
 from neuspring.experiments.benchmark import read_methods, read_searches
-from neuspring.experiments.tuning.records import FACTS, VALUES, labels, write_study, write_trial
-from neuspring.experiments.tuning.space import CLUSTERS, Plan
+from neuspring.experiments.tuning.records import FACTS, VALUES, labels, write_sweep, write_trial
+from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan
 from neuspring.experiments.tuning.store import DEFINITION, WORKER, Slot, Store, slots
 from neuspring.report.tables.summary import markdown
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from optuna.study import Study
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
+SHARED = ("simulation", "losses", "released_quirks")
+"""Sections that belong to no row: an overlay sets them for all methods."""
 SHOWN = 10
 """Trials in the summary's table."""
 TABLES = ("trials.csv", "best.yaml", *TABLES_OF_ROWS.values())
@@ -41,7 +43,7 @@ PICTURES = {
 
 @dataclass(frozen=True)
 class Findings:
-    """A study as it is read."""
+    """A sweep as it is read."""
 
     plan: Plan
     slots: tuple[Slot, ...]
@@ -65,33 +67,35 @@ class Findings:
 
 
 def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> None:
-    """Sum up a study, finished or not, in `output`'s folder, which holds it. Raises InputError if there is none."""
+    """Sum up a sweep, finished or not. It lies in `output`'s folder. Raises InputError if there is none."""
     plan, folder = Plan.of(settings, tune, root), output.parent
     study = Store(folder, tune.storage, tune.study).load(plan.facts())
     definition = study.user_attrs[DEFINITION]
-    # Slots beyond a budget that was lowered count as well: they are there.
-    found = tuple(slots(study).values())
-    findings = Findings(plan, found, _table(found, plan), _importances(study), tuple(definition["frames"]))
-    for slot in found:
+    # Trials beyond a `tune.trials` that was lowered count as well.
+    begun = tuple(slots(study).values())
+    findings = Findings(plan, begun, _table(begun, plan), _importances(study), tuple(definition["frames"]))
+    for slot in begun:
         if slot.state in ("complete", "pruned", "failed"):
             write_trial(plan, definition, slot, folder)
-    # None of an earlier report may stay beside this one's.
+    # No file of an earlier report may stay beside this one's.
     for name in (*TABLES, *PICTURES):
         (folder / name).unlink(missing_ok=True)
     write_text(folder / "trials.csv", findings.table.to_csv(index=False))
     write_best(findings, settings, folder, root)
-    _draw(findings, folder)
+    if findings.table["state"].isin(["complete", "pruned"]).any():
+        from neuspring.experiments.tuning import figures
+
+        figures.draw(study, folder, importances=bool(findings.importances))
     write_text(output, summary(findings, folder))
-    made = [folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file()]
-    best = findings.best
-    rows = {"best": best.trials[-1].value if best else None, "baseline": findings.baseline}
-    known = {name: value for name, value in rows.items() if value is not None}
-    write_study(tune, definition, found, known, [output, *made], folder)
+    files = [folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file()]
+    losses = {"best": findings.best.trials[-1].value if findings.best else None, "baseline": findings.baseline}
+    scores = {name: value for name, value in losses.items() if value is not None}
+    write_sweep(tune, definition, begun, scores, [output, *files], folder)
 
 
-def _table(found: Sequence[Slot], plan: Plan) -> pd.DataFrame:
+def _table(begun: Sequence[Slot], plan: Plan) -> pd.DataFrame:
     rows = []
-    for slot in found:
+    for slot in begun:
         trial = slot.trials[-1]
         facts = trial.user_attrs.get(FACTS, {})
         last = trial.intermediate_values[trial.last_step] if trial.last_step is not None else None
@@ -113,18 +117,17 @@ def _importances(study: Study) -> dict[str, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            found = optuna.importance.get_param_importances(study)
-        # Optuna's word for too few finished trials, or trials that are all alike.
-        except (ValueError, RuntimeError):
+            importances = optuna.importance.get_param_importances(study)
+        except (ValueError, RuntimeError):  # too few finished trials, or all of the same loss
             return {}
-    return {name: float(value) for name, value in found.items()} if any(found.values()) else {}
+    return {name: float(value) for name, value in importances.items()} if any(importances.values()) else {}
 
 
 def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -> None:
-    """best.yaml, an overlay with a new method row, and the tables that it names; nothing if no trial has finished.
+    """Write best.yaml, an overlay with a new method row, and the tables that it names; nothing if no trial has finished.
 
-    The new row is the varied one with the best trial's `fit` settings in its own; `search` settings and `clusters` make a new
-    search row. What belongs to no row (simulation, losses, quirks) is set for all methods.
+    The new method row is the varied one with the best trial's `fit` settings. Its `search` settings and `clusters` make a new
+    search row. Settings that belong to no row (simulation, losses, quirks) are set for all methods.
     """
     if findings.best is None:
         return
@@ -132,32 +135,32 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
     values = findings.best.trials[-1].user_attrs[VALUES]
     methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
     name = tuned_name(plan.tune)
-    own: dict[str, dict[str, Any]] = {"fit": {}, "search": {}, "simulation": {}, "losses": {}, "released_quirks": {}}
+    sections: dict[str, dict[str, Any]] = {name: {} for name in SECTIONS}
     for path, value in values.items():
         if path != CLUSTERS:
             *above, key = path.split(".")
-            place: dict[str, Any] = own
+            place: dict[str, Any] = sections
             for part in above:
                 place = place.setdefault(part, {})
             place[key] = value
-    text = f"{plan.tune.method}, tuned: trial {findings.best.number} of study {plan.tune.study}"
+    text = f"{plan.tune.method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"
     search, row = plan.method.search, plan.row
-    if own["search"] or CLUSTERS in values:
+    if sections["search"] or CLUSTERS in values:
         search = name
         clusters = values.get(CLUSTERS, row.clusters)
-        searches[search] = replace(row, clusters=clusters, settings=_merged(row.settings, own["search"]), description=text)
-    methods[name] = replace(plan.method, search=search, settings=_merged(plan.method.settings, own["fit"]), description=text)
+        searches[search] = replace(row, clusters=clusters, settings=_merged(row.settings, sections["search"]), description=text)
+    methods[name] = replace(plan.method, search=search, settings=_merged(plan.method.settings, sections["fit"]), description=text)
     _write_yaml(folder / "methods.yaml", {key: config.plain(value) for key, value in methods.items()})
     _write_yaml(folder / "searches.yaml", {key: config.plain(value) for key, value in searches.items()})
     overlay: dict[str, Any] = {"methods": [plan.tune.method, name], "compare_with": plan.tune.method, "tables": f"tables-{name}"}
     # Absolute: relative ones would start from the Snakefile.
     overlay |= {f"{table}_table": str((folder / name).resolve()) for table, name in TABLES_OF_ROWS.items()}
-    overlay |= {section: own[section] for section in ("simulation", "losses", "released_quirks") if own[section]}
+    overlay |= {section: sections[section] for section in SHARED if sections[section]}
     _write_yaml(folder / "best.yaml", overlay)
 
 
 def tuned_name(tune: Tune) -> str:
-    """The method row of a study's best trial."""
+    """The method row of a sweep's best trial."""
     return f"{tune.method}_{tune.study}"
 
 
@@ -171,36 +174,19 @@ def _write_yaml(path: Path, values: Mapping[str, Any]) -> None:
     write_text(path, yaml.safe_dump(dict(values), sort_keys=False, width=120))
 
 
-def _draw(findings: Findings, folder: Path) -> None:
-    from neuspring.experiments.tuning import figures
-
-    table, space = findings.table, findings.plan.tune.space
-    if not table["state"].isin(["complete", "pruned"]).any():
-        return
-    figures.history_figure(table, folder / "history.png")
-    figures.slices_figure(table, space, folder / "slices.png")
-    if findings.best is not None:
-        figures.parallel_figure(table, space, folder / "parallel.png")
-    if findings.importances:
-        figures.importances_figure(findings.importances, folder / "importances.png")
-    steps = {slot.number: sorted(slot.trials[-1].intermediate_values.items()) for slot in findings.slots}
-    if findings.plan.method.fit:
-        figures.steps_figure(table, steps, findings.scenes, findings.plan.epochs, folder / "steps.png")
-
-
 def summary(findings: Findings, folder: Path) -> str:
-    """The study in Markdown."""
+    """The sweep in Markdown."""
     plan, tune, best = findings.plan, findings.plan.tune, findings.best
     counts = {state: sum(slot.state == state for slot in findings.slots) for state in ("complete", "pruned", "failed", "running")}
     ended = counts["complete"] + counts["pruned"] + counts["failed"]
-    lines = [f"# Study {tune.study}: {tune.method} tuned", ""]
+    lines = [f"# Sweep {tune.study}: {tune.method} tuned", ""]
     how = f"{counts['complete']} finished, {counts['pruned']} pruned, {counts['failed']} failed"
     lines += [f"{ended} of {tune.trials} trials: {how}."]
     if counts["running"]:
         lines += [f"{counts['running']} more are running, or were left behind by a killed worker."]
     share, many = plan.base["fit"]["tail_fraction"], f"{len(findings.scenes)} scenario{'s' * (len(findings.scenes) > 1)}"
-    lines += ["", f"The loss, m², is that of the last {share:.0%} of the training frames, which neither search nor fit has seen;"]
-    lines += [f"mean over {many}: {', '.join(findings.scenes)}. Test frames were not read.", ""]
+    lines += ["", f"The loss, m², is that of the last {share:.0%} of the training frames, which neither search nor fit has seen."]
+    lines += [f"It is the mean over {many}: {', '.join(findings.scenes)}. Test frames were not read.", ""]
     codes = findings.table["code"].dropna().unique()
     if len(codes) > 1:
         lines += [f"Trials were made by {len(codes)} versions of the code (see trials.csv) and may not be comparable.", ""]
@@ -208,7 +194,7 @@ def summary(findings: Findings, folder: Path) -> str:
     lines += ["## Importance", ""]
     if findings.importances:
         lines += markdown(["Setting", "Importance"], [[name, f"{value:.2f}"] for name, value in findings.importances.items()])
-        lines += ["", "PED-ANOVA over finished trials; with few of them it says little.", ""]
+        lines += ["", "PED-ANOVA over finished trials. With few trials it says little.", ""]
     else:
         lines += ["Not computable: too few trials have finished, or they do not differ.", ""]
     lines += _trial_lines(findings)
@@ -231,7 +217,7 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
         lines += ["That is the unchanged configuration: no trial was better."]
     else:
         lines += [f"The unchanged configuration (trial 0): {baseline:.4e} m²; a ratio of {loss / baseline:.3f}."]
-    lines += ["The least of many losses on the same few frames is too good: compare the two methods on test frames.", ""]
+    lines += ["The smallest of many losses on the same few frames is optimistic: compare the two methods on test frames.", ""]
     values, unchanged = labels(best.trials[-1].user_attrs[VALUES]), labels(plan.baseline)
     lines += markdown(["Setting", "Best", "Unchanged"], [[name, _shown(values[name]), _shown(unchanged[name])] for name in values])
     lines += [
@@ -240,8 +226,8 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
         "",
     ]
     lines += ["```", f"snakemake ... --configfile <the benchmark's> {folder / 'best.yaml'}", "```", ""]
-    if shared := [name for name in values if name.split(".")[0] in ("simulation", "losses", "released_quirks")]:
-        lines += [f"It sets {', '.join(shared)} for both rows, since these belong to no method.", ""]
+    if shared := [name for name in values if name.split(".")[0] in SHARED]:
+        lines += [f"It sets {', '.join(shared)} for both rows: these settings belong to no method.", ""]
     return lines
 
 

@@ -1,7 +1,7 @@
-"""What a study varies: settings of one method and of its search, checked before the first trial.
+"""What a sweep varies: settings of one method and of its search, checked before the first trial.
 
-A trial's settings are the baseline's (the configuration, with the method's and its search row's own settings on top) with the
-trial's values on top. Nothing heavy is imported: the workflow makes a plan before any job exists.
+The baseline is the configuration with the settings of the method's row and of its search row on top. A trial puts its values on top
+of that. Nothing heavy is imported: the workflow makes a plan before any job exists.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from neuspring import config
 from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
+from neuspring.core.run_record import flat
 from neuspring.experiments.benchmark import fit_of, read_methods, read_searches, search_of
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
@@ -31,12 +32,12 @@ CLUSTERS = "clusters"
 FIXED = ("losses.chamfer", "losses.track", "fit.selection", "fit.tail_fraction", "released_quirks.frozen_loss_denominators")
 """The objective is measured with these, so all trials must share them."""
 MOST_COMBINATIONS = 256
-"""Of the ends of all ranges, checked before the first trial; of more, the lowest and highest."""
+"""Combinations of range ends that are checked before the first trial. If there are more, only all lowest and all highest ones."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A study with everything that it refers to."""
+    """A sweep with everything that it refers to."""
 
     tune: Tune
     method: Method
@@ -47,7 +48,7 @@ class Plan:
 
     @classmethod
     def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
-        """Check a study as far as it can be without data. Tables are read relative to `root`. Raises InputError."""
+        """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
         methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
         method = _row("tune.method", tune.method, methods, settings.method_table)
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
@@ -85,19 +86,19 @@ class Plan:
 
     @property
     def epochs(self) -> int:
-        """The most epochs that a trial may have; 1 for a method without first-order stage."""
+        """The most epochs that a trial can have; 1 for a method without first-order stage."""
         dimension = self.tune.space.get("fit.epochs")
         most = self.base["fit"]["epochs"] if dimension is None else max(_ends(dimension), default=0)
         return int(most) if self.method.fit else 1
 
     def facts(self) -> dict[str, Any]:
-        """What must not change while a study lasts, as plain values."""
+        """What must not change while a sweep lasts, as plain values."""
         space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
         return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": self.tune.seed}
 
     def flat(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All settings of a trial under their dotted names."""
-        return _flat(self.base) | dict(values)
+        return flat(self.base) | dict(values)
 
     def _require_setting(self, name: str) -> None:
         where, section = f"tune.space, {name}", name.partition(".")[0]
@@ -115,18 +116,18 @@ class Plan:
             raise InputError(where, f"method {self.tune.method} trains springs and reads no settings of a field")
 
     def _corners(self) -> Iterator[dict[str, Any]]:
-        """The baseline, every end of every dimension by itself, then combinations of ends: all if few, else lowest and highest."""
+        """The baseline, every end of every range by itself, then combinations of ends: all if they are few, else two."""
         ends = {name: _ends(dimension) for name, dimension in self.tune.space.items()}
         yield {}
         yield from ({name: value} for name, values in ends.items() for value in values)
         if math.prod(map(len, ends.values())) <= MOST_COMBINATIONS:
-            yield from (dict(zip(ends, chosen, strict=True)) for chosen in itertools.product(*ends.values()))
+            yield from (dict(zip(ends, values, strict=True)) for values in itertools.product(*ends.values()))
         else:
             yield from ({name: values[place] for name, values in ends.items()} for place in (0, -1))
 
 
 def is_whole(name: str) -> bool:
-    """Whether a setting with a range takes whole numbers only."""
+    """Whether a setting takes whole numbers only."""
     return name == CLUSTERS or float not in _kinds(_annotation(name))
 
 
@@ -140,13 +141,6 @@ def holds(dimension: Dimension, value: Any) -> bool:
     assert dimension.high is not None
     steps = 0.0 if dimension.step is None else (value - dimension.low) / dimension.step
     return dimension.low <= value <= dimension.high and math.isclose(steps, round(steps), abs_tol=1e-9)
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
 
 
 def _ends(dimension: Dimension) -> list[Any]:

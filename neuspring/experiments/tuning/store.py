@@ -1,22 +1,28 @@
-"""The study that workers share: an Optuna study in SQLite or PostgreSQL, and who works on which trial.
+"""The sweep that workers share: an Optuna study in SQLite or PostgreSQL, and who works on which trial.
 
-A study has slots 0 .. trials - 1; each is filled by one finished, pruned or failed trial. A worker takes the lowest free slot
-while it holds the study's lock, so that together workers make exactly as many trials as were asked for. A worker also holds a
-lock of its own as long as it lives. A trial that runs for a worker whose lock is free was left behind by a killed one: its slot
-becomes free again and keeps the values, so that fits continue from their checkpoints.
+A sweep has slots 0 .. trials - 1. Each is filled by one finished, pruned or failed trial. A worker takes the lowest free slot
+under the sweep's lock, so that together workers make exactly as many trials as were asked for. When a killed worker starts again,
+it frees the slot of the trial that it left running. The slot keeps its values, so that fits continue from their checkpoints.
+
+Optuna's own means do not give an exact number of trials. `MaxTrialsCallback` counts after a trial, when other workers have begun
+more. Its heartbeat notices a dead worker only after minutes, and never one that died before the first beat; a worker's number
+tells at once.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
+
+from filelock import FileLock
 
 from neuspring.core.errors import InputError
 from neuspring.core.records import canonical
+from neuspring.core.run_record import flat
 
 if TYPE_CHECKING:
     from optuna.pruners import BasePruner
@@ -24,148 +30,82 @@ if TYPE_CHECKING:
     from optuna.storages import RDBStorage
     from optuna.study import Study
     from optuna.trial import FrozenTrial, Trial
-    from sqlalchemy import Engine
+
+    from neuspring.config.tuning import Tune
 
 DATABASE = "optuna.db"
 DEFINITION = "definition"
 SLOT, WORKER, REASON, CRASH = "slot", "worker", "reason", "crash"
 """Attributes of a trial. A failed trial with a reason fills its slot; one without was left behind or crashed."""
 MOST_DEATHS = 5
-"""A slot whose trial ends its worker this often counts as failed, so that the study ends."""
+"""A slot whose trial ends its worker this often counts as failed, so that the sweep ends."""
 PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
 
-class Locks(Protocol):
-    """Locks that their holder's death frees."""
-
-    def hold(self, name: str) -> contextlib.AbstractContextManager[object]:
-        """Wait for a lock and hold it."""
-
-    def is_free(self, name: str) -> bool:
-        """Whether nobody holds a lock."""
-
-
-@dataclass(frozen=True)
-class FileLocks:
-    """Locks of one machine: files in `folder`."""
-
-    folder: Path
-
-    def hold(self, name: str) -> contextlib.AbstractContextManager[object]:
-        """Wait for a lock and hold it."""
-        from filelock import FileLock
-
-        self.folder.mkdir(parents=True, exist_ok=True)
-        return FileLock(self.folder / f"{name}.lock")
-
-    def is_free(self, name: str) -> bool:
-        """Whether nobody holds a lock."""
-        from filelock import FileLock, Timeout
-
-        try:
-            with FileLock(self.folder / f"{name}.lock", timeout=0):
-                return True
-        except Timeout:
-            return False
-
-
-@dataclass(frozen=True)
-class DatabaseLocks:
-    """Locks of all machines that share a PostgreSQL server; each lives as long as its connection."""
-
-    uri: str
-    study: str
-
-    def _number(self, name: str) -> int:
-        return int.from_bytes(hashlib.sha256(f"neuspring {self.study} {name}".encode()).digest()[:8], "big", signed=True)
-
-    @contextlib.contextmanager
-    def hold(self, name: str) -> Iterator[None]:
-        """Wait for a lock and hold it."""
-        import sqlalchemy
-
-        with self._engine().connect() as connection:
-            connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:number)"), {"number": self._number(name)})
-            yield
-
-    def is_free(self, name: str) -> bool:
-        """Whether nobody holds a lock."""
-        import sqlalchemy
-
-        with self._engine().connect() as connection:
-            taken = sqlalchemy.text("SELECT pg_try_advisory_lock(:number)")
-            return bool(connection.execute(taken, {"number": self._number(name)}).scalar())
-
-    def _engine(self) -> Engine:
-        import sqlalchemy
-
-        # A lock is held for hours without a word.
-        alive = {"keepalives_idle": 30, "keepalives_interval": 10}
-        try:
-            # A pool would keep the connection, and its locks with it.
-            return sqlalchemy.create_engine(
-                self.uri, poolclass=sqlalchemy.NullPool, isolation_level="AUTOCOMMIT", connect_args=alive
-            )
-        except ImportError as error:
-            raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
-
-
 @dataclass(frozen=True)
 class Store:
-    """Where a study is kept: its folder, and a PostgreSQL URI or None for a SQLite file in the folder."""
+    """Where a sweep is kept: its folder, and a PostgreSQL URI or None for a SQLite file in the folder."""
 
     folder: Path
     uri: str | None
     study: str
 
-    @property
-    def locks(self) -> Locks:
-        """The locks of this study's workers."""
-        return DatabaseLocks(self.uri, self.study) if self.uri else FileLocks(self.folder / ".locks")
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the sweep against its other workers; the death of the holder frees it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.uri is None:
+            with FileLock(self.folder / ".lock"):
+                yield
+            return
+        import sqlalchemy
 
-    def open(self, facts: Mapping[str, Any], sampler: BaseSampler, pruner: BasePruner) -> Study:
-        """The study, made if there is none. Raises InputError if the one there was begun with other `facts`."""
+        try:
+            # The lock is the connection's; a pool would keep both.
+            engine = sqlalchemy.create_engine(self.uri, poolclass=sqlalchemy.NullPool, isolation_level="AUTOCOMMIT")
+        except ImportError as error:
+            raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
+        with engine.connect() as connection:
+            digest = hashlib.sha256(f"neuspring {self.study} study".encode()).digest()
+            number = int.from_bytes(digest[:8], "big", signed=True)
+            connection.execute(sqlalchemy.text("SELECT pg_advisory_lock(:number)"), {"number": number})
+            yield
+
+    def open(self, facts: Mapping[str, Any], pruner: BasePruner) -> Study:
+        """The sweep, made if there is none. Raises InputError if it was begun with other `facts`."""
         import optuna
 
-        self.folder.mkdir(parents=True, exist_ok=True)
         # Several processes must not create the tables at once.
-        with self.locks.hold("study"):
-            storage = self._storage()
+        with self.lock():
             study = optuna.create_study(
-                storage=storage, study_name=self.study, sampler=sampler, pruner=pruner, load_if_exists=True, direction="minimize"
+                storage=self._storage(), study_name=self.study, pruner=pruner, load_if_exists=True, direction="minimize"
             )
             if DEFINITION not in study.user_attrs:
                 study.set_user_attr(DEFINITION, dict(facts))
-            self._require_same(study, facts)
-            return study
+        return self._checked(study, facts)
 
     def load(self, facts: Mapping[str, Any]) -> Study:
-        """The study for reading. Raises InputError if there is none, or if it was begun with other `facts`."""
+        """The sweep for reading. Raises InputError if there is none, or if it was begun with other `facts`."""
         import optuna
 
-        missing = InputError(f"study {self.study}", "must have been begun", None, "Run neuspring tune first.")
-        if self.uri is None and not (self.folder / DATABASE).is_file():
-            raise missing
-        try:
-            with self.locks.hold("study"):
+        if self.uri or (self.folder / DATABASE).is_file():
+            with contextlib.suppress(KeyError), self.lock():
                 study = optuna.load_study(storage=self._storage(), study_name=self.study)
-        except KeyError as error:
-            raise missing from error
-        if DEFINITION not in study.user_attrs:
-            raise missing
-        self._require_same(study, facts)
-        return study
+                if DEFINITION in study.user_attrs:
+                    return self._checked(study, facts)
+        raise InputError(f"sweep {self.study}", "must have been begun", None, "Run neuspring tune first.")
 
-    def _require_same(self, study: Study, facts: Mapping[str, Any]) -> None:
-        known = {name: study.user_attrs[DEFINITION].get(name) for name in facts}
-        if canonical(known) != canonical(facts):
+    def _checked(self, study: Study, facts: Mapping[str, Any]) -> Study:
+        definition = {name: study.user_attrs[DEFINITION].get(name) for name in facts}
+        if canonical(definition) != canonical(facts):
             raise InputError(
-                f"study {self.study}",
+                f"sweep {self.study}",
                 "must go on with what it was begun with",
-                f"another {', '.join(_differences(known, facts))}",
-                f"Name a new study (tune.study), or delete this one{'' if self.uri else f' ({self.folder})'}.",
+                f"another {', '.join(_differences(definition, facts))}",
+                f"Name a new sweep (tune.study), or delete this one{'' if self.uri else f' ({self.folder})'}.",
             )
+        return study
 
     def _storage(self) -> RDBStorage:
         from optuna import logging
@@ -181,34 +121,27 @@ class Store:
         return RDBStorage(self.uri, engine_kwargs={"pool_pre_ping": True})
 
 
-def _differences(known: Mapping[str, Any], facts: Mapping[str, Any], prefix: str = "") -> list[str]:
+def _differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     """Dotted names of what differs."""
-    names: list[str] = []
-    for key in sorted({*known, *facts}):
-        old, new = known.get(key), facts.get(key)
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            names += _differences(old, new, f"{prefix}{key}.")
-        elif old != new:
-            names.append(f"{prefix}{key}")
-    return names
+    before, after = flat(first), flat(second)
+    return [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A place for one trial, with those that were begun for it, oldest first; the last decides."""
+    """A place for one trial, with the trials that were begun for it, oldest first. The last one decides."""
 
     number: int
     trials: tuple[FrozenTrial, ...]
 
     @property
     def state(self) -> Literal["complete", "pruned", "failed", "running", "waiting", "free"]:
-        """What became of it; free: its trials were left behind, too few to give up. Waiting: about to run."""
+        """Free: all its trials were left behind or crashed, too few times to give up. Waiting: about to run."""
         from optuna.trial import TrialState
 
         last = self.trials[-1]
         if last.state != TrialState.FAIL:
-            names = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.RUNNING: "running"}
-            return names.get(last.state, "waiting")  # type: ignore[return-value]
+            return last.state.name.lower()  # type: ignore[return-value]
         return "failed" if REASON in last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
 
     @property
@@ -223,39 +156,35 @@ class Slot:
 
 def slots(study: Study) -> dict[int, Slot]:
     """The slots for which trials were begun, in order."""
-    found: dict[int, list[FrozenTrial]] = {}
+    trials: dict[int, list[FrozenTrial]] = {}
     for trial in study.get_trials(deepcopy=False):
-        found.setdefault(trial.user_attrs[SLOT], []).append(trial)
-    return {number: Slot(number, tuple(found[number])) for number in sorted(found)}
+        trials.setdefault(trial.user_attrs[SLOT], []).append(trial)
+    return {number: Slot(number, tuple(trials[number])) for number in sorted(trials)}
 
 
-def claim(study: Study, locks: Locks, worker: int, limit: int, first: Mapping[str, Any]) -> Trial | None:
-    """A trial of the lowest free slot below `limit`, None if there is none. `first` are the values of slot 0.
+def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampler: Callable[[int], BaseSampler]) -> Trial | None:
+    """A trial of the lowest free slot, None if there is none. `first` are the values of slot 0; each slot has its `sampler`.
 
-    The caller holds the lock of `worker` and runs no other trial.
+    The caller holds the sweep's lock, is the only process that is `worker`, and runs no other trial.
     """
     from optuna.trial import TrialState
 
-    with locks.hold("study"):
-        for left in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            owner = left.user_attrs.get(WORKER)
-            # Without an owner: killed between taking the trial and saying so, which happens under this lock.
-            if owner in (None, worker) or locks.is_free(worker_lock(owner)):
-                study.tell(left.number, state=TrialState.FAIL)
-        known = slots(study)
-        # Waiting: killed between asking for a trial and taking it.
-        if not any(slot.state == "waiting" for slot in known.values()):
-            free = (number for number in range(limit) if number not in known or known[number].state == "free")
-            number = next(free, None)
-            if number is None:
-                return None
-            values = dict(first) if number == 0 else {}
-            study.enqueue_trial(values | (known[number].trials[-1].params if number in known else {}), user_attrs={SLOT: number})
-        trial = study.ask()
-        trial.set_user_attr(WORKER, worker)
-        return trial
-
-
-def worker_lock(worker: int) -> str:
-    """The name of a worker's own lock."""
-    return f"worker-{worker}"
+    for running in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        owner = running.user_attrs.get(WORKER)
+        # Left behind by this worker's earlier process; by a process killed under this lock, before it named its worker; or by a
+        # worker that the configuration no longer has.
+        if owner in (None, worker) or owner >= tune.workers:
+            study.tell(running.number, state=TrialState.FAIL)
+    begun = slots(study)
+    # A trial that waits was left between being queued and being taken.
+    number = next((n for n, slot in begun.items() if slot.state == "waiting"), None)
+    if number is None:
+        number = next((n for n in range(tune.trials) if n not in begun or begun[n].state == "free"), None)
+        if number is None:
+            return None
+        values = begun[number].trials[-1].params if number in begun else {}
+        study.enqueue_trial((dict(first) if number == 0 else {}) | values, user_attrs={SLOT: number})
+    study.sampler = sampler(number)
+    trial = study.ask()
+    trial.set_user_attr(WORKER, worker)
+    return trial

@@ -1,9 +1,9 @@
-"""One trial of a study: search and fit with its settings, judged by the tail of the training frames, which neither has seen.
+"""One trial of a sweep: search and fit with its settings, judged by a tail of the training frames, which neither has seen.
 
-The last `fit.tail_fraction` of a scenario's training frames are held back. The search sees the frames before them only; the fit
-trains on those, and after every epoch its twin is rolled out over the tail. A trial's value is the tail's mean loss of the twin
-that the method's own rule (`fit.selection`) would choose, averaged over scenarios. Everything after the training frames is cut
-off before anything is computed.
+The tail is the last `fit.tail_fraction` of a scenario's training frames. Search and fit see only the frames before it. After every
+epoch of the fit its twin is rolled out over the tail. A trial's value is the mean loss over the tail of the twin that the method's
+own rule (`fit.selection`) selects, averaged over scenarios. All frames after the training frames are cut off before anything is
+computed.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Scene:
         observations = Observations.load(path)
         scenario = observations.scenario
         if scenario.train_end < 3:
-            rule = "a held-back tail needs at least two training frames after frame 0"
+            rule = "a tail needs at least two training frames after frame 0"
             raise InputError(f"scenario {scenario.name}", rule, scenario.train_end - 1)
         head = cut(observations, head_end(scenario.train_end, tail_fraction))
         target = folder / f"{scenario.name}.npz"
@@ -65,31 +65,31 @@ class Scene:
 
 
 def cut(observations: Observations, end: int) -> Observations:
-    """The first `end` frames, all for training. Annotated tracks are for scoring and left out."""
+    """The first `end` frames, all for training, without annotated tracks, which are for scoring."""
     timed = [spec.name for spec in dataclasses.fields(Observations) if spec.metadata.get("shape", ("",))[0] == "T"]
     arrays = {name: getattr(observations, name)[:end] for name in timed}
     arrays["tracks"] = arrays["tracks"][:, :0]
-    # What the reader noted, such as digests of files, depends on later frames.
+    # The reader's notes, such as digests of files, depend on later frames.
     return replace(observations, scenario=replace(observations.scenario, frame_count=end, train_end=end, provenance={}), **arrays)
 
 
 def head_end(train_end: int, tail_fraction: float) -> int:
-    """The first held-back frame: that of `TwinFit`, which a test compares."""
+    """The first frame of the tail. A test holds it equal to that of `TwinFit`."""
     return train_end - min(max(round(tail_fraction * (train_end - 1)), 1), train_end - 2)
 
 
 @dataclass
 class Outcome:
-    """What a trial found so far."""
+    """Results of a trial so far."""
 
     losses: dict[str, float] = field(default_factory=dict)
     """Scenario -> loss of its tail, m^2."""
     seconds: dict[str, float] = field(default_factory=lambda: {"search": 0.0, "fit": 0.0})
-    """Wall time; searches that an earlier trial made take none."""
+    """Wall time; a search that an earlier trial made counts 0."""
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Count what is done inside."""
+        """Add the time of the block."""
         began = time.perf_counter()
         try:
             yield
@@ -112,13 +112,13 @@ def run(
     report: Report,
     outcome: Outcome,
 ) -> None:
-    """Search and fit every scenario with a trial's values, and put what was found into `outcome`. What `report` raises ends it.
+    """Search and fit every scenario with a trial's values; `outcome` receives the results.
 
-    `folder` is the study's: searches in it are shared by trials, checkpoints of the slot's fits are continued from. Raises
-    NumericalFailure and, for settings that exclude each other or the data, InputError.
+    `folder` is the sweep's. Trials share the searches in it, and the slot's fits continue from their checkpoints in it. Raises what
+    `report` raises; NumericalFailure; InputError for settings that exclude each other or do not fit the data.
     """
     settings, clusters = plan.at(values, f"trial {slot}")
-    # Whatever selects the epoch, every epoch's loss of the tail is wanted.
+    # The loss over the tail is needed after every epoch, whichever rule selects one.
     tailed = replace(settings, fit=replace(settings.fit, selection="tail"))
     for index, scene in enumerate(scenes):
         with outcome.timed("search"):
@@ -130,7 +130,7 @@ def run(
         sections = (tailed.fit, tailed.simulation, tailed.losses, tailed.released_quirks)
         problem = FitProblem(scene.training, twin, *sections, device, plan.method.fit or "springs", plan.tune.seed)
 
-        def said(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:
+        def report_epoch(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:
             mean = (sum(outcome.losses.values()) + loss) / (len(outcome.losses) + 1)
             report(first + epoch, mean, f"{name}, epoch {epoch}")
 
@@ -138,17 +138,17 @@ def run(
             with outcome.timed("fit"):
                 if plan.method.fit is None:
                     loss = TwinFit(problem).tail_loss()
-                    said(0, loss)
+                    report_epoch(0, loss)
                 else:
                     key = _key(problem, record.files["twin"][1], device)
-                    loss = _fitted(problem, settings, checkpoint(folder, slot, scene.name), key, said)
+                    loss = _fitted(problem, settings, checkpoint(folder, slot, scene.name), key, report_epoch)
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
         outcome.losses[scene.name] = loss
 
 
 def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: str, folder: Path) -> Path:
-    """The record of a search on the frames before the tail, made by the first trial that needs it."""
+    """The record of a search on the frames before the tail. The first trial that needs the search makes it."""
     from filelock import FileLock
 
     values = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
@@ -177,34 +177,34 @@ def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: s
 
 
 def checkpoint(folder: Path, slot: int, scene: str) -> Path:
-    """Where a slot's fit can be continued from."""
+    """The checkpoint of a slot's fit."""
     return folder / "trials" / str(slot) / f"{scene}.partial.npz"
 
 
 def _key(problem: FitProblem, twin: str, device: str) -> str:
-    """What a checkpoint must match to be continued from."""
+    """Digest of everything that must be equal for a fit to continue from a checkpoint."""
     sections = [config.plain(part) for part in (problem.fit, problem.simulation, problem.losses, problem.quirks)]
     facts = [sections, problem.kind, problem.seed, twin, device.partition(":")[0], code_digest("neuspring.twin.fit")]
     return hashlib.sha256(canonical(facts).encode()).hexdigest()
 
 
-def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, said: Callable[[int, float], None]) -> float:
-    """The tail's loss of the twin that `settings.fit.selection` chooses."""
+def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, report: Callable[[int, float], None]) -> float:
+    """The loss over the tail of the twin that `settings.fit.selection` selects."""
     by = "tail_loss" if settings.fit.selection == "tail" else "loss"
-    least, chosen, seen = math.inf, math.inf, 0
+    least, selected, count = math.inf, math.inf, 0
 
     def see(history: Sequence[Mapping[str, Any]]) -> None:
-        nonlocal least, chosen, seen
-        for row in history[seen:]:
-            seen += 1
+        nonlocal least, selected, count
+        for row in history[count:]:
+            count += 1
             if row["rolled_back"]:
                 continue
             last = row["epoch"] == settings.fit.epochs - 1
             sparse = settings.released_quirks.sparse_checkpoints and row["epoch"] % RELEASED_CHECKPOINT_EPOCHS and not last
             if row[by] < least and not sparse:
-                least, chosen = row[by], row["tail_loss"]
-            if math.isfinite(chosen):
-                said(row["epoch"], chosen)
+                least, selected = row[by], row["tail_loss"]
+            if math.isfinite(selected):
+                report(row["epoch"], selected)
 
     result = fit(problem, partial=partial, key=key, on_epoch=see)
     # A fit that was complete when its worker was killed has no further epoch.
@@ -212,6 +212,6 @@ def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, said
     if by == "tail_loss":
         # The start may be best.
         return result.best_loss
-    if not math.isfinite(chosen):
-        raise NumericalFailure(f"no epoch with a finite loss of the held-back frames; rolled back: {'; '.join(result.rollbacks)}")
-    return chosen
+    if not math.isfinite(selected):
+        raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.rollbacks)}")
+    return selected

@@ -1,25 +1,27 @@
-"""Tuning: Optuna studies over settings of one method, by any number of workers, judged on held-back training frames.
+"""One worker of a sweep, a job of the workflow: it runs trials until the sweep has as many as configured.
 
-`work` is one worker, a job of the workflow; `report` sums the study up. Workers share the study's storage, so
-each may be on another GPU or machine. The sampler is seeded for every slot by itself: a study of one worker that was killed and
-continued finds what it would have found in one go.
+Workers share the sweep's storage, so each may be on another GPU or machine. Trials are judged on a tail of the training frames. The
+sampler is seeded for every slot by itself: a sweep of one worker that was killed and continued finds what it would have found in
+one go.
 """
 
 from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import hashlib
 import json
 import math
 import socket
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import optuna
+from filelock import FileLock, Timeout
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import BaseSampler, TPESampler
 from optuna.trial import FrozenTrial, Trial, TrialState
@@ -32,48 +34,26 @@ from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, now
 from neuspring.experiments.tuning.records import FACTS, VALUES, label, labels, write_trial
 from neuspring.experiments.tuning.space import Plan, holds, is_whole
-from neuspring.experiments.tuning.store import CRASH, DEFINITION, REASON, SLOT, Store, claim, slots, worker_lock
+from neuspring.experiments.tuning.store import CRASH, DEFINITION, REASON, SLOT, Store, claim, slots
 from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
 
 if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
     from optuna.study import Study
 
 
-class Seeded(BaseSampler):
-    """TPE with a seed of its own for every slot."""
-
-    def __init__(self, tune: Tune, *, grouped: bool) -> None:
-        """`grouped`: some trial, the baseline, lacks values that the space cannot hold."""
-        self._tune, self._grouped = tune, grouped
-        self._inner = self._made(0)
-
-    def _made(self, slot: int) -> TPESampler:
-        seed = int.from_bytes(hashlib.sha256(f"{self._tune.seed} {slot}".encode()).digest()[:4], "big")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            return TPESampler(
-                seed=seed, n_startup_trials=self._tune.startup_trials, multivariate=True, group=self._grouped, constant_liar=True
-            )
-
-    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        self._inner = self._made(trial.user_attrs[SLOT])
-
-    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return self._inner.infer_relative_search_space(study, trial)
-
-    def sample_relative(self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        return self._inner.sample_relative(study, trial, search_space)
-
-    def sample_independent(self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution) -> Any:
-        return self._inner.sample_independent(study, trial, param_name, param_distribution)
+def sampler_of(tune: Tune, slot: int, *, grouped: bool) -> BaseSampler:
+    """TPE with the seed of a slot. `grouped`: the baseline has values that the space cannot hold, so that its trial lacks them."""
+    seed = int.from_bytes(hashlib.sha256(f"{tune.seed} {slot}".encode()).digest()[:4], "big")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return TPESampler(seed=seed, n_startup_trials=tune.startup_trials, multivariate=True, group=grouped, constant_liar=True)
 
 
 class MedianOfStep(BasePruner):
-    """Optuna's median rule on the last value alone: losses of different scenarios, at different steps, cannot be compared."""
+    """Optuna's median rule, on the last value alone: losses at different steps are of different scenarios."""
 
     def __init__(self, tune: Tune, warmup: int) -> None:
-        # Of no finished trial there is no median.
+        # There is no median before one trial has finished.
         self._inner = MedianPruner(n_startup_trials=max(tune.startup_trials, 1), n_warmup_steps=warmup)
 
     def prune(self, study: Study, trial: FrozenTrial) -> bool:
@@ -86,11 +66,11 @@ class MedianOfStep(BasePruner):
 
 
 def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
-    """The pruner of a study whose trials have at most `epochs` steps for each of its scenarios."""
-    whole = tune.warmup_scenarios
-    if whole is None:
-        whole = math.ceil(scenarios / 3) if scenarios > 1 else 0
-    warmup = whole * epochs + tune.warmup_epochs
+    """The pruner of a sweep whose trials have at most `epochs` steps for each of its scenarios."""
+    unpruned = tune.warmup_scenarios
+    if unpruned is None:
+        unpruned = math.ceil(scenarios / 3) if scenarios > 1 else 0
+    warmup = unpruned * epochs + tune.warmup_epochs
     if tune.pruner == "hyperband":
         return HyperbandPruner(min_resource=max(warmup, 1), max_resource=max(scenarios * epochs, warmup, 1))
     return MedianOfStep(tune, warmup) if tune.pruner == "median" else NopPruner()
@@ -99,8 +79,8 @@ def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
 def suggest(trial: Trial, name: str, dimension: Dimension) -> Any:
     """The trial's value of a setting."""
     if dimension.choices:
-        known = [label(value) for value in dimension.choices]
-        return dimension.choices[known.index(trial.suggest_categorical(name, known))]
+        choices = [label(value) for value in dimension.choices]
+        return dimension.choices[choices.index(trial.suggest_categorical(name, choices))]
     low, high, step, log = dimension.low, dimension.high, dimension.step, dimension.log
     assert low is not None
     assert high is not None
@@ -119,40 +99,55 @@ def work(
     root: Path = Path(),
     done: Callable[[int, str], None] = lambda slot, text: print(f"trial {slot}: {text}", flush=True),
 ) -> None:
-    """Run trials until the study has `tune.trials`, or others run the last ones; then write `output`, a JSON record.
+    """Run trials until the sweep has `tune.trials`, or others run the last ones; then write `output`, a JSON record.
 
-    The study lies in `output`'s folder. `observations` are those of the study's scenarios, in this order. Raises InputError.
+    The sweep lies in `output`'s folder. `observations` are those of its scenarios, in this order. Raises InputError.
     """
     from neuspring.core.device import resolve_device
 
     if not 0 <= worker < tune.workers:
         raise InputError("--worker", f"0 to tune.workers - 1 = {tune.workers - 1} is required", worker)
     plan, folder, device = Plan.of(settings, tune, root), output.parent, resolve_device(device)
-    store = Store(folder, tune.storage, tune.study)
     scenes = [Scene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
-    wanted = list(tune.scenarios or settings.scenarios)
-    if [scene.name for scene in scenes] != wanted:
-        raise InputError("--observations", f"those of {', '.join(wanted)} are required", ", ".join(scene.name for scene in scenes))
+    required, names = list(tune.scenarios or settings.scenarios), [scene.name for scene in scenes]
+    if names != required:
+        raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
     first = labels({name: value for name, value in plan.baseline.items() if holds(tune.space[name], value)})
-    sampler = Seeded(tune, grouped=len(first) < len(tune.space))
+    sampler = functools.partial(sampler_of, tune, grouped=len(first) < len(tune.space))
     facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
-    study = store.open(facts, sampler, pruner_of(tune, len(scenes), plan.epochs))
-    mine: list[int] = []
-    if not store.locks.is_free(worker_lock(worker)):
-        print(f"waiting for another process that is worker {worker} of study {tune.study}", flush=True)
-    with store.locks.hold(worker_lock(worker)):
-        while trial := claim(study, store.locks, worker, tune.trials, first):
+    store = Store(folder, tune.storage, tune.study)
+    study = store.open(facts, pruner_of(tune, len(scenes), plan.epochs))
+    finished: list[int] = []
+    with _only(folder, worker):
+        while True:
+            with store.lock():
+                trial = claim(study, worker, tune, first, sampler)
+            if trial is None:
+                break
             slot = trial.user_attrs[SLOT]
-            finished = _attempt(study, trial, plan, scenes, folder, device)
+            outcome = _attempt(study, trial, plan, scenes, folder, device)
             write_trial(plan, study.user_attrs[DEFINITION], slots(study)[slot], folder)
-            mine.append(slot)
-            done(slot, finished)
-    content = {"study": tune.study, "worker": worker, "slots": mine, "ended": now(), "device": device, "host": socket.gethostname()}
-    write_text(output, json.dumps({"format": RECORD_FORMAT, **content}, indent=1, sort_keys=True) + "\n")
+            finished.append(slot)
+            done(slot, outcome)
+    content = {"study": tune.study, "worker": worker, "slots": finished, "ended": now(), "device": device}
+    content |= {"format": RECORD_FORMAT, "host": socket.gethostname()}
+    write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+
+@contextlib.contextmanager
+def _only(folder: Path, worker: int) -> Iterator[None]:
+    """Be the only process with this number. Raises InputError if there is another."""
+    try:
+        with FileLock(folder / f".worker-{worker}.lock", timeout=0):
+            yield
+    except Timeout as error:
+        raise InputError(
+            "--worker", "one process at a time may be this worker", worker, "Wait for the other one to end."
+        ) from error
 
 
 def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], folder: Path, device: str) -> str:
-    """Run a trial and tell the study how it ended; returns that as text. What is no result of its settings raises."""
+    """Run a trial and tell Optuna how it ended; returns that as text. Raises errors that say nothing about its settings."""
     slot, started = trial.user_attrs[SLOT], now()
     outcome = Outcome()
 

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Jobs of Snakemake as Jobs of Kubernetes, through kubectl: `pods.py submit SCRIPT`, `pods.py status NAME`, `pods.py NAME...`.
 
-Snakemake's cluster-generic executor calls these to submit, to ask and (names alone) to cancel. What all jobs share is in job.yaml.
+Snakemake's cluster-generic executor calls these to submit a job, to ask for its state, and (names alone) to cancel jobs. The part that
+all jobs share is in job.yaml.
 """
 
 import json
@@ -17,7 +18,7 @@ PROPERTIES = "# properties = "
 
 
 def main(arguments: list[str]) -> int:
-    """Do what Snakemake asks; returns an exit status."""
+    """Submit, ask or cancel; returns an exit status."""
     match arguments:
         case ["submit", script]:
             print(submit(Path(script)))
@@ -46,9 +47,9 @@ def manifest(properties: dict, script: Path) -> dict:
     rule = properties.get("rule") or properties["groupid"]
     job["metadata"]["generateName"] = f"neuspring-{rule.replace('_', '-').lower()}-"
     pod = job["spec"]["template"]["spec"]
-    # Of the pod: the time of a Job would run while it waits for a GPU.
+    # Set for the pod: a Job's time limit would also count while it waits for a GPU.
     pod["activeDeadlineSeconds"] = 60 * resources["runtime"]
-    # Memory as a limit too: what needs more ends as one job, and is tried again with more.
+    # Memory is a limit too: a job that needs more fails alone, and is tried again with more.
     needs = {"cpu": str(properties["threads"]), "memory": f"{resources['mem_mb']}M"}
     limits = {"memory": needs["memory"]} | ({"nvidia.com/gpu": str(resources["gpu"])} if resources.get("gpu") else {})
     pod["containers"][0] |= {"command": ["/bin/sh", str(script)], "resources": {"requests": needs, "limits": limits}}

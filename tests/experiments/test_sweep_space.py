@@ -1,0 +1,135 @@
+"""What a sweep refuses, and the field's resolution that it may vary."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.core.errors import InputError
+from neuspring.experiments.tuning.space import Plan
+from neuspring.twin.field import SpringField, adaptive_resolution
+from tests.support.sweeps import plan, report, settings, slots, sweep, work
+
+RANGE = {"low": 1, "high": 2}
+
+
+@pytest.mark.parametrize(
+    ("space", "words"),
+    [
+        ({"fit.learning_rat": RANGE}, ["tune.space, fit.learning_rat", "Did you mean learning_rate?"]),
+        ({"fitt.horizon": RANGE}, ["must begin with simulation", "Did you mean fit?"]),
+        ({"toy.frames": RANGE}, ["must begin with simulation"]),
+        ({"fit.field": RANGE}, ["not a section"]),
+        ({"search.clusters": RANGE}, ["not a section", "called clusters"]),
+        ({"fit.horizon.more": RANGE}, ["more must be a setting"]),
+        ({"fit.horizon": {"low": 1.0, "high": 2.0}}, ["fit.horizon, low", "whole number"]),
+        ({"clusters": {"low": 1, "high": 2.5}}, ["clusters, high", "whole number"]),
+        ({"clusters": {"low": 0, "high": 2}}, ["clusters", "at least 1"]),
+        ({"fit.schedule": RANGE}, ["choices are required"]),
+        ({"fit.schedule": {"choices": ["constant", "linear"]}}, ["fit.schedule = 'linear'", "constant", "cosine"]),
+        ({"fit.learning_rate": {"low": -1.0, "high": 1.0}}, ["fit.learning_rate = -1.0", "greater than 0"]),
+        ({"fit.field.channels": RANGE}, ["trains springs"]),
+        ({"fit.selection": {"choices": ["tail", "training_loss"]}}, ["same in all trials"]),
+        ({"losses.chamfer": RANGE}, ["same in all trials"]),
+        ({"search.tied_rollouts": {"low": 0, "high": 11}}, ["search.tied_rollouts = 11", "below rollouts"]),
+        ({"fit.stiffness_range": {"choices": [[0.0, 1e5], [0.0, 1e4]]}}, ["must hold search.ranges.stiffness"]),
+        (
+            {"search.tied_rollouts": {"low": 0, "high": 8}, "search.rollouts": {"low": 5, "high": 11}},
+            ["search.tied_rollouts = 8, search.rollouts = 5", "below rollouts"],
+        ),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_space_that_cannot_be_is_refused_by_name(finished, space, words):
+    with pytest.raises(InputError) as error:
+        plan(finished[0], sweep(space=space))
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "words"),
+    [
+        ({"low": 1}, "low and high, or choices"),
+        ({"low": 2, "high": 1}, "low < high"),
+        ({"low": 0, "high": 1, "log": True}, "log"),
+        ({"low": 0, "high": 1, "step": 2}, "step"),
+        ({"choices": [1]}, "at least two"),
+        ({"choices": [1, 2], "low": 1}, "either"),
+        ({"low": "1e-4", "high": 1}, "5.0e-5"),
+        ({"lowest": 1, "high": 2}, "unknown key"),
+    ],
+    ids=str,
+)
+def test_a_dimension_that_cannot_be_is_refused(dimension, words):
+    with pytest.raises(InputError, match=words):
+        sweep(space={"fit.horizon": dimension})
+
+
+def test_a_password_in_the_storage_is_refused():
+    with pytest.raises(InputError, match="a password would be shown"):
+        sweep(storage="postgresql://me:secret@host:5432/studies")
+    assert sweep(storage="postgresql://me@host:5432/studies").storage
+
+
+def test_a_method_without_a_first_order_stage_has_no_fit_settings_to_vary(finished):
+    with pytest.raises(InputError, match="no first-order stage"):
+        plan(finished[0], sweep(method="search_only"))
+
+
+def test_an_unknown_method_is_refused(finished):
+    with pytest.raises(InputError, match=r"Did you mean baseline\?"):
+        plan(finished[0], sweep(method="basline"))
+
+
+def test_a_sweep_does_not_go_on_with_other_settings(finished):
+    folder, tune = finished
+    other, space = settings(fit={"epochs": 4}), tune.space | sweep(space={"fit.horizon": {"choices": [1, 3]}}).space
+    with pytest.raises(InputError, match=r"another base\.fit\.epochs"):
+        work(folder, tune, base=other)
+    with pytest.raises(InputError, match=r"another base\.fit\.epochs"):
+        report(folder, tune, other)
+    with pytest.raises(InputError, match=r"another space\.fit\.horizon\.choices"):
+        work(folder, dataclasses.replace(tune, space=space))
+
+
+def test_a_sweep_that_was_not_begun_has_no_report(folder):
+    with pytest.raises(InputError, match="must have been begun"):
+        report(folder, sweep())
+
+
+def test_observations_of_other_scenarios_and_workers_without_a_number_are_refused(folder):
+    with pytest.raises(InputError, match="those of other are required"):
+        work(folder, sweep(scenarios=["other"]))
+    with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
+        work(folder, sweep(), 1)
+
+
+def test_settings_that_exclude_each_other_only_inside_their_ranges_fail_the_trial(folder, monkeypatch):
+    allowed = Plan.at
+
+    def at(self, values, where):
+        if where.startswith("trial"):
+            raise InputError(where, "these settings exclude each other")
+        return allowed(self, values, where)
+
+    monkeypatch.setattr(Plan, "at", at)
+    work(folder, sweep(trials=2))
+    reasons = [slot.reason for slot in slots(folder, sweep()).values()]
+    assert reasons == [f"trial {number}: these settings exclude each other." for number in (0, 1)]
+    assert "2 of 3 trials: 0 finished, 0 pruned, 2 failed." in report(folder, sweep())
+
+
+def test_a_plan_is_made_without_heavy_imports():
+    heavy = ("torch", "warp", "mlflow", "matplotlib", "optuna")
+    code = f"import sys, neuspring.experiments.tuning.space; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_a_factor_varies_the_adaptive_resolution():
+    points = np.random.default_rng(0).random((400, 3))
+    assert SpringField(points, config.SpringField(), 1, 0).resolution == adaptive_resolution(400) == 17
+    assert SpringField(points, config.SpringField(adaptive_factor=1.7), 1, 0).resolution == 34
+    assert SpringField(points, config.SpringField(adaptive_factor=1.7, resolution=9), 1, 0).resolution == 9

@@ -1,0 +1,135 @@
+"""Trials of a sweep: what they may see, how they are judged, how they end."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.records import StageRecord
+from neuspring.experiments.tuning import store, trial, worker
+from neuspring.twin.fit import FitProblem, TwinFit, fit
+from tests.support import small
+from tests.support.sweeps import furnish, report, results_of, settings, slots, sweep, work
+
+
+def test_no_test_frame_changes_any_trial(tmp_path, finished):
+    folder, tune = finished
+    spoiled = furnish(tmp_path, small.spoiled_future())
+    assert not np.array_equal(small.spoiled_future().object_points, small.observations().object_points)
+    work(spoiled, tune)
+    assert results_of(spoiled, tune) == results_of(folder, tune)
+
+
+def test_the_search_does_not_see_the_tail(tmp_path):
+    scene = small.observations()
+    end = trial.head_end(scene.scenario.train_end, 0.4)
+    points = scene.object_points.copy()
+    points[end:] += 1.0
+    heads = []
+    for name, observations in {"as": scene, "changed": dataclasses.replace(scene, object_points=points)}.items():
+        observations.save(tmp_path / f"{name}.npz")
+        made = trial.Scene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
+        heads.append(made.head.read_bytes())
+        assert len(Observations.load(made.head).object_points) == end < scene.scenario.train_end
+        assert len(made.training.object_points) == scene.scenario.train_end < scene.scenario.frame_count
+    assert heads[0] == heads[1]
+
+
+@pytest.mark.parametrize("fraction", [0.01, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("frames", [8, 20])
+def test_the_tail_is_the_one_that_the_fit_holds_back(fraction, frames):
+    problem = small.fit_problem(small.scene(frames=frames).observations)
+    end = TwinFit(dataclasses.replace(problem, fit=config.Fit(selection="tail", tail_fraction=fraction))).head_end
+    assert trial.head_end(problem.observations.scenario.train_end, fraction) == end
+
+
+@pytest.mark.parametrize(("method", "selection"), [("baseline", "training_loss"), ("baseline", "tail"), ("search_only", "tail")])
+def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, method, selection):
+    base = settings(fit={"selection": selection, "learning_rate": 0.3, "tail_fraction": 0.4, "epochs": 4})
+    tune = sweep(method=method, trials=1, space={"losses.acceleration": {"choices": [0.01, 0.02]}})
+    work(folder, tune, base=base)
+    value = slots(folder, tune, base)[0].trials[-1].value
+    record = next(folder.glob("search-*/search.json"))
+    twin = Twin.load(StageRecord.load(record).file("twin", record))
+    training = trial.cut(small.observations(), small.observations().scenario.train_end)
+    tailed = dataclasses.replace(base.fit, selection="tail")
+    problem = FitProblem(training, twin, tailed, base.simulation, base.losses, base.released_quirks)
+    if method == "search_only":
+        assert value == TwinFit(problem).tail_loss()
+        return
+    result = fit(problem)
+    by_training = result.history["tail_loss"][result.history["loss"].argmin()]
+    assert value == (result.best_loss if selection == "tail" else by_training)
+    assert result.best_loss != by_training, "the two rules choose different twins, or this test could not tell them apart"
+
+
+def test_hopeless_trials_are_pruned_before_their_last_epoch(folder):
+    space = {"simulation.gravity": {"choices": [9.8, 80.0]}, "fit.learning_rate": {"choices": [1e-3, 1.1e-3]}}
+    tune = sweep(trials=5, startup_trials=1, warmup_epochs=0, space=space)
+    work(folder, tune)
+    heavy = [slot for slot in slots(folder, tune).values() if slot.trials[-1].params["simulation.gravity"] == 80.0]
+    assert heavy
+    for slot in heavy:
+        assert slot.state == "pruned"
+        assert slot.reason.startswith("small, epoch 0: ")
+        assert list(slot.trials[-1].intermediate_values) == [0]
+
+
+def test_losses_of_other_scenarios_do_not_keep_a_trial():
+    """A median of best values over all steps would compare the second scenario with the first."""
+    import optuna
+
+    study = optuna.create_study(pruner=worker.MedianOfStep(sweep(startup_trials=1), 0))
+    for losses in ([1e-5, 1e-3], [1e-5, 1e-3]):
+        trial = study.ask()
+        for step, loss in enumerate(losses):
+            trial.report(loss, step)
+        study.tell(trial, losses[-1])
+    trial = study.ask()
+    trial.report(0.9e-5, 0)
+    assert not trial.should_prune()
+    trial.report(1e-2, 1)
+    assert trial.should_prune()
+
+
+def test_pruning_waits_for_whole_scenarios():
+    for scenarios, steps in ((1, 5), (2, 15), (22, 85)):
+        pruner = worker.pruner_of(sweep(warmup_epochs=5), scenarios, 10)
+        assert pruner._inner._n_warmup_steps == steps
+    assert worker.pruner_of(sweep(warmup_epochs=5, warmup_scenarios=0), 22, 10)._inner._n_warmup_steps == 5
+
+
+def test_a_numerical_failure_is_a_failed_trial_with_its_reason(folder):
+    tune = sweep(trials=3, space={"simulation.max_substeps": {"choices": [2000, 1]}})
+    work(folder, tune)
+    by_slot = slots(folder, tune)
+    failed = [slot for slot in by_slot.values() if slot.state == "failed"]
+    assert len(by_slot) == 3
+    assert failed
+    assert all("search: none of 11 candidates could be simulated" in slot.reason for slot in failed)
+    assert all(slot.trials[-1].user_attrs["values"] == {"simulation.max_substeps": 1} for slot in failed)
+    report(folder, tune)
+    assert f"{len(failed)} failed" in (folder / "summary.md").read_text()
+
+
+def test_a_trial_that_keeps_ending_its_worker_is_given_up(folder, monkeypatch):
+    tune, crashes = sweep(trials=2), 0
+
+    def crashing(*_args, **_kwargs):
+        nonlocal crashes
+        crashes += 1
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(store, "MOST_DEATHS", 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(trial, "fit", crashing)
+        for _ in range(2):
+            with pytest.raises(MemoryError):
+                work(folder, tune)
+    assert crashes == 2
+    assert work(folder, tune) == [1]
+    by_slot = slots(folder, tune)
+    assert [slot.state for slot in by_slot.values()] == ["failed", "complete"]
+    assert by_slot[0].reason == "given up after 2 attempts, the last: MemoryError: no room"

@@ -1,0 +1,160 @@
+"""Workers of a sweep: exactly as many trials as configured, however many workers there are and are killed."""
+
+import multiprocessing
+from pathlib import Path
+
+import pytest
+
+from neuspring.config.tuning import Tune
+from neuspring.core.errors import InputError
+from neuspring.experiments.tuning import store
+from neuspring.stages import stages
+from neuspring.twin.fit import TwinFit
+from tests.support import stores
+from tests.support.sweeps import furnish, report, results_of, slots, sweep, work
+
+
+def test_more_trials_continue_a_sweep(folder):
+    assert work(folder, sweep(trials=2)) == [0, 1]
+    assert work(folder, sweep(trials=3)) == [2]
+    assert list(slots(folder, sweep())) == [0, 1, 2]
+
+
+def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_path, finished, monkeypatch):
+    whole, tune = finished
+    folder = furnish(tmp_path)
+    epochs, run_epoch = 0, TwinFit.epoch
+
+    def dying(self):
+        nonlocal epochs
+        epochs += 1
+        # In the last of three epochs of the third trial.
+        if epochs == 9:
+            raise KeyboardInterrupt
+        return run_epoch(self)
+
+    monkeypatch.setattr(TwinFit, "epoch", dying)
+    with pytest.raises(KeyboardInterrupt):
+        work(folder, tune)
+    assert [slot.state for slot in slots(folder, tune).values()] == ["complete", "complete", "running"]
+    assert work(folder, tune) == [2, 3]
+    assert results_of(folder, tune) == results_of(whole, tune)
+    assert epochs == 4 * 3 + 1, "two epochs of the third trial were not repeated"
+
+
+def test_a_kill_between_asking_for_a_trial_and_taking_it_costs_nothing(folder, monkeypatch):
+    import optuna
+
+    tune, ask = sweep(trials=2), optuna.Study.ask
+
+    def killed(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    def asked_and_killed(self):
+        ask(self)
+        raise KeyboardInterrupt
+
+    for stand_in in (killed, asked_and_killed):
+        with monkeypatch.context() as patch:
+            patch.setattr(optuna.Study, "ask", stand_in)
+            with pytest.raises(KeyboardInterrupt):
+                work(folder, tune)
+    assert work(folder, tune) == [0, 1]
+    assert [len(slot.trials) for slot in slots(folder, tune).values()] == [2, 1]
+
+
+def counting(calls: Path) -> None:
+    """Note every search in a file, in this process."""
+    searched = stages.search
+
+    def noted(*args, **kwargs):
+        with calls.open("a") as stream:
+            stream.write("search\n")
+        searched(*args, **kwargs)
+
+    stages.search = noted
+
+
+def other_worker(folder: Path, tune: Tune, start, hangs, calls: Path) -> None:
+    """Worker 1 in a process of its own, which hangs in the first epoch of its second trial."""
+    counting(calls)
+    epochs, run_epoch = 0, TwinFit.epoch
+
+    def epoch(self):
+        nonlocal epochs
+        epochs += 1
+        if epochs > 3:
+            hangs.set()
+            multiprocessing.Event().wait()
+        return run_epoch(self)
+
+    TwinFit.epoch = epoch
+    start.wait(120)
+    work(folder, tune, 1)
+
+
+def two_workers(folder: Path, tune: Tune) -> None:
+    """Two workers begin a sweep of six trials together; one is killed in its second trial, the other goes on."""
+    calls, processes = folder.parent / "calls", multiprocessing.get_context("spawn")
+    start, hangs = processes.Barrier(2), processes.Event()
+    other = processes.Process(target=other_worker, args=(folder, tune, start, hangs, calls))
+    other.start()
+    try:
+        counting(calls)
+        start.wait(120)
+        mine = work(folder, tune, after=lambda: hangs.wait(120))
+        states = {number: slot.state for number, slot in slots(folder, tune).items()}
+        left = [number for number, state in states.items() if state == "running"]
+        assert len(states) == 6
+        assert len(mine) == 4
+        assert len(left) == 1, "the trial of a living worker is left alone"
+    finally:
+        other.kill()
+        other.join()
+    assert work(folder, tune, 1) == left, "the worker that was killed starts again"
+    by_slot = slots(folder, tune)
+    assert [slot.state in ("complete", "pruned") for slot in by_slot.values()] == [True] * 6
+    assert {number: len(slot.trials) for number, slot in by_slot.items() if number in left} == {left[0]: 2}
+    assert sum(len(slot.trials) for slot in by_slot.values()) == 7
+    assert calls.read_text() == "search\n", "workers that need the same search make it once"
+
+
+def test_two_workers_and_a_kill_make_exactly_the_trials_asked_for(folder, monkeypatch):
+    # Restored after the test.
+    monkeypatch.setattr(stages, "search", stages.search)
+    two_workers(folder, sweep(trials=6, workers=2, pruner="none"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(stores.without_postgres()), reason=stores.without_postgres())
+def test_postgresql_holds_a_sweep(folder, monkeypatch):
+    monkeypatch.setattr(stages, "search", stages.search)
+    with stores.postgres() as cluster:
+        tune = sweep(trials=6, workers=2, pruner="none", storage=cluster.database("study"))
+        two_workers(folder, tune)
+        assert "6 of 6 trials" in report(folder, tune)
+    assert not (folder / store.DATABASE).exists()
+
+
+def test_a_trial_of_a_worker_that_is_no_longer_configured_is_finished_by_another(folder, monkeypatch):
+    def killed(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TwinFit, "epoch", killed)
+        with pytest.raises(KeyboardInterrupt):
+            work(folder, sweep(workers=2), 1)
+    assert work(folder, sweep(workers=2), 0) == [1, 2]
+    assert work(folder, sweep(workers=1), 0) == [0]
+
+
+def test_two_processes_cannot_be_the_same_worker(folder):
+    refused = []
+
+    def begin_again():
+        with pytest.raises(InputError, match="one process at a time may be this worker; received 0"):
+            work(folder, sweep(trials=1))
+        refused.append(True)
+
+    work(folder, sweep(trials=1), after=begin_again)
+    assert refused == [True]

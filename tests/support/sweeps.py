@@ -1,0 +1,99 @@
+"""A small sweep for tests and benchmarks: its configuration, its tables and observations on disk, its workers and results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neuspring import config
+from neuspring.config.tuning import Tune
+from neuspring.core.artifacts import Observations
+from neuspring.experiments.tuning import report as tuning_report
+from neuspring.experiments.tuning import worker
+from neuspring.experiments.tuning.space import Plan
+from neuspring.experiments.tuning.store import Slot, Store
+from neuspring.experiments.tuning.store import slots as slots_of
+from tests.support import small
+
+OBSERVATIONS = "observations.npz"
+START = {"object_radius": 0.045, "stiffness": 1.0e4}
+BASE = {"scenarios": ["small"], "search": {"rollouts": 11, "start": START}, "fit": {"epochs": 3, "checkpoint_every": 1}}
+METHODS = {
+    "search_only": {"search": "uniform", "fit": None, "description": "No second stage"},
+    "baseline": {"search": "uniform", "fit": "springs", "description": "Springs"},
+    "field": {"search": "uniform", "fit": "field", "description": "Field", "settings": {"horizon": 3}},
+}
+SEARCHES = {"uniform": {"clusters": 1, "description": "One region"}}
+FAST = {"fit.learning_rate": {"low": 1.0e-4, "high": 1.0e-1, "log": True}, "fit.horizon": {"choices": [1, 2]}}
+"""Settings of the fit alone, so that one search serves all trials."""
+
+
+def settings(**changes: Any) -> config.Config:
+    """The configuration whose method is varied."""
+    values = json.loads(json.dumps(BASE))
+    config.merge(values, changes)
+    return config.parse(config.Config, values, "test")
+
+
+def sweep(**changes: Any) -> Tune:
+    """A sweep of three trials over settings of the fit."""
+    base = {"study": "small", "method": "baseline", "trials": 3, "startup_trials": 2, "warmup_epochs": 1, "space": FAST}
+    return config.parse(Tune, base | changes, "tune")
+
+
+def furnish(root: Path, observations: Observations | None = None) -> Path:
+    """Write the tables and observations that a sweep reads to a folder; returns the place of the sweep's own folder in it."""
+    for name, rows in {"methods": METHODS, "searches": SEARCHES}.items():
+        path = root / "config" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(yaml.safe_dump(rows))
+    (observations or small.observations()).save(root / OBSERVATIONS)
+    return root / "study"
+
+
+def plan(folder: Path, tune: Tune, base: config.Config | None = None) -> Plan:
+    """The checked sweep."""
+    return Plan.of(base or settings(), tune, folder.parent)
+
+
+def work(
+    folder: Path,
+    tune: Tune,
+    number: int = 0,
+    base: config.Config | None = None,
+    after: Callable[[], object] = lambda: None,
+) -> list[int]:
+    """Run a worker and call `after` after each of its trials; returns the slots that it ran."""
+    ended: list[int] = []
+    worker.work(
+        base or settings(),
+        tune,
+        [folder.parent / OBSERVATIONS],
+        number,
+        "cpu",
+        folder / f"worker-{number}.json",
+        folder.parent,
+        lambda slot, text: (ended.append(slot), after()),  # type: ignore[arg-type, return-value, func-returns-value]
+    )
+    return ended
+
+
+def report(folder: Path, tune: Tune, base: config.Config | None = None) -> str:
+    """Report a sweep; returns its summary."""
+    tuning_report.report(base or settings(), tune, folder / "summary.md", folder.parent)
+    return (folder / "summary.md").read_text()
+
+
+def slots(folder: Path, tune: Tune, base: config.Config | None = None) -> dict[int, Slot]:
+    """The sweep's slots as its storage has them."""
+    return slots_of(Store(folder, tune.storage, tune.study).load(plan(folder, tune, base).facts()))
+
+
+def results_of(folder: Path, tune: Tune) -> list[tuple[Any, ...]]:
+    """State, value, values and intermediate losses of every slot."""
+    trials = [(slot.state, slot.trials[-1]) for slot in slots(folder, tune).values()]
+    return [(state, trial.value, trial.user_attrs.get("values"), trial.intermediate_values) for state, trial in trials]
