@@ -20,7 +20,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 install: $(INSTALLED)
 
 demo: $(INSTALLED)
-	$(SNAKEMAKE) --cores $(CORES) --quiet rules
+	$(SNAKEMAKE) --cores $(CORES) --quiet rules --configfile config/data/demo.yaml
 	@echo "The table once more: cat results/tables/summary.md"
 
 test: $(INSTALLED)
@@ -31,7 +31,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile workflow/rules
-	$(BIN)/snakemake --lint
+	$(BIN)/snakemake --lint --configfile config/data/demo.yaml
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .

@@ -40,8 +40,6 @@ class GsDynamics:
     """full: kind, heights, displacements and action of a node. short: kind and action. rope short, others full."""
     tools: Tools = "points"
     """points: every controller is a tool node. centroids: one tool node per hand, at the mean of its controllers."""
-    hand_gap: Positive = 0.08
-    """Controllers whose chain of neighbours in frame 0 has no longer gap than this are one hand, m."""
     width: Count = 512
     """Of all hidden layers."""
     rounds: Count = 3

@@ -1,4 +1,4 @@
-"""Settings of synthetic captures and of perception, the steps from raw RGBD video to observations."""
+"""Settings of perception: the steps from raw RGBD video to observations."""
 
 from __future__ import annotations
 
@@ -8,23 +8,6 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from neuspring.config.types import STRICT, Count, NonNegative, Positive, Range
-
-
-@dataclass(frozen=True, kw_only=True)
-class Synthetic:
-    """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
-
-    __pydantic_config__ = STRICT
-    size: Literal["tiny", "demo", "full"] = "demo"
-    """Images of 120 x 68, 424 x 240 or 848 x 480 pixels, meshes to match."""
-    frames: Annotated[int, Field(ge=5)] | None = None
-    """Keep only the first frames of a scene; null keeps all."""
-    cameras: Annotated[int, Field(ge=1, le=3)] = 3
-    """How many cameras film it."""
-    sensor: Literal["model", "clean"] = "model"
-    """Depth with noise, dropouts and holes, or only quantised."""
-    seed: Annotated[int, Field(ge=0)] = 0
-    """Of the sensor's noise; the scenario's name enters too."""
 
 
 @dataclass(frozen=True, kw_only=True)

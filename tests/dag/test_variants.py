@@ -58,6 +58,8 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
             "gs_dynamics": {"width": 8, "batch": 2, "epochs": 1, "updates_per_epoch": 2, "step": 0.002},
         },
         "studies": ["table1"],
+        # The study brings phystwin and neuspring too, which other tests run.
+        "only": "method=search_only,static,controller_lbs,spring_gaus,spring_gaus_points,gs_dynamics",
         "transfers": {SCENE: ["toy_rope_shake_smooth"]},
         "compare_with": "static",
         "tracking": {"enabled": False},

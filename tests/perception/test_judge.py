@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from neuspring.config import ScenarioRow
-from neuspring.config.perception import Lift, ShapePriorSettings, Synthetic
+from neuspring.config import Synthetic
+from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making

@@ -10,7 +10,7 @@ def sweep_summaries():
 def sweep_targets(wildcards):
     if not CONFIG.tune:
         raise WorkflowError(
-            "The target sweep needs a study: the section `tune` of the configuration (config/README.md, config/tune.yaml)."
+            "The target sweep needs a study: the section `tune` of the configuration (config/README.md, config/studies/tune.yaml)."
         )
     logged = [f"{TUNE_FOLDER}/mlflow.txt"] if CONFIG.tracking.enabled else []
     return [*sweep_summaries(), *logged]
