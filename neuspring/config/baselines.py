@@ -10,10 +10,10 @@ from neuspring.config.spring_gaus import SpringGaus
 from neuspring.config.types import STRICT
 
 Model = Literal["spring_gaus", "gs_dynamics", "static", "controller_lbs"]
-"""spring_gaus: anchors with directed springs. gs_dynamics: a graph network. static: frame 0 is held. controller_lbs: the object is
-skinned to the controllers."""
+"""spring_gaus: anchors with directed springs. gs_dynamics: a graph network. static: frame 0 is frozen. controller_lbs: the object
+is skinned to the controllers."""
 TRAINING = {"spring_gaus": "neuspring.baselines.spring_gaus.setup", "gs_dynamics": "neuspring.baselines.gs_dynamics.train"}
-"""Models that are trained, and the module that all their code is reached from."""
+"""Models that are trained, and the module from which all their code is reached."""
 
 
 @dataclass(frozen=True, kw_only=True)
