@@ -7,7 +7,7 @@ from typing import Literal
 
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.config.types import STRICT
+from neuspring.config.types import Section
 
 Model = Literal["spring_gaus", "gs_dynamics", "static", "controller_lbs"]
 """spring_gaus: anchors with directed springs. gs_dynamics: a graph network. static: frame 0 is frozen. controller_lbs: the object
@@ -17,11 +17,8 @@ TRAINING = {"spring_gaus": "neuspring.baselines.spring_gaus.setup", "gs_dynamics
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baselines:
+class Baselines(Section):
     """The models of the baselines; a method's own `settings` go on top."""
 
-    __pydantic_config__ = STRICT
     spring_gaus: SpringGaus = field(default_factory=SpringGaus)
-    """See [baselines.spring_gaus](#baselinesspring_gaus)."""
     gs_dynamics: GsDynamics = field(default_factory=GsDynamics)
-    """See [baselines.gs_dynamics](#baselinesgs_dynamics)."""

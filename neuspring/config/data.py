@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive
+from neuspring.config.types import Count, NonNegative, Positive, Section
 
 FILMED = ("synthetic", "capture", "phystwin_raw")
 """Sources of raw video, from which perception makes observations."""
@@ -16,10 +16,9 @@ MADE = ("toy", "synthetic")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Toy:
+class Toy(Section):
     """Analytic scenes simulated by the float64 reference, with known stiffness."""
 
-    __pydantic_config__ = STRICT
     frames: Annotated[int, Field(ge=5)] = 60
     """Frames per scene; the first 70 % are for training."""
     frame_rate: Positive = 30.0
@@ -33,10 +32,9 @@ class Toy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mocap:
+class Mocap(Section):
     """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
 
-    __pydantic_config__ = STRICT
     stride: Count = 2
     """Use every n-th sample of the 100 Hz record."""
     start: Annotated[int, Field(ge=0)] = 0
@@ -58,10 +56,9 @@ class Mocap:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synthetic:
+class Synthetic(Section):
     """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
 
-    __pydantic_config__ = STRICT
     size: Literal["tiny", "demo", "full"] = "demo"
     """Size of the images, with meshes to match: 120 x 68, 424 x 240 or 848 x 480 pixels."""
     frames: Annotated[int, Field(ge=5)] | None = None

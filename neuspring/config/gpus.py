@@ -7,16 +7,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.types import STRICT, Count
+from neuspring.config.types import Count, Section
 
 Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9/._-]*$")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gpus:
+class Gpus(Section):
     """GPUs of this machine that jobs lease. On a cluster these are not read: its scheduler chooses."""
 
-    __pydantic_config__ = STRICT
     devices: Literal["all"] | tuple[Device, ...] = "all"
     """Indices or UUIDs of the GPUs; all: those of CUDA_VISIBLE_DEVICES, or all of the machine where it is not set."""
     jobs_per_gpu: Count = 1

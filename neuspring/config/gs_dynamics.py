@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive
+from neuspring.config.types import Count, NonNegative, Positive, Section
 
 NodeInput = Literal["full", "short"]
 Tools = Literal["points", "centroids"]
@@ -15,10 +15,9 @@ Propagation = Literal["all", "nearest"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GsDynamics:
+class GsDynamics(Section):
     """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion."""
 
-    __pydantic_config__ = STRICT
     preset: Literal["auto", "rope", "animals", "cloth"] = "auto"
     """Public configuration from which keys that are null take their values. auto: by the scenario's category: rope and DLO cables
     take rope, cloth and package take cloth, all others take animals."""

@@ -7,16 +7,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive
+from neuspring.config.types import Count, NonNegative, Positive, Section
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Appearance:
+class Appearance(Section):
     """Training of splats on frame 0; the defaults are those of the released training. Pixels are those of an image 848 wide."""
 
-    __pydantic_config__ = STRICT
     iterations: Count = 10_000
     """Optimizer steps. Each takes one view, drawn without replacement."""
     isotropic: bool = True
@@ -89,10 +88,9 @@ class Appearance:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageQuirks:
+class ImageQuirks(Section):
     """Errors of the released evaluation of pictures; all are off by default."""
 
-    __pydantic_config__ = STRICT
     second_camera_intrinsics: bool = False
     """Draw every view with the intrinsics of the second camera."""
     any_alpha: bool = False
@@ -106,10 +104,9 @@ class ImageQuirks:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LpipsWeights:
+class LpipsWeights(Section):
     """Weights of LPIPS. Nothing is downloaded; without the weights LPIPS is not computed, and tables say so."""
 
-    __pydantic_config__ = STRICT
     backbone: str | None = None
     """Path of torchvision's AlexNet (alexnet-owt-7be5be79.pth); null: it is looked for in torch hub's cache."""
     heads: str | None = None
@@ -118,10 +115,9 @@ class LpipsWeights:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Images:
+class Images(Section):
     """Appearance and the scores of pictures, for scenarios that have images."""
 
-    __pydantic_config__ = STRICT
     enabled: bool = True
     """Train splats, draw every method's prediction and score it."""
     backend: Literal["auto", "warp", "gsplat"] = "auto"
@@ -135,8 +131,5 @@ class Images:
     video: bool = True
     """Write videos: observed, predicted and error side by side, and a turntable of the twin."""
     appearance: Appearance = field(default_factory=Appearance)
-    """See [images.appearance](#imagesappearance)."""
     lpips: LpipsWeights = field(default_factory=LpipsWeights)
-    """See [images.lpips](#imageslpips)."""
     released_quirks: ImageQuirks = field(default_factory=ImageQuirks)
-    """See [images.released_quirks](#imagesreleased_quirks)."""

@@ -84,7 +84,10 @@ def section(title: str, kind: type) -> str:
     """A heading, what the section is, and a table of its keys."""
     summary = (kind.__doc__ or "").partition("\n")[0]
     lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
-    lines += [f"| `{key}` | {words} | {default} | {meaning} |" for key, words, default, meaning in fields(kind)]
+    for key, words, default, meaning in fields(kind):
+        nested = key if kind is settings.Config else f"{title}.{key}"
+        link = f"See [{nested}](#{nested.replace('.', '')})."
+        lines.append(f"| `{key}` | {words} | {default} | {link if words == 'section' else meaning} |")
     return "\n".join([f"### {title}", "", summary, "", *lines, ""])
 
 

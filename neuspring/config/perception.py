@@ -7,14 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive, Range
+from neuspring.config.types import Count, NonNegative, Positive, Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpenCvSegmentation:
+class OpenCvSegmentation(Section):
     """Segmentation by height and color against the table; hands by their color."""
 
-    __pydantic_config__ = STRICT
     height: Positive = 0.012
     """Height above the table, m, from which a pixel is foreground whatever its color; below, its color decides."""
     hand_hue: Range = (35.0, 70.0)
@@ -33,10 +32,9 @@ class OpenCvSegmentation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpenCvTracking:
+class OpenCvTracking(Section):
     """Lucas-Kanade or DIS flow with a forward-backward check."""
 
-    __pydantic_config__ = STRICT
     method: Literal["lucas_kanade", "dis"] = "lucas_kanade"
     """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
@@ -59,10 +57,9 @@ class OpenCvTracking:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GroundedSam2:
+class GroundedSam2(Section):
     """GroundingDINO and SAM 2, through `transformers` (extra `perception`); defaults are those of the released processing."""
 
-    __pydantic_config__ = STRICT
     detector: str = "IDEA-Research/grounding-dino-tiny"
     """GroundingDINO: its name on the Hugging Face hub, or a folder."""
     video_model: str = "facebook/sam2.1-hiera-large"
@@ -80,10 +77,9 @@ class GroundedSam2:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoTracker3:
+class CoTracker3(Section):
     """CoTracker3, online, from torch.hub."""
 
-    __pydantic_config__ = STRICT
     points: Count = 5000
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
     download: bool = False
@@ -91,10 +87,9 @@ class CoTracker3:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lift:
+class Lift(Section):
     """Pixels to points in the world, and which of them are trusted; defaults are those of the released processing."""
 
-    __pydantic_config__ = STRICT
     depth_range: Range = (0.2, 1.5)
     """Depth that is used, m along the optical axis."""
     depth_window: Count = 3
@@ -126,10 +121,9 @@ class Lift:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShapePriorSettings:
+class ShapePriorSettings(Section):
     """What the cameras do not see of the object in frame 0."""
 
-    __pydantic_config__ = STRICT
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
     """auto: none for `thin` categories, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
     mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure what perception costs."""
@@ -154,10 +148,9 @@ class ShapePriorSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampling:
+class Sampling(Section):
     """Structure points; defaults are those of the released processing."""
 
-    __pydantic_config__ = STRICT
     voxel: Positive = 0.005
     """Side of a voxel, m; one structure point is kept in each."""
     surface: Count = 1024
@@ -167,46 +160,34 @@ class Sampling:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Segmentation:
+class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
-    __pydantic_config__ = STRICT
     backend: Literal["given", "opencv", "grounded_sam2"] = "given"
     """given: the capture's masks. opencv: height and color. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
-    """See [perception.segment.opencv](#perceptionsegmentopencv)."""
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
-    """See [perception.segment.grounded_sam2](#perceptionsegmentgrounded_sam2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointTracking:
+class PointTracking(Section):
     """Where the pixels of frame 0 go."""
 
-    __pydantic_config__ = STRICT
     backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
     """opencv: Lucas-Kanade or DIS flow. cotracker3: the online CoTracker3 of torch.hub. truth: exact tracks of a synthetic capture,
     as many as opencv follows, to measure what perception costs."""
     opencv: OpenCvTracking = field(default_factory=OpenCvTracking)
-    """See [perception.track.opencv](#perceptiontrackopencv)."""
     cotracker3: CoTracker3 = field(default_factory=CoTracker3)
-    """See [perception.track.cotracker3](#perceptiontrackcotracker3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Perception:
+class Perception(Section):
     """Raw RGBD video to observations."""
 
-    __pydantic_config__ = STRICT
     segment: Segmentation = field(default_factory=Segmentation)
-    """See [perception.segment](#perceptionsegment)."""
     track: PointTracking = field(default_factory=PointTracking)
-    """See [perception.track](#perceptiontrack)."""
     lift: Lift = field(default_factory=Lift)
-    """See [perception.lift](#perceptionlift)."""
     shape: ShapePriorSettings = field(default_factory=ShapePriorSettings)
-    """See [perception.shape](#perceptionshape)."""
     sample: Sampling = field(default_factory=Sampling)
-    """See [perception.sample](#perceptionsample)."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the pixels that are followed and of the points that are sampled."""

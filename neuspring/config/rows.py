@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from neuspring.config.baselines import Model
-from neuspring.config.types import STRICT, Count, Name
+from neuspring.config.types import Count, Name, Section
 
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
@@ -15,10 +15,9 @@ UNTRAINED = ("static", "controller_lbs")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchRow:
+class SearchRow(Section):
     """A row of the search table: into how many regions the topology is divided, and settings of its own."""
 
-    __pydantic_config__ = STRICT
     clusters: Count
     """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
     description: str
@@ -28,10 +27,9 @@ class SearchRow:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Method:
+class Method(Section):
     """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
 
-    __pydantic_config__ = STRICT
     description: str
     """What the row is, for people."""
     search: Name | None = None
@@ -70,10 +68,9 @@ class Method:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScenarioRow:
+class ScenarioRow(Section):
     """A row of the scenario table: where a capture comes from, and what the simulation must know of it."""
 
-    __pydantic_config__ = STRICT
     scenario: Name
     """Name of the scenario."""
     source: Literal["phystwin", "mocap", "toy", "synthetic", "capture", "phystwin_raw"]

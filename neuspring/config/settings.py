@@ -16,7 +16,7 @@ from neuspring.config.perception import Perception
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses, Search
-from neuspring.config.types import STRICT, Name
+from neuspring.config.types import Name, Section
 from neuspring.core.uri import refuse_password
 
 
@@ -45,10 +45,9 @@ Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracking:
+class Tracking(Section):
     """MLflow, an index of the runs. The files are the record."""
 
-    __pydantic_config__ = STRICT
     enabled: bool = True
     """Log runs to MLflow."""
     uri: str | None = None
@@ -63,10 +62,9 @@ class Tracking:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Section):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
-    __pydantic_config__ = STRICT
     scenarios: tuple[Name, ...] = ()
     """Rows of the scenario table that are run."""
     methods: tuple[Name, ...] = ()
@@ -103,31 +101,18 @@ class Config:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
     gpus: Gpus = field(default_factory=Gpus)
-    """See [gpus](#gpus)."""
     simulation: Simulation = field(default_factory=Simulation)
-    """See [simulation](#simulation)."""
     losses: Losses = field(default_factory=Losses)
-    """See [losses](#losses)."""
     search: Search = field(default_factory=Search)
-    """See [search](#search)."""
     fit: Fit = field(default_factory=Fit)
-    """See [fit](#fit)."""
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
-    """See [released_quirks](#released_quirks)."""
     toy: Toy = field(default_factory=Toy)
-    """See [toy](#toy)."""
     mocap: Mocap = field(default_factory=Mocap)
-    """See [mocap](#mocap)."""
     synthetic: Synthetic = field(default_factory=Synthetic)
-    """See [synthetic](#synthetic)."""
     perception: Perception = field(default_factory=Perception)
-    """See [perception](#perception)."""
     images: Images = field(default_factory=Images)
-    """See [images](#images)."""
     baselines: Baselines = field(default_factory=Baselines)
-    """See [baselines](#baselines)."""
     tracking: Tracking = field(default_factory=Tracking)
-    """See [tracking](#tracking)."""
     tune: Tune | None = None
     """A sweep over settings, for the target `sweep`, see [tune](#tune); null: none."""
 

@@ -7,14 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, Finite
+from neuspring.config.types import Count, Finite, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulation:
+class Simulation(Section):
     """Integration. Which way is up, the ground and self-collision come with the scenario."""
 
-    __pydantic_config__ = STRICT
     substeps: Count | Literal["auto"] = "auto"
     """Integration steps per frame; `auto` takes the smallest count that the stability bound allows."""
     safety: Annotated[float, Field(gt=0, le=0.95)] = 0.8
@@ -32,13 +31,12 @@ class Simulation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReleasedQuirks:
+class ReleasedQuirks(Section):
     """Behaviors of the released PhysTwin code that differ from its description; all are off by default.
 
     Each is explained in neuspring/twin/README.md.
     """
 
-    __pydantic_config__ = STRICT
     integer_damping: bool = False
     """Truncate drag and dashpot to integers after the search."""
     frozen_loss_denominators: bool = False

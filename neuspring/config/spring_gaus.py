@@ -7,14 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, Finite, NonNegative, Positive
+from neuspring.config.types import Count, Finite, NonNegative, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringGaus:
+class SpringGaus(Section):
     """Anchors with directed springs, trained on masks, or, as a variant, on points."""
 
-    __pydantic_config__ = STRICT
     supervision: Literal["masks", "points"] = "masks"
     """masks: silhouettes of the splats, as published. points: the Chamfer and track losses of the other methods, with anchors drawn
     from the structure points; this needs no images."""

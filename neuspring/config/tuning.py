@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.types import STRICT, Count, Name
+from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]
@@ -15,10 +15,9 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dimension:
+class Dimension(Section):
     """What a sweep may choose for one setting: a number between `low` and `high`, or one of `choices`."""
 
-    __pydantic_config__ = STRICT
     low: Number | None = None
     """Smallest value, in the setting's unit; a whole number where the setting is one."""
     high: Number | None = None
@@ -48,10 +47,9 @@ class Dimension:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune:
+class Tune(Section):
     """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read."""
 
-    __pydantic_config__ = STRICT
     study: Annotated[Name, StringConstraints(max_length=60)]
     """Name of the sweep and of its folder in `<results>/tune`. A sweep keeps its method, space, settings and data for good."""
     method: Name

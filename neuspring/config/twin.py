@@ -8,16 +8,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive, Range
+from neuspring.config.types import Count, NonNegative, Positive, Range, Section
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Losses:
+class Losses(Section):
     """Weights of the training losses; the defaults are those of the released PhysTwin code."""
 
-    __pydantic_config__ = STRICT
     chamfer: NonNegative = 1.0
     """Weight of the squared one-way Chamfer distance."""
     track: NonNegative = 1.0
@@ -27,10 +26,9 @@ class Losses:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchRanges:
+class SearchRanges(Section):
     """Bounds of the zero-order search."""
 
-    __pydantic_config__ = STRICT
     stiffness: Range = (0.0, 1e5)
     """Stiffness Y of the springs, N."""
     object_radius: Range = (0.01, 0.05)
@@ -70,10 +68,9 @@ class SearchRanges:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchStart:
+class SearchStart(Section):
     """Where the search starts; the defaults are those of the released configuration."""
 
-    __pydantic_config__ = STRICT
     stiffness: float = 3e4
     """Stiffness Y of the springs, N."""
     object_radius: float = 0.02
@@ -101,10 +98,9 @@ class SearchStart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clusters:
+class Clusters(Section):
     """Regions of a piecewise topology: agglomerative clustering of the nodes in the rest shape; a search row says how many."""
 
-    __pydantic_config__ = STRICT
     linkage: Literal["ward", "complete", "average", "single"] = "ward"
     """Distance between regions; the two nearest regions merge. ward: the growth of their variance."""
     connectivity: Annotated[int, Field(ge=0)] = 0
@@ -112,10 +108,9 @@ class Clusters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class Search(Section):
     """Zero-order stage: CMA-ES over homogeneous material and topology."""
 
-    __pydantic_config__ = STRICT
     rollouts: Count = 220
     """Budget in candidate rollouts, the same for every method that is compared. The last generation may be cut short."""
     sigma: Positive = 1 / 6
@@ -131,11 +126,8 @@ class Search:
     """Nodes without any spring. repair: join them to their 3 nearest nodes. penalise: refuse the candidate. allow: leave them, as
     released."""
     clusters: Clusters = field(default_factory=Clusters)
-    """Regions of a piecewise topology, see [search.clusters](#searchclusters)."""
     ranges: SearchRanges = field(default_factory=SearchRanges)
-    """Bounds, see [search.ranges](#searchranges)."""
     start: SearchStart = field(default_factory=SearchStart)
-    """Start, see [search.start](#searchstart)."""
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self.start):
@@ -151,10 +143,9 @@ class Search:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringField:
+class SpringField(Section):
     """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over spring midpoints in the rest shape."""
 
-    __pydantic_config__ = STRICT
     triplane: bool = True
     """Use three feature planes (xy, yz, xz), bilinear, summed. false: F is an MLP on Fourier features of the coordinates."""
     resolution: Annotated[int, Field(ge=2)] | Literal["adaptive"] = "adaptive"
@@ -182,10 +173,9 @@ class SpringField:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
+class Fit(Section):
     """First-order stage: Adam, with gradients through the simulation. A method's `fit` says what is free per spring."""
 
-    __pydantic_config__ = STRICT
     epochs: Count = 200
     """Passes over the training frames."""
     learning_rate: Positive = 1e-3
@@ -224,7 +214,6 @@ class Fit:
     tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Fraction of the training frames on which nothing is fitted with `selection: tail`."""
     field: SpringField = dataclasses.field(default_factory=SpringField)
-    """See [fit.field](#fitfield)."""
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
 
