@@ -44,4 +44,4 @@ class ReleasedQuirks(Section):
     frame_time_667: bool = False
     """Let a frame last 667 x 5e-5 s = 33.35 ms in 667 substeps, whatever the frame rate."""
     sparse_checkpoints: bool = False
-    """Consider an epoch as the best one only every 20 epochs, and the last epoch."""
+    """Look for the best epoch only among every 20th epoch and the last."""

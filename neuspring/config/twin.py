@@ -197,8 +197,8 @@ class Fit(Section):
     clip_gradient_norm: NonNegative = 0.0
     """Largest norm of the gradient; 0 disables clipping."""
     output_bound: NonNegative = 0.0
-    """Bound of the change per spring: stiffness (and dashpot) stay within exp(+-bound) of the searched value, by bound
-    tanh(./bound); common factors come on top. 0: unbounded."""
+    """Bound b of the change per spring: stiffness (and dashpot) stay within exp(+-b) of the searched value, by b tanh(x / b).
+    Common factors come on top. 0: no bound."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
@@ -209,8 +209,8 @@ class Fit(Section):
     rest_lengths_by: Literal["springs", "field"] = "springs"
     """Trained rest lengths are free per spring, or an output of the field (for methods that have one)."""
     selection: Literal["training_loss", "tail"] = "training_loss"
-    """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the start
-    and on the last training frames, on which nothing is fitted then."""
+    """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last
+    training frames, on which nothing is fitted then; the start of the fit is a candidate too."""
     tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Fraction of the training frames on which nothing is fitted with `selection: tail`."""
     field: SpringField = dataclasses.field(default_factory=SpringField)
