@@ -21,8 +21,8 @@ class Appearance(Section):
     isotropic: bool = True
     """Each splat has one scale; false: one scale per axis."""
     fixed_radius: Positive | None = None
-    """Standard deviation of every splat, m, which is then not trained; null: it is trained, from the distance to the nearest splats
-    on."""
+    """Standard deviation of every splat, m, which is then not trained; null: it is trained, and starts from the distance to the
+    nearest splats."""
     start: Literal["seen", "shape_prior", "alpha"] = "seen"
     """Where the first splats are. seen: points that were seen, and the shape prior's points where nothing was seen. shape_prior:
     the surface of the prior alone; without a prior, as for seen, and the run's notes say so. alpha: gray splats at random within

@@ -87,7 +87,8 @@ def section(title: str, kind: type) -> str:
     for key, words, default, meaning in fields(kind):
         nested = key if kind is settings.Config else f"{title}.{key}"
         link = f"See [{nested}](#{nested.replace('.', '')})."
-        lines.append(f"| `{key}` | {words} | {default} | {link if words == 'section' else meaning} |")
+        shown = link if words == "section" else meaning.replace("|", r"\|")
+        lines.append(f"| `{key}` | {words} | {default} | {shown} |")
     return "\n".join([f"### {title}", "", summary, "", *lines, ""])
 
 

@@ -103,7 +103,7 @@ class Lift(Section):
     least_neighbours: Count = 5
     """Smallest number of neighbors of a motion that is trusted, itself included."""
     agreement: Positive = 0.005
-    """Distance, m, within which half of a motion's neighbors must move alike."""
+    """Distance, m, within which at least half of a motion's neighbors must move alike."""
     controllers: Count = 30
     """Largest number of controller points."""
     least_controllers: Count = 30
