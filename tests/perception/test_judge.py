@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from neuspring.config import ScenarioRow
-from neuspring.config import Synthetic
+from neuspring.config import ScenarioRow, Synthetic
 from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
