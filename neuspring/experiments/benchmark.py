@@ -311,7 +311,7 @@ class Benchmark:
 
 
 def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], methods: Mapping[str, Method]) -> Config:
-    """The configuration with the methods in the rows of its studies. If they add any, all stand in the order of the method table."""
+    """The configuration with the methods in the rows of its studies. If they add any, all are in the order of the method table."""
     implied = {method for study in config.studies for method in studies[study].rows.values() if method in methods}
     if implied <= set(config.methods):
         return config
