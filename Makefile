@@ -20,7 +20,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 install: $(INSTALLED)
 
 demo: $(INSTALLED)
-	$(SNAKEMAKE) --cores $(CORES) --quiet all
+	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml
 
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
@@ -30,7 +30,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile workflow/rules
-	$(BIN)/snakemake --lint
+	$(BIN)/snakemake --lint --configfile config/data/demo.yaml
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .

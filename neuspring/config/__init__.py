@@ -1,33 +1,23 @@
-"""Every setting: what it means, its unit, its range and its default, as frozen dataclasses that refuse unknown keys.
+"""Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
 
-`settings` holds the whole configuration and `parse`; each other module is one section of config/README.md. Nothing here imports
-torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
+    settings                       the whole configuration (`Config`)
+    simulation, twin               integration; losses, search, field, fit
+    data, perception, images       sources; raw video to observations; splats and their scores
+    baselines, spring_gaus, gs_dynamics
+    gpus, tuning                   sharing GPUs; sweeps over settings
+    rows                           rows of the scenario, method and search tables
+    parse                          YAML to settings and back
+    page                           writes config/README.md from all of these
+
+Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
 """
 
-from neuspring.config.settings import (
-    Clusters,
-    Config,
-    Fit,
-    Kind,
-    Losses,
-    Method,
-    Mocap,
-    ReleasedQuirks,
-    ScenarioRow,
-    Search,
-    SearchRanges,
-    SearchRow,
-    SearchStart,
-    Simulation,
-    SpringField,
-    Toy,
-    Tracking,
-    merge,
-    parse,
-    plain,
-    read_text,
-    read_yaml,
-)
+from neuspring.config.data import Mocap, Synthetic, Toy
+from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
+from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
+from neuspring.config.settings import Config, Tracking
+from neuspring.config.simulation import ReleasedQuirks, Simulation
+from neuspring.config.twin import Clusters, Fit, Losses, Search, SearchRanges, SearchStart, SpringField
 
 __all__ = [
     "Clusters",
@@ -45,6 +35,7 @@ __all__ = [
     "SearchStart",
     "Simulation",
     "SpringField",
+    "Synthetic",
     "Toy",
     "Tracking",
     "merge",

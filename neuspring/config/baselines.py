@@ -6,15 +6,12 @@ from dataclasses import dataclass, field
 
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.config.types import STRICT
+from neuspring.config.types import Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baselines:
+class Baselines(Section):
     """The models of the baselines; a method's own `settings` go on top."""
 
-    __pydantic_config__ = STRICT
     spring_gaus: SpringGaus = field(default_factory=SpringGaus)
-    """See [baselines.spring_gaus](#baselinesspring_gaus)."""
     gs_dynamics: GsDynamics = field(default_factory=GsDynamics)
-    """See [baselines.gs_dynamics](#baselinesgs_dynamics)."""

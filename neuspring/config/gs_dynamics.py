@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, NonNegative, Positive
+from neuspring.config.types import Count, NonNegative, Positive, Section
 
 NodeInput = Literal["full", "short"]
 Tools = Literal["points", "centroids"]
@@ -15,37 +15,35 @@ Propagation = Literal["all", "nearest"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GsDynamics:
-    """A graph network that moves particles by what the hands do next, a step per centimetre of hand motion."""
+class GsDynamics(Section):
+    """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion."""
 
-    __pydantic_config__ = STRICT
     preset: Literal["auto", "rope", "animals", "cloth"] = "auto"
-    """Which public configuration the keys that are null take their values from. auto: by the scenario's category; rope and DLO
-    cables: rope, cloth and package: cloth, all others: animals."""
+    """Public configuration from which keys that are null take their values. auto: by the scenario's category: rope and DLO cables
+    take rope, cloth and package take cloth, all others take animals."""
     radius: Positive | None = None
-    """Nodes nearer than this feel each other, m. rope 0.08, animals 0.08, cloth 0.075."""
+    """Distance below which nodes feel each other, m. rope 0.08, animals 0.08, cloth 0.075."""
     neighbours: Count | None = None
-    """k: a particle feels its k nearest particles, the first of which is itself. rope 5, animals 6, cloth 6."""
+    """Number k of nearest particles that a particle feels, itself included. rope 5, animals 6, cloth 6."""
     particles: Count | None = None
-    """Most particles of a graph. rope 100, animals 100, cloth 150."""
+    """Largest number of particles of a graph. rope 100, animals 100, cloth 150."""
     noise: NonNegative | None = None
-    """Uniform noise of positions in the history while training, +- m. rope 0.003, animals 0.003, cloth 0.002."""
+    """Half width of the uniform noise that training adds to positions in the history, m. rope 0.003, animals 0.003, cloth 0.002."""
     length_weight: NonNegative | None = None
-    """Lambda of the length loss. rope 0.1, animals 0.05, cloth 0.1."""
+    """Weight lambda of the length loss. rope 0.1, animals 0.05, cloth 0.1."""
     batch: Count | None = None
     """Windows per update. rope 16, animals 64, cloth 64."""
     connect_all: bool | None = None
-    """Edges between each tool and each particle, not only within the radius; null: with `tools: centroids` only."""
+    """Join each tool to each particle; false: only within the radius. null: true with `tools: centroids`, otherwise false."""
     node_input: NodeInput | None = None
-    """full: kind, heights, displacements and action of a node. short: kind and action. rope short, others full."""
+    """full: kind, heights, displacements and action of a node. short: kind and action. null: short for rope, full for the
+    others."""
     tools: Tools = "points"
     """points: every controller is a tool node. centroids: one tool node per hand, at the mean of its controllers."""
-    hand_gap: Positive = 0.08
-    """Controllers whose chain of neighbours in frame 0 has no longer gap than this are one hand, m."""
     width: Count = 512
-    """Of all hidden layers."""
+    """Units of all hidden layers."""
     rounds: Count = 3
-    """Of message passing, with the same weights."""
+    """Rounds of message passing, which share their weights."""
     history: Count = 3
     """Steps that the network sees, the present one included."""
     future: Count = 5
@@ -53,38 +51,40 @@ class GsDynamics:
     step: Positive = 0.01
     """Motion of the tools that makes a step, m."""
     last_accepted: Annotated[float, Field(gt=0, le=1)] = 0.75
-    """Part of a step at which the last training frame ends one."""
+    """Part of a step that suffices for the last training frame to end a step."""
     coverage: NonNegative = 0.03
-    """No more particles are added once all points lie within this of one, m."""
+    """Distance, m: no more particles are added once every point lies within it of a particle."""
     dense_points: Count = 1000
-    """Most tracks that particles are drawn from."""
+    """Largest number of tracks from which particles are drawn."""
     smoothing_passes: Annotated[int, Field(ge=0)] = 10
-    """Moving averages of tracks over three frames, within the training frames, of what is seen."""
+    """Passes of a moving average over three frames on the visible part of tracks, within the training frames."""
     outlier_deviations: NonNegative = 3.0
-    """Tracks are dropped whose path length differs by so many median absolute deviations from the median; 0 drops none."""
+    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
+    drops none."""
     min_visible: Count = 20
-    """Where fewer tracks are seen in all frames of a window, it takes those seen in its history, and losses leave out what is not
-    seen."""
+    """Smallest number of tracks that must be seen in all frames of a window. Where fewer are, the window takes the tracks seen in
+    its history, and the losses leave out what is not seen."""
     yaw: bool = True
     """Turn each training window by a random angle about the vertical."""
     epochs: Count = 50
-    """Passes; the released predictions are of so many, the public code trains 500 to 1000."""
+    """Passes of training. The released predictions are of 50; the public code trains 500 to 1000."""
     updates_per_epoch: Count = 100
-    """Optimiser steps per epoch, each on windows drawn at random."""
+    """Optimizer steps per epoch, each on windows drawn at random."""
     learning_rate: Positive = 1e-3
-    """Adam's."""
+    """Adam's learning rate."""
     faithful_length_loss: bool = False
-    """As published: edges to tools count in the length loss as the distance of the particle from the world's origin, which
-    penalises motion; off: they are left out."""
+    """As published, count edges to tools in the length loss with the distance of the particle from the world's origin, which
+    penalizes motion; false: leave these edges out."""
     padded_mean: bool = False
-    """As published: the mean of squared errors counts unused particles, up to `particles` per window; off: particles that are
-    there."""
+    """As published, count unused particles in the mean of squared errors, up to `particles` per window; false: count only particles
+    that exist."""
     propagation: Propagation = "all"
     """How structure points follow particles: by all of them, as published, or by the nearest."""
     nearest: Count = 16
-    """Particles that a structure point follows with `propagation: nearest`."""
+    """Number of particles that a structure point follows with `propagation: nearest`."""
     interpolate: bool = True
-    """Between steps structure points move on straight lines, which needs the next step, so offline only; off: they wait."""
+    """Move structure points on straight lines between steps, which needs the next step and so works offline only; false: they
+    wait."""
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
 

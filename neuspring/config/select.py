@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from neuspring.config.settings import Config, plain
+from neuspring.config.parse import plain
+from neuspring.config.settings import Config
 
 
 def select(config: Config, keys: Iterable[str]) -> dict[str, Any]:

@@ -7,77 +7,78 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import STRICT, Count, Finite, NonNegative, Positive
+from neuspring.config.types import Count, Finite, NonNegative, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringGaus:
+class SpringGaus(Section):
     """Anchors with directed springs, trained on masks, or, as a variant, on points."""
 
-    __pydantic_config__ = STRICT
     supervision: Literal["masks", "points"] = "masks"
     """masks: silhouettes of the splats, as published. points: the Chamfer and track losses of the other methods, with anchors drawn
-    from the structure points; needs no images."""
+    from the structure points; this needs no images."""
     anchors: Count = 1024
-    """N, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are not enough."""
+    """Number N of anchors, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are too few cells."""
     neighbours: Count = 20
-    """K: the nearest anchors that an anchor feels."""
+    """Number K of nearest anchors that an anchor feels."""
     full_neighbours: Count = 16
-    """n_c: so many of them with full weight, the others softly."""
+    """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
     bound_anchors: Count = 16
-    """Nearest anchors that a splat or a structure point follows."""
+    """Number of nearest anchors that a splat or a structure point follows."""
     exponent: NonNegative = 0.5
-    """p in (1 + |e|)^p."""
+    """Exponent p in (1 + |e|)^p, where e is the strain of a spring."""
     link_count: Count = 50
-    """Most anchors that a controller is linked to, ..."""
+    """Largest number of anchors that a controller is linked to."""
     link_reach: Positive = 0.04
-    """... none farther away in frame 0 than this, m."""
+    """Largest distance in frame 0 of a controller from an anchor that it is linked to, m."""
     link_stiffness: NonNegative = 3e4
-    """N per unit strain at 1 kg, fixed."""
+    """Stiffness of the links, N per unit strain at 1 kg; it is not trained."""
     stiffness: Positive = 2000.0
-    """10^kappa at the start, N at 1 kg."""
+    """Stiffness 10^kappa at the start, N at 1 kg."""
     damping: Positive = 0.2
-    """zeta at the start, N s at 1 kg."""
+    """Damping zeta at the start, N s at 1 kg."""
     ground_logit: Finite = -1.0
-    """rho at the start: phi = clamp(1.2 sigmoid(rho) - 0.1, 0, 1) of the velocity along the ground is left after each substep."""
+    """Value of rho at the start. After each substep, phi = clamp(1.2 sigmoid(rho) - 0.1, 0, 1) of the velocity along the ground is
+    left."""
     substeps: Count = 50
-    """Per frame at the start."""
+    """Substeps per frame at the start."""
     substeps_added: Count = 50
-    """Further substeps at each of `substeps_raised`, and whenever a frame fails."""
+    """Substeps that are added at each of `substeps_raised`, and whenever a frame fails."""
     substeps_raised: tuple[Count, ...] = (25, 50)
     """Iterations from which there are more substeps."""
     max_substeps: Count = 1000
-    """A frame that fails with so many ends training, as a failure of the run."""
+    """Largest number of substeps; if a frame fails with so many, training ends as a failure of the run."""
     iterations: Count = 100
-    """Passes over the training frames, an optimiser step per frame."""
+    """Passes over the training frames, with an optimizer step per frame."""
     stiffness_rate: Positive = 1e-3
     """Adam's learning rate of kappa."""
     ground_rate: Positive = 1e-3
-    """Of rho."""
+    """Adam's learning rate of rho."""
     soft_rate: Positive = 1e-3
-    """Of the soft vector's s."""
+    """Adam's learning rate of s, the parameter of the soft weights."""
     damping_rate: Positive = 1e-4
-    """Of exp(zeta)."""
+    """Adam's learning rate of exp(zeta)."""
     velocity_rate: Positive = 2.5e-4
-    """Of the initial velocity, one for all anchors, m/s."""
+    """Adam's learning rate of the initial velocity, which all anchors share, m/s."""
     clip_gradient_norm: NonNegative = 1.0
-    """Of each tensor by itself; 0 disables clipping."""
+    """Largest norm of the gradient of each tensor by itself; 0 disables clipping."""
     l1: NonNegative = 0.2
     """Weight of the mean absolute difference of silhouettes."""
     dssim: NonNegative = 0.8
     """Weight of 1 - SSIM."""
     centroid: NonNegative = 1.0
-    """Weight of the distance of the silhouettes' centroids, in widths of the picture."""
+    """Weight of the distance between the silhouettes' centroids, in widths of the picture."""
     features: NonNegative = 0.1
     """Weight of the mean squared difference of VGG16's features; without its weights the term is left out, and tables say so."""
     total_variation: NonNegative = 2.0
-    """Weight of the mean squared differences of neighbouring pixels of the drawn silhouette."""
+    """Weight of the mean squared differences of neighboring pixels of the drawn silhouette."""
     ignore_hands: bool = False
-    """Leave out what hands cover; as published, the object counts as absent there."""
+    """Leave out of the losses what hands cover; false: the object counts as absent there, as published."""
     negative_damping: bool = False
-    """Let zeta become negative, as published."""
+    """Let zeta become negative, as published; false: it is clamped at zero."""
     vgg16: str | None = None
-    """Weights of torchvision's VGG16 (vgg16-397923af.pth); null: in torch hub's cache. Nothing is downloaded."""
+    """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
+    downloaded."""
     checkpoint_every: Annotated[int, Field(ge=1)] = 5
     """Iterations between checkpoints from which a killed job continues."""
 

@@ -1,4 +1,4 @@
-"""Settings of a tuning study; part of `neuspring.config.settings`."""
+"""Settings of a sweep over settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.types import STRICT, Count, Name
+from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]
@@ -15,20 +15,19 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dimension:
-    """What a study may choose for one setting: a range of numbers (`low`, `high`), or one of `choices`."""
+class Dimension(Section):
+    """What a sweep may choose for one setting: a number between `low` and `high`, or one of `choices`."""
 
-    __pydantic_config__ = STRICT
     low: Number | None = None
-    """Smallest value, in the setting's unit; whole numbers where the setting is one."""
+    """Smallest value, in the setting's unit; a whole number where the setting is one."""
     high: Number | None = None
     """Largest value."""
     log: bool = False
     """Draw on a logarithmic scale."""
     step: Number | None = None
-    """Distance of the values from `low` on; null: 1 for whole numbers, continuous otherwise."""
+    """Distance between two values, from `low` on; null: 1 for whole numbers, otherwise continuous."""
     choices: tuple[Any, ...] = ()
-    """Instead of a range: any values that the setting may have."""
+    """Values to choose from instead of a range: any that the setting may have."""
 
     def __post_init__(self) -> None:
         if self.choices:
@@ -48,39 +47,38 @@ class Dimension:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune:
-    """A study: which settings of one method are varied, and how trials are spent. Test frames are never read."""
+class Tune(Section):
+    """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read."""
 
-    __pydantic_config__ = STRICT
     study: Annotated[Name, StringConstraints(max_length=60)]
-    """Name of the study and of its folder in `<results>/tune`. A study keeps its method, space, settings and data for good."""
+    """Name of the sweep and of its folder in `<results>/tune`. A sweep keeps its method, space, settings and data for good."""
     method: Name
-    """Row of the method table that is varied; its own settings, and its search row's, are the baseline (trial 0). What it does to
-    predictions alone (`carry_over`, `average_seeds`) plays no part."""
+    """Row of the method table that is varied. Trial 0 is the row as it is, with its own settings and those of its search row. What
+    the row does to predictions alone (`carry_over`, `average_seeds`) is left out."""
     space: dict[str, Dimension]
     """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
     `released_quirks`, and `clusters`, the number of regions of the method's search."""
     scenarios: tuple[Name, ...] = ()
-    """Scenarios whose mean loss is minimised; empty: the configuration's."""
+    """Scenarios whose mean loss is minimized; empty: those of the configuration."""
     seed: Whole = 0
-    """Of search, field and sampler."""
+    """Seed of search, field and sampler."""
     trials: Count = 40
-    """Finished, pruned and failed ones, over all workers. More than before: the study goes on."""
+    """Number of trials over all workers: finished, pruned and failed ones. With a larger number the sweep continues."""
     workers: Count = 1
-    """Jobs that share the study."""
+    """Number of jobs that share the sweep."""
     storage: Annotated[str, StringConstraints(pattern=r"^postgresql(\+\w+)?://\S+$")] | None = None
-    """PostgreSQL URI, for workers on several machines (no password in it: libpq reads PGPASSWORD or ~/.pgpass); null: SQLite
-    in the study's folder, for workers of one machine."""
+    """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
+    in the sweep's folder, for workers of one machine."""
     pruner: Literal["median", "hyperband", "none"] = "median"
-    """Which trials end early: those above the median of finished ones at the same epoch, those that successive halving drops, or
-    none."""
+    """Which trials end early. median: those above the median of finished ones at the same epoch. hyperband: those that successive
+    halving drops."""
     startup_trials: Whole = 10
-    """Random trials before the sampler (TPE) learns from earlier ones, and before the median prunes any."""
+    """Number of random trials, before the sampler (TPE) learns from earlier ones and before the median prunes any."""
     warmup_scenarios: Whole | None = None
-    """Scenarios that every trial runs to their end before it may be pruned: losses of one alone say little about the mean. They
-    are run in the order given; null: a third of them, rounded up, if there are several."""
+    """Number of scenarios that every trial runs to their end before it may be pruned, because the loss of one alone says little
+    about the mean. They are run in the order given; null: a third of them, rounded up, if there are several."""
     warmup_epochs: Whole = 5
-    """Epochs after those in which no trial is pruned either."""
+    """Epochs of the next scenario in which no trial is pruned either."""
 
     def __post_init__(self) -> None:
         if not self.space:

@@ -34,6 +34,7 @@ from neuspring.scores.studies import Study, read_studies
 
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
+REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
 def read_methods(path: Path) -> dict[str, Method]:
@@ -173,14 +174,15 @@ class Benchmark:
     def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
         """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
         whole = parse(Config, values, "configuration")
-        for name in ("scenarios", "methods", "seeds"):
-            if not getattr(whole, name):
-                raise InputError(f"configuration, {name}", "at least one entry is required")
         scenarios, methods = read_scenarios(root / whole.scenario_table), read_methods(root / whole.method_table)
-        _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
-        _require_known("methods", whole.methods, methods, whole.method_table)
         studies = read_studies(root / whole.study_table)
         _require_known("studies", whole.studies, studies, whole.study_table)
+        _require_known("methods", whole.methods, methods, whole.method_table)
+        whole = _with_methods_of_studies(whole, studies, methods)
+        for name in ("scenarios", "methods", "seeds"):
+            if not getattr(whole, name):
+                raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
+        _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
         config = chosen_part(whole, scenarios)
         searches = read_searches(root / config.search_table)
         wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
@@ -314,6 +316,15 @@ class Benchmark:
                 )
             if not path.exists():
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+
+
+def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], methods: Mapping[str, Method]) -> Config:
+    """The configuration with the methods in the rows of its studies. If they add any, all are in the order of the method table."""
+    implied = {method for study in config.studies for method in studies[study].rows.values() if method in methods}
+    if implied <= set(config.methods):
+        return config
+    union = implied | set(config.methods)
+    return dataclasses.replace(config, methods=tuple(name for name in methods if name in union))
 
 
 def _tuned(whole: Config) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ python -m tests.benchmarks.restart RESULTS_FOLDER DATA_SET METHOD [METHOD ...]
 
 The workflow's rollout carries what went wrong in all training frames into the future. Here the same twin starts again in the
 first frame after the split, with nodes and velocities made from the markers there as in frame 0; what is left is the model's
-own error over as many frames. RESULTS_FOLDER must have been made with config/mocap.yaml.
+own error over as many frames. RESULTS_FOLDER must have been made with config/data/mocap.yaml.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def benchmark_of(data_set: Path, methods: list[str]) -> Benchmark:
-    """The study of config/mocap.yaml, on its own scenarios alone."""
+    """The study of config/data/mocap.yaml, on its own scenarios alone."""
     values = config.read_yaml(ROOT / "config/config.yaml")
-    config.merge(values, config.read_yaml(ROOT / "config/mocap.yaml"))
+    config.merge(values, config.read_yaml(ROOT / "config/data/mocap.yaml"))
     config.merge(values, {"methods": methods, "compare_with": None, "data_root": str(data_set), "transfers": None})
     return Benchmark.of(values, ROOT)
 

@@ -18,7 +18,7 @@ def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
     settings = tmp_path / "small.yaml"
     settings.write_text("toy: {frames: 5}\n")
     output = tmp_path / "observations.npz"
-    arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/config.yaml,{settings}"]
+    arguments = ["observe", "--scenario", "toy_blob_lift_smooth", "--settings", f"config/data/demo.yaml,{settings}"]
     assert main([*arguments, "--output", str(output)]) == 0
     assert Observations.load(output).scenario.frame_count == 5
 

@@ -54,6 +54,16 @@ def test_values_reach_their_place() -> None:
     assert (made.fit.learning_rate, made.fit.horizon, made.seeds) == (0.01, 0, (3, 1))
 
 
+@pytest.mark.parametrize(("text", "seeds"), [("'0,1,2'", (0, 1, 2)), ("'4'", (4,)), ("7", (7,)), ("['2', '0']", (2, 0))])
+def test_seeds_may_be_text_as_the_command_line_hands_them_over(text: str, seeds: tuple[int, ...]) -> None:
+    assert load(f"seeds: {text}\n").seeds == seeds
+
+
+def test_no_transfers_may_be_asked_for_on_the_command_line() -> None:
+    assert load("transfers: 'null'\n").transfers is None
+    assert load("transfers: {rope: [other]}\n").transfers == {"rope": ("other",)}
+
+
 # Mistakes -------------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
@@ -119,6 +129,8 @@ MISTAKES = {
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
     "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
     "a mapping for a list": ("seeds: {a: 1}", "seeds"),
+    "a word among seeds": ("seeds: 0,a", "seeds: integers separated by commas are required, as in seeds=0,1,2, received '0,a'"),
+    "a truth for a seed": ("seeds: true", "seeds", "received True"),
     "a date": ("results: 2026-01-01", "values must be plain YAML"),
 }
 

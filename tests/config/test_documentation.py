@@ -7,14 +7,14 @@ from pathlib import Path
 import yaml
 
 from neuspring import config
-from tests.support import config_readme
+from neuspring.config import page as config_page
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_the_configuration_page_is_up_to_date_and_complete():
     page = (ROOT / "config" / "README.md").read_text()
-    assert page == config_readme.text(), "run: python -m tests.support.config_readme"
+    assert page == config_page.text(), "run: python -m neuspring.config.page"
     assert "|  |\n" not in page  # every key has a meaning
 
 
@@ -28,9 +28,9 @@ def sections(kind: type) -> set[type]:
 
 
 def test_every_section_is_on_the_page():
-    assert set(config_readme.KEYS.values()) == sections(config.Config)
-    page = config_readme.text()
-    for title in config_readme.KEYS:
+    assert set(config_page.KEYS.values()) == sections(config.Config)
+    page = config_page.text()
+    for title in config_page.KEYS:
         assert f"### {title}\n" in page
         # Titles are reached by the anchors that fields name.
         assert title == "(top level)" or f"](#{title.replace('.', '')})" in page
@@ -39,20 +39,20 @@ def test_every_section_is_on_the_page():
 def test_shown_defaults_are_accepted_as_they_are_written():
     """Read as YAML by the strict configuration, they are the defaults (but for sigma, which is shown rounded)."""
     written = {}
-    for title, kind in config_readme.KEYS.items():
+    for title, kind in config_page.KEYS.items():
         if title.startswith("tune"):
             continue  # null unless it is set
         place = written
         for name in [] if title == "(top level)" else title.split("."):
             place = place.setdefault(name, {})
-        place |= {key: yaml.safe_load(default.strip("`")) for key, _, default, _ in config_readme.fields(kind) if default}
+        place |= {key: yaml.safe_load(default.strip("`")) for key, _, default, _ in config_page.fields(kind) if default}
     made = config.parse(config.Config, written, "the page")
     assert config.plain(made) | {"search": None} == config.plain(config.Config()) | {"search": None}
     assert dataclasses.replace(made.search, sigma=1 / 6) == config.Search()
 
 
 def test_ranges_are_those_that_the_configuration_enforces():
-    shown = {key: words for key, words, _, _ in config_readme.fields(config.Fit)}
+    shown = {key: words for key, words, _, _ in config_page.fields(config.Fit)}
     assert shown["epochs"] == "integer >= 1"
     assert shown["tail_fraction"] == "number > 0 and < 1"
     assert shown["betas"] == "[number >= 0 and < 1, number >= 0 and < 1]"

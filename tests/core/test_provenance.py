@@ -84,6 +84,7 @@ def test_everything_that_makes_pictures_counts(copy, file, old, new):
 def test_modules_that_are_imported_by_name_count(copy):
     """Backends, readers and baselines: the registries name them, and the workflow adds them to the stage that uses them."""
     values = config.read_yaml(ROOT / "config" / "config.yaml")
+    config.merge(values, config.read_yaml(ROOT / "config" / "data" / "demo.yaml"))
     inputs = Inputs(Benchmark.of(values, ROOT))
     job = SimpleNamespace(scenario=inputs.config.scenarios[0], camera="0", method=inputs.config.methods[0], seed=0)
 

@@ -145,7 +145,7 @@ def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(place, tmp_path)
         (tmp_path / "data" / "different_types" / name).mkdir(parents=True)
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
     command += ["--cores", "8", "--dry-run", "--quiet", "rules"]
-    command += ["--configfile", "config/benchmark.yaml", "--config", f"data_root={tmp_path}"]
+    command += ["--configfile", "config/data/phystwin.yaml", "--config", f"data_root={tmp_path}"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), gpus.VISIBLE: ""}
     done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=200, check=True)
     # Of the baselines' models Spring-Gaus needs images, which these folders do not have.

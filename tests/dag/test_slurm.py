@@ -37,7 +37,7 @@ def benchmark(tmp_path_factory):
                 [
                     *(sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/slurm"),
                     *("--default-resources", "slurm_partition=main", "--slurm-init-seconds-before-status-checks", "2"),
-                    *("--configfile", "config/config.yaml", "overlay.yaml"),
+                    *("--configfile", "config/data/demo.yaml", "overlay.yaml"),
                 ],
                 cwd=project,
                 env=os.environ | {"PYTHONPATH": str(ROOT)},

@@ -113,7 +113,7 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(place / "Snakefile"), "--cores", "1"]
     target = f"{results}/{SCENE}/observations.npz"
     arguments(place)
-    command += ["--configfile", str(place / "config/config.yaml"), str(place / "overlay.yaml"), "--config", f"results={results}"]
+    command += ["--configfile", str(place / "config/data/demo.yaml"), str(place / "overlay.yaml"), "--config", f"results={results}"]
     done = subprocess.run([*command, "--", target], cwd=elsewhere, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
     assert Path(target).is_file()

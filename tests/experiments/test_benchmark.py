@@ -287,7 +287,7 @@ def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
 
 def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
     names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_ignore_hands"]
-    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": names}
+    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
     values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
     made = Benchmark.of(values, ROOT)
     assert made.pictured == {"spring_gaus", "spring_gaus_ignore_hands"}
@@ -317,7 +317,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     """Every row of the method table, with the search that it names."""
     root = ROOT
     methods = tuple(tables.read_methods(root / "config" / "methods.yaml"))
-    values = config.read_yaml(root / "config" / "config.yaml")
+    values = config.read_yaml(root / "config" / "data" / "demo.yaml")
     made = Benchmark.of(values | {"methods": list(methods)}, root)
     for name, method in made.methods.items():
         if method.search:
@@ -331,11 +331,20 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
 @pytest.mark.parametrize(
     "overlays",
     [
-        [],
-        ["clusters"],
-        ["baselines"],
-        ["mocap", "baselines"],
+        ["demo"],
+        ["demo", "baselines"],
+        ["demo", "perception"],
+        ["demo", "perception", "clean_depth"],
+        ["demo", "true_observations"],
+        ["demo", "heldout"],
+        ["toy"],
+        ["toy", "clusters"],
+        ["toy", "paper"],
+        ["toy", "tune"],
+        ["synthetic"],
+        ["synthetic", "paper"],
         ["mocap"],
+        ["mocap", "baselines"],
         ["mocap", "clusters"],
         ["mocap", "mocap_first_frame"],
         ["mocap", "mocap_free"],
@@ -344,19 +353,13 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_pieces"],
         ["mocap", "mocap_field"],
         ["mocap", "mocap_prediction"],
-        ["mocap", "one_seed"],
-        ["benchmark"],
-        ["benchmark", "tune"],
-        ["toy", "paper"],
-        ["toy", "tune"],
         ["mocap", "paper"],
-        ["synthetic", "paper"],
+        ["phystwin"],
+        ["phystwin", "tune"],
     ],
 )
 def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
-    values = {}
-    for name in ["config", *overlays]:
-        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
+    values = shipped(*overlays)
     for row in tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values():
         (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / row.path).touch()
@@ -367,21 +370,55 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
         assert Plan.of(benchmark.config, benchmark.config.tune, ROOT)
 
 
+def shipped(data: str, *studies: str) -> dict:
+    """What the workflow reads of config/config.yaml, a file of config/data and files of config/studies."""
+    values: dict = {}
+    for name in ("config", f"data/{data}", *(f"studies/{study}" for study in studies)):
+        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
+    return values
+
+
+def test_the_default_configuration_names_the_tables_alone():
+    default = config.read_yaml(ROOT / "config" / "config.yaml")
+    assert set(default) == {"scenario_table", "method_table", "search_table", "study_table"}
+    assert config.parse(config.Config, default, "config.yaml") == config.Config()
+    with pytest.raises(InputError, match=r"--configfile config/data/demo\.yaml"):
+        Benchmark.of(default, ROOT)
+
+
+def test_the_synthetic_benchmark_has_the_sizes_of_the_demo():
+    demo, synthetic = shipped("demo"), shipped("synthetic")
+    for section in ("methods", "perception", "images", "search", "fit", "baselines"):
+        assert synthetic[section] == demo[section]
+
+
 def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
-    whole, paper = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("benchmark", "paper"))
+    whole, paper = shipped("phystwin"), config.read_yaml(ROOT / "config" / "studies" / "paper.yaml")
     assert {name: whole[name] for name in paper} == paper
-    studies = read_studies(ROOT / "config" / "studies.yaml")
-    assert list(studies) == paper["studies"]
-    known = set(tables.read_methods(ROOT / "config" / "methods.yaml"))
-    named = {method for study in studies.values() for method in study.rows.values()}
-    assert named & known <= set(paper["methods"])
+    assert list(read_studies(ROOT / "config" / "studies.yaml")) == paper["studies"]
     rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values()
     assert {row.scenario for row in rows if row.source == "phystwin"} == set(whole["scenarios"])
 
 
+def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
+    studies, methods = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("studies", "methods"))
+    made = Benchmark.of(shipped("toy", "paper"), ROOT).whole.methods
+    named = {method for study in studies.values() for method in study["rows"].values()}
+    listed = set(shipped("toy", "paper")["methods"])
+    assert made == tuple(name for name in methods if name in named | listed)
+    # Methods that are all listed keep the order in which they are listed.
+    some = shipped("toy") | {"studies": ["table3"], "methods": ["neuspring", "fixed_resolution", "no_triplane"]}
+    assert Benchmark.of(some, ROOT).whole.methods == ("neuspring", "fixed_resolution", "no_triplane")
+    assert Benchmark.of(shipped("toy") | {"studies": ["table3"], "methods": []}, ROOT).whole.methods == (
+        "neuspring",
+        "no_triplane",
+        "fixed_resolution",
+    )
+
+
 def test_every_method_that_is_shipped_is_valid():
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
-    values = config.read_yaml(ROOT / "config" / "config.yaml") | {"methods": list(methods)}
+    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
     benchmark = Benchmark.of(values, ROOT)
     # Rows that differ in the prediction alone, or in the name, share the fit.
     shared = {name: owner for name, owner in benchmark.fit_of_method.items() if name != owner}

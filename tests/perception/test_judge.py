@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from neuspring.config import ScenarioRow
-from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings, Synthetic
+from neuspring.config import ScenarioRow, Synthetic
+from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making

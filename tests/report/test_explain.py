@@ -102,10 +102,10 @@ def test_a_run_says_what_made_it(results):
 
 
 def test_the_command_names_the_run_and_its_stages(results):
-    run = explain("table3/NeuSpring/future/chamfer", results, results / "tables", ["config/phystwin.yaml"]).runs[0]
+    run = explain("table3/NeuSpring/future/chamfer", results, results / "tables", ["config/data/phystwin.yaml"]).runs[0]
     assert run.command == (
         f"snakemake {results}/{NAMES[0]}/neuspring/0/run.json --profile workflow/profiles/default --cores 1 "
-        f"--configfile config/phystwin.yaml --config results={results} 'only=scenario={NAMES[0]} method=neuspring seed=0' "
+        f"--configfile config/data/phystwin.yaml --config results={results} 'only=scenario={NAMES[0]} method=neuspring seed=0' "
         "device=cpu --forcerun fit score"
     )
 

@@ -42,7 +42,7 @@ def arguments(project: Path, changes=None, *extra: str) -> list[str]:
     overlay = project / "overlay.yaml"
     overlay.write_text(yaml.safe_dump(config_with(changes or {})))
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2"]
-    return [*command, "--configfile", "config/config.yaml", str(overlay), *extra]
+    return [*command, "--configfile", "config/data/demo.yaml", str(overlay), *extra]
 
 
 def config_with(changes: dict) -> dict:

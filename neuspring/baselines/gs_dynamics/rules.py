@@ -53,7 +53,6 @@ class Rules:
     connect_all: bool
     node_input: NodeInput
     tools: Tools
-    hand_gap: float
     width: int
     rounds: int
     history: int

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.config import ScenarioRow
-from neuspring.config.perception import Synthetic
+from neuspring.config.data import Synthetic
 from neuspring.core.device import quiet
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.points import farthest

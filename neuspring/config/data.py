@@ -1,0 +1,66 @@
+"""Settings of the sources of data that this package makes or samples itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from neuspring.config.types import Count, NonNegative, Positive, Section
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toy(Section):
+    """Analytic scenes simulated by the float64 reference, with known stiffness."""
+
+    frames: Annotated[int, Field(ge=5)] = 60
+    """Frames per scene; the first 70 % are for training."""
+    frame_rate: Positive = 30.0
+    """Frames per second."""
+    noise: NonNegative = 0.0005
+    """Standard deviation of the observation noise, m."""
+    occlusion: Annotated[float, Field(ge=0, lt=1)] = 0.2
+    """Fraction of point-frames hidden, in runs of several frames."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of noise and occlusion; the scenario's name enters too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mocap(Section):
+    """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
+
+    stride: Count = 2
+    """Use every n-th sample of the 100 Hz record."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Samples left out at the beginning of the record."""
+    frames: Annotated[int, Field(ge=5)] | None = None
+    """Number of frames that are kept, the first ones, counted after the stride; null keeps all."""
+    spacing: Positive = 0.012
+    """Distance of rings along the center line, m."""
+    rings: Annotated[int, Field(ge=2)] | None = None
+    """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable; null: by `spacing`."""
+    radius: Positive = 0.006
+    """Radius of the rings, m."""
+    ring: Annotated[int, Field(ge=3)] = 4
+    """Nodes per ring."""
+    rest_shape: Literal["first_frame", "straight"] = "first_frame"
+    """Shape without forces. first_frame: frame 0, as in the paper. straight: a straight cable with the arc lengths of frame 0."""
+    train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    """Fraction of the frames that are for training, the first ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthetic(Section):
+    """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
+
+    size: Literal["tiny", "demo", "full"] = "demo"
+    """Size of the images, with meshes to match: 120 x 68, 424 x 240 or 848 x 480 pixels."""
+    frames: Annotated[int, Field(ge=5)] | None = None
+    """Number of frames that are kept, the first ones; null keeps all."""
+    cameras: Annotated[int, Field(ge=1, le=3)] = 3
+    """Number of cameras that film the scene."""
+    sensor: Literal["model", "clean"] = "model"
+    """model: depth with noise, dropouts and holes. clean: depth that is only quantized."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of the sensor's noise; the scenario's name enters too."""

@@ -1,0 +1,85 @@
+"""Plain YAML values to settings and back. Unknown keys raise, values are never cast, every problem is listed with its path."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from neuspring.core.errors import InputError
+from neuspring.core.uri import masked
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
+    """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
+    try:
+        result: T = _adapter(kind).validate_json(json.dumps(values), strict=True)  # type: ignore[arg-type]
+        return result
+    except TypeError as error:
+        raise InputError(where, "values must be plain YAML", str(error)) from error
+    except ValidationError as error:
+        problems = [_describe(problem) for problem in error.errors()]
+        raise InputError(where, "\n  " + "\n  ".join(problems), remedy="\nSee config/README.md for every key.") from error
+
+
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Building one takes longer than a thousand uses of it."""
+    return TypeAdapter(kind)
+
+
+def _describe(problem: Any) -> str:
+    path = ".".join(str(part) for part in problem["loc"] if not str(part).startswith("constrained")) or "(top level)"
+    value = problem["input"]
+    if problem["type"] == "unexpected_keyword_argument":
+        return f"{path}: unknown key"
+    if problem["type"] == "missing":
+        return f"{path}: required, but missing"
+    hint = ""
+    if isinstance(value, str) and problem["type"] in ("float_type", "int_type"):
+        hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{path}: {message[:1].lower()}{message[1:]}, received {masked(repr(value))}{hint}"
+
+
+def plain(settings: Any) -> dict[str, Any]:
+    """The settings as plain YAML/JSON values (lists, not tuples)."""
+    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
+    return result
+
+
+def read_text(path: Path) -> str:
+    """A file's text. Raises InputError."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "this file must be readable UTF-8 text", error) from error
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML mapping from a file. Raises InputError."""
+    try:
+        values = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise InputError(path, "this file must be YAML", str(error).replace("\n", " ")) from error
+    if not isinstance(values, dict):
+        raise InputError(path, "this file must hold a YAML mapping", type(values).__name__)
+    return values
+
+
+def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
+    """Put `overlay` on top of `base`, in place: mappings merge, everything else replaces."""
+    for key, value in overlay.items():
+        below = base.get(key)
+        if isinstance(value, Mapping) and isinstance(below, dict):
+            merge(below, value)
+        else:
+            base[key] = value

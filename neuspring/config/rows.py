@@ -1,0 +1,73 @@
+"""Rows of the tables that a configuration names: scenarios, methods, searches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from neuspring.config.types import Count, Name, Section
+
+Kind = Literal["springs", "field"]
+"""What a first-order stage trains: each spring by itself, or the neural spring field."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchRow(Section):
+    """A row of the search table: into how many regions the topology is divided, and settings of its own."""
+
+    clusters: Count
+    """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
+    description: str
+    """What the row is, for people."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Search settings of this row alone (keys of `search`), on top of the configuration's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method(Section):
+    """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
+
+    description: str
+    """What the row is, for people."""
+    search: Name | None = None
+    """A row of the search table; methods that name the same row share the search."""
+    fit: Kind | None = None
+    """What the first-order stage trains: each spring by itself, or the neural spring field; null: there is no such stage."""
+    model: Name | None = None
+    """A baseline, which has neither search nor fit: spring_gaus, gs_dynamics, static or controller_lbs."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
+    section of `baselines`."""
+    appearance: dict[str, Any] | None = None
+    """Makes splats for this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
+    methods share."""
+    carry_over: bool = False
+    """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
+    average_seeds: bool = False
+    """Predict the mean of the trajectories of all seeds; this costs as many fits as there are seeds."""
+
+    def __post_init__(self) -> None:
+        if (self.search is None) == (self.model is None):
+            raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
+        twins_only = {"fit": self.fit, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
+        misplaced = [name for name, value in twins_only.items() if value]
+        if self.model and misplaced:
+            raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to model {self.model}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioRow(Section):
+    """A row of the scenario table: where a capture comes from, and what the simulation must know of it."""
+
+    scenario: Name
+    """Name of the scenario."""
+    source: Name
+    """The kind of its data: phystwin, mocap, toy, synthetic, capture or phystwin_raw."""
+    category: Name
+    """Kind of object: rope, cloth, package, sloth, ..."""
+    path: str
+    """Folder or file under data_root; for toy and synthetic scenes, the scene's name."""
+    self_collision: bool
+    """Whether the object may touch itself."""
+    ground: bool
+    """Whether there is a ground."""
