@@ -57,10 +57,11 @@ def _ui(a: argparse.Namespace) -> int:
 
 
 def _check_data(a: argparse.Namespace) -> int:
-    from neuspring.data import check
+    from neuspring.data.check import render
+    from neuspring.scores.released.check_data import check
 
-    departures = check.check(a.folder)
-    print(check.render(departures))
+    departures = check(a.folder)
+    print(render(departures))
     return 2 if any(departure.level == "error" for departure in departures) else 0
 
 
@@ -139,13 +140,14 @@ def _study_of(a: argparse.Namespace) -> tuple[Config, Tune]:
 
 
 def _fetch(a: argparse.Namespace) -> int:
-    from neuspring.data import check
+    from neuspring.data.check import render
     from neuspring.data.fetch import fetch
+    from neuspring.scores.released.check_data import check
 
-    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run)
+    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)
     if a.dry_run:
         return 0
-    print(check.render(departures))
+    print(render(departures))
     return 2 if any(departure.level == "error" for departure in departures) else 0
 
 

@@ -30,59 +30,15 @@ from neuspring.config.types import STRICT, Finite, Name, Positive
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
+from neuspring.data.calibration import TEXT_TOLERANCE, intrinsics_departures, pose_departures
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 
 CAPTURE, TRACKS = "capture.json", "tracks.json"
-FORMAT = 1
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
-RIGID_TOLERANCE = 1e-4
-"""Of R^T R - 1; leaves room for matrices that went through text with five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraEntry:
-    """One camera of capture.json."""
-
-    __pydantic_config__ = STRICT
-    name: Name
-    """Its folder under color, depth and mask."""
-    width: Annotated[int, Field(ge=16)]
-    height: Annotated[int, Field(ge=16)]
-    intrinsics: tuple[Row3, Row3, Row3]
-    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
-    camera_to_world: tuple[Row4, Row4, Row4, Row4]
-    """Rigid, m."""
-    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    """Frames that this camera does not have."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Description:
-    """capture.json."""
-
-    __pydantic_config__ = STRICT
-    format: Literal[1]
-    name: Name
-    category: str
-    """What the object is, in words: cloth, rope, package, ..."""
-    frame_count: Annotated[int, Field(ge=5)]
-    frame_rate: Positive
-    """Frames per second."""
-    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
-    depth_unit: Positive = 0.001
-    """Metres per count of an integer depth image."""
-    depth_format: Literal["png", "npy"] = "png"
-    up: Literal["+z", "-z"] = "+z"
-    """Which way is up along the world's z axis."""
-    train_end: Annotated[int, Field(ge=2)] | None = None
-    """Training frames are [0, train_end); null: the first 70 %."""
-    masks: bool = False
-    """Whether mask/ is there."""
-    provenance: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +72,52 @@ class Camera:
         return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CameraEntry:
+    """One camera of capture.json."""
+
+    __pydantic_config__ = STRICT
+    name: Name
+    """Its folder under color, depth and mask."""
+    width: Annotated[int, Field(ge=16)]
+    height: Annotated[int, Field(ge=16)]
+    intrinsics: tuple[Row3, Row3, Row3]
+    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
+    camera_to_world: tuple[Row4, Row4, Row4, Row4]
+    """Rigid, m."""
+    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Frames that this camera does not have."""
+
+    def camera(self) -> Camera:
+        """The calibrated camera."""
+        return Camera(self.name, self.width, self.height, np.array(self.intrinsics), np.array(self.camera_to_world))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """capture.json."""
+
+    __pydantic_config__ = STRICT
+    format: Literal[1]
+    name: Name
+    category: str
+    """What the object is, in words: cloth, rope, package, ..."""
+    frame_count: Annotated[int, Field(ge=5)]
+    frame_rate: Positive
+    """Frames per second."""
+    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    depth_unit: Positive = 0.001
+    """Metres per count of an integer depth image."""
+    depth_format: Literal["png", "npy"] = "png"
+    up: Literal["+z", "-z"] = "+z"
+    """Which way is up along the world's z axis."""
+    train_end: Annotated[int, Field(ge=2)] | None = None
+    """Training frames are [0, train_end); null: the first 70 %."""
+    masks: bool = False
+    """Whether mask/ is there."""
+    provenance: dict[str, str] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """A capture folder, its images read on demand."""
@@ -135,10 +137,7 @@ class Capture:
     @cached_property
     def cameras(self) -> dict[str, Camera]:
         """By name, in the order of capture.json."""
-        return {
-            c.name: Camera(c.name, c.width, c.height, np.array(c.intrinsics), np.array(c.camera_to_world))
-            for c in self.description.cameras
-        }
+        return {entry.name: entry.camera() for entry in self.description.cameras}
 
     @property
     def frame_count(self) -> int:
@@ -263,43 +262,25 @@ def read_description(path: Path) -> Description:
 
 
 def description_departures(path: Path, description: Description) -> list[Departure]:
-    """What types cannot say: calibration, frame numbers, the split."""
-    found = []
+    """Rules that types cannot express: calibration, frame numbers, the split."""
+    departures = []
     names = [camera.name for camera in description.cameras]
     if len(set(names)) < len(names):
-        found.append(broken(path, "cameras", "names must differ", names))
+        departures.append(broken(path, "cameras", "names must differ", names))
     if description.train_end is not None and description.train_end > description.frame_count:
-        found.append(broken(path, "train_end", f"must be at most frame_count = {description.frame_count}", description.train_end))
+        rule = f"must be at most frame_count = {description.frame_count}"
+        departures.append(broken(path, "train_end", rule, description.train_end))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
-        found += _calibration_departures(path, where, camera)
+        size = (camera.width, camera.height)
+        departures += intrinsics_departures(path, f"{where}.intrinsics", np.array(camera.intrinsics), size)
+        departures += pose_departures(path, f"{where}.camera_to_world", np.array(camera.camera_to_world), TEXT_TOLERANCE)
         beyond = [frame for frame in camera.missing if frame >= description.frame_count]
         if beyond:
-            found.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
+            departures.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
         if 0 in camera.missing:
-            found.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
-    return found
-
-
-def _calibration_departures(path: Path, where: str, camera: CameraEntry) -> list[Departure]:
-    found = []
-    k = np.array(camera.intrinsics)
-    if not (k[0, 0] > 0 and k[1, 1] > 0 and k[0, 1] == 0 and np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])):
-        found.append(broken(path, f"{where}.intrinsics", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0", k.tolist()))
-    elif not (0 <= k[0, 2] < camera.width and 0 <= k[1, 2] < camera.height):
-        found.append(
-            broken(path, f"{where}.intrinsics", f"(cx, cy) must lie in the {camera.width} x {camera.height} image", k.tolist())
-        )
-    pose = np.array(camera.camera_to_world)
-    error = float(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max())
-    if error > RIGID_TOLERANCE or np.linalg.det(pose[:3, :3]) < 0:
-        rule = "the upper left 3 x 3 block must be a rotation (orthonormal, right-handed)"
-        found.append(
-            broken(path, f"{where}.camera_to_world", rule, f"a departure of {error:.3g} from R^T R = 1, or a mirror image")
-        )
-    if not np.array_equal(pose[3], [0, 0, 0, 1]):
-        found.append(broken(path, f"{where}.camera_to_world", "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
-    return found
+            departures.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+    return departures
 
 
 def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:

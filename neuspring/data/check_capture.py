@@ -9,7 +9,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, description_departures, read_description
-from neuspring.data.departure import Case, Departure, broken, note, unusual
+from neuspring.data.departure import Departure, Inspection, broken, note, unusual
 
 NEAR, FAR = 0.1, 10.0
 """m: a median depth outside means another unit."""
@@ -28,21 +28,22 @@ def is_capture(folder: Path) -> bool:
 
 def check_capture(folder: Path) -> list[Departure]:
     """Description, calibration, every image, masks of frame 0, tracks."""
-    case, path = Case(folder, None), folder / CAPTURE
+    case, path = Inspection(folder), folder / CAPTURE
     description = case.load(path, read_description)
     if description is None:
-        return case.found
-    case.found += description_departures(path, description)
+        return case.departures
+    case.departures += description_departures(path, description)
     capture = Capture(folder, description)
     for name in capture.cameras:
         _check_camera(case, capture, name)
     case.load(folder / "tracks.json", lambda _: capture.tracks())
     if not description.masks:
-        case.found.append(note(path, "masks: false: masks are not checked; perception.segment needs another backend than given"))
-    return case.found
+        message = "masks: false: masks are not checked; perception.segment needs another backend than given"
+        case.departures.append(note(path, message))
+    return case.departures
 
 
-def _check_camera(case: Case, capture: Capture, name: str) -> None:
+def _check_camera(case: Inspection, capture: Capture, name: str) -> None:
     depths, areas = [], np.zeros((3, capture.frame_count))
     for frame in range(capture.frame_count):
         if not capture.has(name, frame):
@@ -55,11 +56,10 @@ def _check_camera(case: Case, capture: Capture, name: str) -> None:
             if capture.description.masks:
                 areas[:, frame] = np.bincount(capture.mask(name, frame).ravel(), minlength=3)[:3]
         except InputError as error:
-            where, _, message = str(error).partition(": ")
-            case.found.append(Departure(Path(where), "error", message))
-    case.found += depth_departures(capture, name, depths)
+            case.departures.append(Departure.of_error(error))
+    case.departures += depth_departures(capture, name, depths)
     if capture.description.masks:
-        case.found += mask_departures(capture, name, areas)
+        case.departures += mask_departures(capture, name, areas)
 
 
 def depth_departures(capture: Capture, name: str, medians: list[float]) -> list[Departure]:

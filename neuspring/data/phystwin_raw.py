@@ -17,7 +17,8 @@ from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data import phystwin
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer, description_departures
+from neuspring.data.calibration import metadata_departures, poses_departures
+from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
@@ -43,23 +44,13 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     width, height = metadata["WH"]
     frames = int(metadata["frame_num"])
     has_masks = (case / "mask").is_dir()
-    cameras = tuple(
-        CameraEntry(
-            name=str(index),
-            width=width,
-            height=height,
-            intrinsics=_rows(intrinsics),
-            camera_to_world=_rows(pose),
-        )
-        for index, (intrinsics, pose) in enumerate(zip(metadata["intrinsics"], poses, strict=True))
-    )
     description = Description(
         format=1,
         name=row.scenario,
         category=row.category,
         frame_count=frames,
         frame_rate=float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
-        cameras=cameras,
+        cameras=camera_entries(metadata, poses),
         depth_unit=0.001,
         depth_format="npy",
         up="-z",
@@ -67,7 +58,6 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         masks=has_masks,
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (phystwin.METADATA, CALIBRATION)},
     )
-    refuse(description_departures(case / CALIBRATION, description))
     writer = Writer(folder, description)
     capture = writer.capture
     for camera in capture.cameras:
@@ -91,25 +81,26 @@ def camera_count(case: Path) -> int:
 
 
 def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
-    """Keys and shapes of metadata.json and calibrate.pkl."""
-    path, calibration = case / phystwin.METADATA, case / CALIBRATION
+    """Frame rate, frame count and calibration in metadata.json and calibrate.pkl."""
+    path = case / phystwin.METADATA
+    departures = phystwin.frame_rate_departures(path, metadata)
     if not isinstance(metadata, dict):
-        return [broken(path, "", "a JSON object is required", type(metadata).__name__)]
-    found = phystwin.frame_rate_departures(path, metadata)
-    size, count = metadata.get("WH"), metadata.get("frame_num")
-    if not (isinstance(size, list) and len(size) == 2 and all(type(v) is int and v > 0 for v in size)):
-        found.append(broken(path, "WH", "[width, height] in pixels is required", size))
+        return departures
+    count, intrinsics = metadata.get("frame_num"), metadata.get("intrinsics")
     if type(count) is not int or count < 5:
-        found.append(broken(path, "frame_num", "at least 5 frames are required", count))
-    intrinsics: Any = metadata.get("intrinsics")
-    if not isinstance(intrinsics, list) or any(np.shape(k) != (3, 3) for k in intrinsics):
-        found.append(broken(path, "intrinsics", "a list of 3 x 3 matrices is required", np.shape(intrinsics) or "nothing"))
-        intrinsics = []
-    if not isinstance(poses, list) or any(np.shape(pose) != (4, 4) for pose in poses):
-        found.append(broken(calibration, "", "a list of 4 x 4 camera-to-world matrices is required", type(poses).__name__))
-    elif len(poses) != len(intrinsics):
-        found.append(broken(calibration, "", f"{phystwin.METADATA} has {len(intrinsics)} cameras", f"{len(poses)} matrices"))
-    return found
+        departures.append(broken(path, "frame_num", "at least 5 frames are required", count))
+    departures += metadata_departures(path, metadata)
+    return departures + poses_departures(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
+
+
+def camera_entries(metadata: dict[str, Any], poses: list[np.ndarray]) -> tuple[CameraEntry, ...]:
+    """The cameras that metadata.json and calibrate.pkl describe, named by their numbers. `raw_departures` must have no errors."""
+    width, height = metadata["WH"]
+    matrices = enumerate(zip(metadata["intrinsics"], poses, strict=True))
+    return tuple(
+        CameraEntry(name=str(index), width=width, height=height, intrinsics=_rows(intrinsics), camera_to_world=_rows(pose))
+        for index, (intrinsics, pose) in matrices
+    )
 
 
 def _detections(case: Path, camera: str) -> dict[int, list[str]]:
@@ -160,7 +151,7 @@ def _train_end(case: Path, frames: int) -> int | None:
 
 
 def _rows(matrix: Any) -> Any:
-    return tuple(tuple(float(value) for value in row) for row in np.asarray(matrix))
+    return tuple(map(tuple, np.asarray(matrix, dtype=np.float64).tolist()))
 
 
 def _link(source: Path, target: Path) -> None:

@@ -1,29 +1,14 @@
 """The capture folder: what is written is read, and every refusal names the file, the field and the value."""
 
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, Camera, CameraEntry, Capture, Description, Writer
-
-FRAMES = 5
-POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))
-
-
-def entry(name: str = "0", width: int = 32, height: int = 24, missing: tuple[int, ...] = ()) -> CameraEntry:
-    intrinsics = ((40.0, 0.0, (width - 1) / 2), (0.0, 40.0, (height - 1) / 2), (0.0, 0.0, 1.0))
-    return CameraEntry(name=name, width=width, height=height, intrinsics=intrinsics, camera_to_world=POSE, missing=missing)
-
-
-def describe(**changes) -> Description:
-    plain = Description(
-        format=1, name="thing", category="rope", frame_count=FRAMES, frame_rate=30.0, cameras=(entry(),), masks=True
-    )
-    return replace(plain, **changes)
+from neuspring.data.capture import CAPTURE, Camera, Capture, Description, Writer
+from tests.support.captures import FRAMES, POSE, describe, entry
 
 
 def write(folder, description: Description | None = None, tracks: np.ndarray | None = None) -> Capture:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from neuspring.config import Mocap, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
-from neuspring.data.check import check
+from neuspring.data.check import check_layout
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
 REAL = Path(__file__).parents[2].parent / "shared" / "data" / "mocap_dlo"
@@ -196,7 +196,7 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
     data[30, :, [4, 5]] = data[30, :, [5, 4]]
     path = write(tmp_path, data.tolist())
     for target in (path, tmp_path):
-        found = check(target)
+        found = check_layout(target)
         assert [d.level for d in found] == ["warning"]
         assert "in frame 30" in found[0].message
     assert [d.message for d in mocap.check_mocap(write(tmp_path, recording(samples=400)))] == [
@@ -206,7 +206,7 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 def test_released_recordings() -> None:
-    assert [d for d in check(REAL) if d.level != "note"] == []
+    assert [d for d in check_layout(REAL) if d.level != "note"] == []
     settings = Mocap()
     for cable in ("DLO1", "DLO2", "DLO4"):
         file = next((REAL / cable / "train").glob("*.pkl"))

@@ -8,8 +8,7 @@ from neuspring.data.synthetic.implicit import sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
 from neuspring.data.synthetic.sensor import measured, quantised
-
-K = np.array([[100.0, 0, 59.5], [0, 100.0, 33.5], [0, 0, 1]])
+from tests.support.captures import K
 
 
 @pytest.fixture(scope="module")
