@@ -109,7 +109,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def _tree(self) -> list[dict[str, Any]]:
         return [
-            {"type": "file", "oid": "0" * 40, "size": file["size"], "path": file["rfilename"]} for file in self._listing()["siblings"]
+            {"type": "file", "oid": "0" * 40, "size": file["size"], "path": file["rfilename"]}
+            for file in self._listing()["siblings"]
         ]
 
     def _file(self, content: bytes) -> None:
@@ -194,7 +195,8 @@ def server(released: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.delenv("HF_TOKEN", raising=False)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_TELEMETRY", True)  # read at import, which another test may have caused
-    monkeypatch.setattr(fetch_hub, "BLOCK", 4096)  # as small as the archives
+    for name, value in {"BLOCK": 4096, "GAP": 1024}.items():  # as small as the archives
+        monkeypatch.setattr(fetch_hub, name, value)
     retry(monkeypatch, 0)
     close_session()  # its client knows the environment of its first use
     with StandIn() as standin:

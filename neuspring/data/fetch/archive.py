@@ -5,6 +5,7 @@ The real archives have not been opened yet. The folders that hold scenarios are 
 
 from __future__ import annotations
 
+import itertools
 import re
 import stat
 import zipfile
@@ -82,11 +83,8 @@ class Plan:
     """Number of missing files for which the disk has a file of other content."""
     absent: dict[str, list[str]]
     """Part -> scenarios for which the archive does not have it."""
-
-    @property
-    def cost(self) -> int:
-        """Bytes to fetch, without what block boundaries add."""
-        return sum(member.info.compress_size for member in self.missing)
+    cost: int
+    """Bytes to fetch."""
 
 
 def archives(parts: set[str]) -> list[str]:
@@ -115,6 +113,7 @@ def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[st
         missing=missing,
         differing=differing,
         absent=_absent(file.name, wanted, cases, parts),
+        cost=remote.expect(_spans(archive, missing)),
     )
 
 
@@ -205,6 +204,13 @@ def _is_finished(path: Path, info: zipfile.ZipInfo) -> bool:
         while block := stream.read(2**20):
             crc = zlib.crc32(block, crc)
     return crc == info.CRC
+
+
+def _spans(archive: zipfile.ZipFile, members: list[Member]) -> list[tuple[int, int]]:
+    """Where the members lie in the archive: each reaches to the next one, or to the table of contents."""
+    starts = {info.header_offset for info in archive.infolist()} | {archive.start_dir}
+    ends = dict(itertools.pairwise(sorted(starts)))
+    return [(offset, ends.get(offset, archive.start_dir)) for offset in sorted({member.info.header_offset for member in members})]
 
 
 def _absent(name: str, wanted: list[Member], cases: list[str], parts: set[str]) -> dict[str, list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ from neuspring.core.errors import InputError
 
 TIMEOUT = 30.0
 """Seconds without a byte after which a request has failed."""
-BLOCK = 2**22
-"""Bytes of one range request. The next block is fetched while one is read."""
-BLOCKS = 4
-"""Blocks of a file that stay in memory."""
+BLOCK = 2**24
+"""Bytes that are read ahead in one range request."""
+GAP = 2**20
+"""Spans that lie closer, bytes, are read as one: a further request takes as long."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,26 @@ class HubFile:
 
 
 class RemoteFile(HfFileSystemFile):
-    """A binary file of the hub, for `zipfile`. The library caches blocks, reads ahead and retries lost connections."""
+    """A binary file of the hub, for `zipfile`. The library reads ahead, and retries lost connections."""
+
+    _spans: Sequence[tuple[int, int]] = ()
+
+    def expect(self, spans: Iterable[tuple[int, int]]) -> int:
+        """Announce the spans [start, end) that will be read, ascending: reading ahead stops at their ends. Returns their bytes."""
+        joined: list[tuple[int, int]] = []
+        for start, end in spans:
+            first = joined.pop()[0] if joined and start - joined[-1][1] <= GAP else start
+            joined.append((first, end))
+        self._spans = joined
+        return sum(end - start for start, end in joined)
 
     def _fetch_range(self, start: int, end: int) -> bytes:
-        wanted = min(end, self.size) - start
+        end = next((last for first, last in self._spans if first <= start < last < end), end)
         url = self.url()
         with _explained(url, self.path):
             content = bytes(super()._fetch_range(start, end))
-        if len(content) != wanted:
-            raise _broken_off(url, f"{len(content)} of {wanted} bytes")
+        if len(content) != end - start:
+            raise _broken_off(url, f"{len(content)} of {end - start} bytes")
         return content
 
 
@@ -70,9 +81,8 @@ class Hub:
         """Open a file for reading. Checks that the server has it in the declared size and serves parts of it."""
         self._require_ranges(file)
         path = f"datasets/{self.repository}@{self.commit}/{file.name}"
-        cache = {"maxblocks": BLOCKS}
         with _explained(path, self.commit):
-            return RemoteFile(self._system, path, size=file.size, block_size=BLOCK, cache_type="background", cache_options=cache)
+            return RemoteFile(self._system, path, size=file.size, block_size=BLOCK, cache_type="readahead")
 
     def _require_ranges(self, file: HubFile) -> None:
         """The library would read a whole archive from a server that ignores ranges; here only the head of an answer is read."""
