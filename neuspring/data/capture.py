@@ -2,13 +2,13 @@
 
     capture.json                       everything but images, see `Description`
     color/<camera>/<frame>.png         8-bit RGB
-    depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float metres (npy); along the optical axis,
+    depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
                                        0: none
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
     tracks.json                        optional, for scoring alone: [K][T] of [x, y, z] m in the world, or null where not annotated
 
-Frames are numbered from 0 with five digits. Pixel centres lie at whole coordinates, x right, y down, z forward (OpenCV). The world
-is right-handed, metres, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
+Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
+is right-handed, meters, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
 and has no files.
 """
 
@@ -19,7 +19,7 @@ import json
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -52,6 +52,12 @@ class Camera:
     """K [3, 3], pixels."""
     camera_to_world: np.ndarray
     """[4, 4], m."""
+
+    def entry(self) -> CameraEntry:
+        """Its entry in capture.json."""
+        intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
+        pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
+        return CameraEntry(name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose)
 
     def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
@@ -101,20 +107,20 @@ class Description:
     format: Literal[1]
     name: Name
     category: str
-    """What the object is, in words: cloth, rope, package, ..."""
+    """Kind of object: cloth, rope, package, ..."""
     frame_count: Annotated[int, Field(ge=5)]
     frame_rate: Positive
     """Frames per second."""
     cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
     depth_unit: Positive = 0.001
-    """Metres per count of an integer depth image."""
+    """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
     up: Literal["+z", "-z"] = "+z"
-    """Which way is up along the world's z axis."""
+    """Direction of up along the world's z axis."""
     train_end: Annotated[int, Field(ge=2)] | None = None
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
-    """Whether mask/ is there."""
+    """Whether the capture has masks."""
     provenance: dict[str, str] = field(default_factory=dict)
 
 
@@ -136,7 +142,7 @@ class Capture:
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
-        """By name, in the order of capture.json."""
+        """Cameras by name, in the order of capture.json."""
         return {entry.name: entry.camera() for entry in self.description.cameras}
 
     @property
@@ -173,7 +179,7 @@ class Capture:
         if values.dtype.kind == "f":
             return np.where(np.isfinite(values), values, 0.0)
         if values.dtype != np.uint16:
-            raise InputError(path, "depth must be 16-bit integers, or floating-point metres (npy)", values.dtype)
+            raise InputError(path, "depth must be 16-bit integers, or floating-point meters (npy)", values.dtype)
         return values * self.description.depth_unit
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
@@ -181,7 +187,7 @@ class Capture:
         path = self.path("mask", camera, frame)
         labels = _image(path, self.cameras[camera], cv2.IMREAD_UNCHANGED)
         if labels.dtype != np.uint8 or labels.ndim != 2:
-            raise InputError(path, "masks are grey images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
+            raise InputError(path, "masks are gray images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
         if labels.max() > HANDS:
             raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
         return labels
@@ -308,11 +314,11 @@ def _array(path: Path, camera: Camera) -> np.ndarray:
 def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
     if image.shape[:2] != (camera.height, camera.width):
         rule = f"camera {camera.name} has images of {camera.width} x {camera.height}"
-        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to colour.")
+        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to color.")
 
 
 def _make_way(path: Path) -> None:
-    """A file in the way may be a link to the original of an imported capture: it is replaced, never written into."""
+    """Remove the old file. It may be a link to the original of an imported capture, which must not be overwritten."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
 

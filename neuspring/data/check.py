@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -127,7 +126,7 @@ def _check_final_data(case: Inspection) -> dict[str, np.ndarray] | None:
     if data is None:
         return None
     case.departures += phystwin.final_data_departures(path, data)
-    if not _has_structure(data):
+    if any(d.level == "error" for d in phystwin.structure_departures(path, data)) or not data["object_visibilities"].size:
         return None
     case.departures += _invisible_departures(path, data)
     case.departures += _motion_departures(path, data)
@@ -136,22 +135,6 @@ def _check_final_data(case: Inspection) -> dict[str, np.ndarray] | None:
     if controllers != CONTROLLERS:
         case.departures.append(unusual(path, "controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
     return dict(data)
-
-
-def _has_structure(data: Any) -> bool:
-    """Whether the arrays that the reader uses have agreeing shapes and kinds, so that their content can be looked at."""
-    if not isinstance(data, dict) or any(rule.required and rule.key not in data for rule in phystwin.ARRAYS):
-        return False
-    sizes: dict[str, int] = {}
-    for rule in phystwin.ARRAYS:
-        if not rule.required:
-            continue
-        value = data[rule.key]
-        if not isinstance(value, np.ndarray) or value.dtype.kind != rule.kind or value.ndim != len(rule.shape):
-            return False
-        if any(n != (int(s) if s.isdigit() else sizes.setdefault(s, n)) for s, n in zip(rule.shape, value.shape, strict=True)):
-            return False
-    return sizes["T"] > 0 and sizes["No"] > 0
 
 
 def _invisible_departures(path: Path, data: dict[str, np.ndarray]) -> list[Departure]:

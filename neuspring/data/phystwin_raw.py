@@ -18,20 +18,20 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data import phystwin
 from neuspring.data.calibration import metadata_departures, poses_departures
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
 
 CALIBRATION = "calibrate.pkl"
 FILES = (phystwin.METADATA, CALIBRATION, phystwin.SPLIT, phystwin.TRACKS)
-"""All but images that the importer looks for in a case's folder."""
+"""The files beside images that the importer looks for in a case's folder."""
 HAND_PHRASE = "hand"
-"""The detected phrase of hands; the one other phrase of a camera is the object."""
+"""The detected phrase of hands. The one detection of a camera with another phrase is the object."""
 
 
 def has_images(case: Path) -> bool:
-    """Whether a case's folder holds images, masks and calibration: what a capture with masks is made of."""
+    """Whether a case's folder holds what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (phystwin.METADATA, CALIBRATION))
     return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 
@@ -50,7 +50,7 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         category=row.category,
         frame_count=frames,
         frame_rate=float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
-        cameras=camera_entries(metadata, poses),
+        cameras=tuple(camera.entry() for camera in cameras_of(metadata, poses)),
         depth_unit=0.001,
         depth_format="npy",
         up="-z",
@@ -93,18 +93,18 @@ def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
     return departures + poses_departures(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
 
 
-def camera_entries(metadata: dict[str, Any], poses: list[np.ndarray]) -> tuple[CameraEntry, ...]:
-    """The cameras that metadata.json and calibrate.pkl describe, named by their numbers. `raw_departures` must have no errors."""
+def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera]:
+    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_departures` must have no errors."""
     width, height = metadata["WH"]
-    matrices = enumerate(zip(metadata["intrinsics"], poses, strict=True))
-    return tuple(
-        CameraEntry(name=str(index), width=width, height=height, intrinsics=_rows(intrinsics), camera_to_world=_rows(pose))
-        for index, (intrinsics, pose) in matrices
-    )
+    intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
+    return [
+        Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
+        for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
+    ]
 
 
 def _detections(case: Path, camera: str) -> dict[int, list[str]]:
-    """Label -> ids of the detections with it. Exactly one detection is not a hand."""
+    """Label -> ids of its detections. Exactly one detection is not a hand."""
     path = case / "mask" / f"mask_info_{camera}.json"
     info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
@@ -148,10 +148,6 @@ def _train_end(case: Path, frames: int) -> int | None:
     split = load_json(path)
     refuse(phystwin.split_departures(path, split, frames))
     return int(split["train"][1])
-
-
-def _rows(matrix: Any) -> Any:
-    return tuple(map(tuple, np.asarray(matrix, dtype=np.float64).tolist()))
 
 
 def _link(source: Path, target: Path) -> None:

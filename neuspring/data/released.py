@@ -19,13 +19,13 @@ from neuspring.data import phystwin
 from neuspring.data.capture import Camera
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.json_file import load_json
-from neuspring.data.phystwin_raw import CALIBRATION, camera_entries, raw_departures
+from neuspring.data.phystwin_raw import CALIBRATION, cameras_of, raw_departures
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
 """Camera depths that the released lifting keeps, m."""
 DEPTH_SCALE = 1000.0
-"""Depth units per metre."""
+"""Depth units per meter."""
 HUMAN = "0"
 """The only detection that the released evaluation reads of a person's masks."""
 LARGEST = 1e30
@@ -214,7 +214,7 @@ def read_cameras(folder: Path) -> list[Camera]:
     """The calibrated cameras of a case, from metadata.json and calibrate.pkl."""
     metadata, poses = load_json(folder / phystwin.METADATA), load_pickle(folder / CALIBRATION)
     refuse(raw_departures(folder, metadata, poses))
-    return [entry.camera() for entry in camera_entries(metadata, poses)]
+    return cameras_of(metadata, poses)
 
 
 def visible_pixels(path: Path) -> np.ndarray:

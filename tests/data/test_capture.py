@@ -140,7 +140,7 @@ def test_a_missing_image_says_how_to_declare_it(tmp_path):
 def test_depth_of_another_size_than_colour_is_refused(tmp_path):
     capture = write(tmp_path)
     cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((12, 16), np.uint16))
-    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to colour"):
+    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to color"):
         capture.depth("0", 1)
 
 
@@ -184,7 +184,7 @@ def test_tracks_do_not_outlive_their_capture_and_may_be_none(tmp_path):
 def test_masks_of_sixteen_bits_are_refused(tmp_path):
     capture = write(tmp_path)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.ones((24, 32), np.uint16))
-    with pytest.raises(InputError, match="masks are grey images of 8 bits; received uint16"):
+    with pytest.raises(InputError, match="masks are gray images of 8 bits; received uint16"):
         capture.mask("0", 2)
 
 

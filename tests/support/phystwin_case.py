@@ -44,7 +44,7 @@ def final_data(frames: int, points: int, surface: int, interior: int, controller
 
 
 def camera() -> tuple[np.ndarray, np.ndarray]:
-    """Camera-to-world matrix of a camera 0.5 m above the table looking down, and intrinsics with an off-centre c_x."""
+    """Camera-to-world matrix of a camera 0.5 m above the table looking down, and intrinsics with an off-center c_x."""
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -0.5]
     return pose, np.array([[60.0, 0.0, WIDTH / 2 + 5.0], [0.0, 60.0, HEIGHT / 2], [0.0, 0.0, 1.0]])

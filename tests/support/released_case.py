@@ -175,7 +175,7 @@ def write_prediction(case: Released, twin: Twin, drag: float, dashpot: float) ->
 
 
 def write_pictures(case: Released, nodes: np.ndarray) -> None:
-    """One splat per node, and what cameras and evaluation saw: the moved splats, other colours in part, masks shifted."""
+    """One splat per node, and what cameras and evaluation saw: the moved splats, other colors in part, masks shifted."""
     rng = np.random.default_rng(4)
     path = case.root / "gaussian_output" / case.name / SPLATS
     colours = rng.uniform(0.2, 0.9, (len(nodes), 3)).astype(np.float32)

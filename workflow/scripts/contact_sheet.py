@@ -53,6 +53,7 @@ def facts(capture: Capture, results: Path) -> dict[str, object]:
 
 
 def main(results: Path, output: Path) -> None:
+    """Write contact_sheet.jpg and captures.csv to `output`."""
     captures = [Capture.load(path.parent) for path in sorted(results.glob(f"*/capture/{CAPTURE}"))]
     strips = [strip(capture) for capture in captures]
     blank = np.full_like(strips[0], 255)

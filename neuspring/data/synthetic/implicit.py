@@ -1,6 +1,6 @@
 """Signed distance functions, negative inside, of which synthetic bodies and hands are made, and their triangle surfaces.
 
-Points are [..., 3], distances [...], metres. The ellipsoid and the smooth union are approximate distances with exact signs away
+Points are [..., 3], distances [...], meters. The ellipsoid and the smooth union are approximate distances with exact signs away
 from the blend, which is all that meshing needs.
 """
 

@@ -41,7 +41,7 @@ def cast(
     label: wp.array2d[wp.uint8],
     slope: wp.array2d[float],
 ):
-    """One pixel: colour is the mean over `offsets`, depth, label and slope are those of the first."""
+    """One pixel: color is the mean over `offsets`, depth, label and slope are those of the first."""
     y, x = wp.tid()
     origin = wp.transform_get_translation(pose)
     state = wp.uint32(7)

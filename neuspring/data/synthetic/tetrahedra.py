@@ -1,4 +1,4 @@
-"""Tetrahedral meshes of implicit bodies (body-centred lattice, boundary snapped to the surface), boxes and rods, in NumPy.
+"""Tetrahedral meshes of implicit bodies (body-centered lattice, boundary snapped to the surface), boxes and rods, in NumPy.
 
 Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
 """
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.data.synthetic.implicit import Sdf, gradient
 
 LATTICE_ALTITUDE = np.sqrt(0.5)
-"""Altitude of a tetrahedron of the body-centred lattice, in lattice constants."""
+"""Altitude of a tetrahedron of the body-centered lattice, in lattice constants."""
 LEAST_ALTITUDE = 0.4
 """Snapping never takes a tetrahedron below this fraction of the lattice's altitude."""
 SNAPPING_STEPS = 40
@@ -63,7 +63,7 @@ def edges(elements: np.ndarray) -> np.ndarray:
 
 
 def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
-    """Tetrahedra of the body-centred cubic lattice that covers a box: two cell centres and an edge of the face between them."""
+    """Tetrahedra of the body-centered cubic lattice that covers a box: two cell centers and an edge of the face between them."""
     first = np.asarray(low, float) - spacing
     corners = np.ceil((np.asarray(high, float) + spacing - first) / spacing).astype(int) + 1
     cells = corners - 1
@@ -134,7 +134,7 @@ def _largest_piece(nodes: np.ndarray, tetrahedra: np.ndarray) -> Mesh:
 
 
 def pieces(tetrahedra: np.ndarray) -> np.ndarray:
-    """[E] the piece of each tetrahedron; neighbours share a face."""
+    """[E] the piece of each tetrahedron; neighbors share a face."""
     faces = np.sort(np.concatenate([tetrahedra[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]), axis=1)
     owner = np.tile(np.arange(len(tetrahedra)), 4)
     order = np.lexsort(faces.T)
@@ -149,7 +149,7 @@ def _adjacency(pairs: np.ndarray, count: int) -> csr_matrix:
 
 
 def _averaging(elements: np.ndarray, count: int) -> csr_matrix:
-    """The matrix that replaces each node by the mean of its neighbours."""
+    """The matrix that replaces each node by the mean of its neighbors."""
     graph = _adjacency(edges(elements), count)
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
     return coo_matrix(graph.multiply(1.0 / degree[:, None])).tocsr()
@@ -179,8 +179,8 @@ def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray,
 
 
 def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
-    """A rod along x, centred: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
-    tetrahedra per prism, split by node order so that neighbours agree."""
+    """A rod along x, centered: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
+    tetrahedra per prism, split by node order so that neighbors agree."""
     along = np.linspace(-length / 2, length / 2, len(radii))
     angles = 2 * np.pi * np.arange(around) / around
     ring = np.stack([np.zeros(around), np.cos(angles), np.sin(angles)], axis=1)

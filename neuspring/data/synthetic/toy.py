@@ -26,7 +26,7 @@ ANNOTATED = 16
 
 @dataclass(frozen=True)
 class Shape:
-    """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Metres."""
+    """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Meters."""
 
     tracked: np.ndarray
     surface: np.ndarray

@@ -36,7 +36,7 @@ class VertexBlockDescent(FiniteElements):
 
     def _hold(self, fists: list[int], known: np.ndarray | None) -> None:
         super()._hold(fists, known)
-        # Without mass a node would still give way to its neighbours.
+        # Without mass a node would still give way to its neighbors.
         flags = np.where(self.holder < 0, int(newton.ParticleFlags.ACTIVE), 0)
         self.model.particle_flags.assign(flags.astype(np.int32))
 

@@ -1,4 +1,4 @@
-"""Conformance with PhysTwin's release: one set of rules for `neuspring check-data` (1 to 4) and `neuspring verify-released` (1 to 6).
+"""Conformance with PhysTwin's release: one set of checks, for `neuspring check-data` (1 to 4) and `verify-released` (1 to 6).
 
 - `run`: the checks and their order, `verify_released`, its report.
 - `check_data`: the layout of a data folder (`neuspring.data.check`) and checks 1 to 4, as departures.

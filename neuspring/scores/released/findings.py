@@ -125,7 +125,10 @@ class Published:
 def of_scores(
     base: Finding, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
 ) -> list[Finding]:
-    """Findings for tidy scores of one scenario, with check, scenario and file of `base`. `missing`: metric -> why it has no score."""
+    """Findings for tidy scores of one scenario, with check, scenario and file of `base`.
+
+    `missing`: metric -> the reason why it has no score.
+    """
     rows = {(row["task"], row["metric"]): row for row in scores.to_dict("records")}
     findings = []
     for metric in metrics:
