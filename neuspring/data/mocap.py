@@ -107,8 +107,8 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number
     """Nodes [R * count, 3], m, on R circles around the centerline through `markers` [n, 3], ring after ring.
 
     The first and last ring lie at the first and last marker. Between them rings are equally spaced along the arc: `number` rings
-    in all, or the spacing nearest to `spacing` that divides the arc evenly. Each circle lies in the plane normal to the tangent. Its
-    first node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
+    in all, or the spacing nearest to `spacing` that divides the arc evenly. Each circle lies in the plane normal to the tangent.
+    Its first node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
     """
     centres, tangents = centreline(markers, spacing, number)
     normals = _transported_normals(tangents)

@@ -121,8 +121,8 @@ def structure_departures(path: Path, data: Any) -> list[Departure]:
     """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
         return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
-    known = {rule.key for rule in ARRAYS} | set(IGNORED)
-    departures = [unusual(path, str(key), "unknown key, not read") for key in data if key not in known]
+    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
+    departures = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
     sizes: dict[str, int] = {}
     for rule in ARRAYS:
         if rule.key in data:

@@ -29,7 +29,7 @@ DEPTH_SCALE = 1000.0
 HUMAN = "0"
 """The only detection that the released evaluation reads of a person's masks."""
 LARGEST = 1e30
-"""No parameter comes near; also refuses infinity and NaN."""
+"""Larger values are refused, like infinity and NaN."""
 OPTIMAL_KEYS = (
     "global_spring_Y",
     "object_radius",
@@ -162,7 +162,7 @@ class Checkpoint:
     object_springs: int
     """Springs between object nodes; they come first."""
     stiffness: np.ndarray
-    """Of every spring [S], N, as stored: the simulator clamps it."""
+    """Stiffness of every spring [S], N, as stored; the simulator clamps it."""
     contact: dict[str, float] | None
     """The scalars of `CONTACT_KEYS` under our names, as stored: the simulator clamps them. None where they are not all there."""
 

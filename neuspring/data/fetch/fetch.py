@@ -4,8 +4,8 @@ Only the files that were asked for are read, by HTTP range requests: one scenari
 stored. The same command continues an interrupted fetch: a file with the size and CRC-32 of its archive member is finished, any
 other starts again. The archive's SHA-256 is recorded, the CRC-32 of every file is checked.
 
-Verified against a local stand-in server with archives made to a description of the released ones. Neither the real hub nor the
-real archives have been met.
+It is tested against a local stand-in server with archives in the described layout. Neither the real hub nor the real archives
+have been met.
 """
 
 from __future__ import annotations

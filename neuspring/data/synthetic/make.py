@@ -212,12 +212,12 @@ def _film(
 
 
 def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
-    """Tracks [T, K, 3], m, of vertices that the first camera sees in frame 0, spread over what it sees."""
+    """Tracks [T, K, 3], m, of well spread vertices that `camera` sees in frame 0."""
     vertices = truth.surface(0)
     pixels, depth = camera.project(vertices)
     inside = np.flatnonzero(camera.sees(pixels))
     x, y = np.round(pixels[inside]).astype(int).T
     seen = capture.depth(camera.name, 0)[y, x]
     visible = inside[(capture.mask(camera.name, 0)[y, x] == OBJECT) & (np.abs(seen - depth[inside]) < 0.004)]
-    chosen = visible[farthest(vertices[visible], ANNOTATED)]
-    return np.stack([truth.surface(frame)[chosen] for frame in range(len(truth.nodes))])
+    spread = visible[farthest(vertices[visible], ANNOTATED)]
+    return np.stack([truth.surface(frame)[spread] for frame in range(len(truth.nodes))])

@@ -76,7 +76,7 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
     def centre(index: np.ndarray) -> np.ndarray:
         return len(nodes) - int(np.prod(cells)) + _flat_index(index, cells)
 
-    found = []
+    elements = []
     for axis in range(3):
         step, right, up = np.roll(np.eye(3, dtype=int), axis, axis=1)
         inner = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
@@ -84,8 +84,8 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
         base = cell + step
         ring = [corner(base), corner(base + right), corner(base + right + up), corner(base + up)]
         for k in range(4):
-            found.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
-    return nodes, oriented(nodes, np.concatenate(found))
+            elements.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
@@ -126,10 +126,10 @@ def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nom
 
 
 def _largest_piece(nodes: np.ndarray, tetrahedra: np.ndarray) -> Mesh:
-    """Of the pieces that hang together by faces."""
+    """The largest of the pieces that share no face."""
     labels = pieces(tetrahedra)
-    kept = tetrahedra[labels == np.bincount(labels).argmax()]
-    used, renumbered = np.unique(kept, return_inverse=True)
+    largest = tetrahedra[labels == np.bincount(labels).argmax()]
+    used, renumbered = np.unique(largest, return_inverse=True)
     return nodes[used], renumbered.reshape(-1, 4)
 
 
@@ -169,13 +169,13 @@ def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray,
         ((0, 1, 1), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
         ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
     )
-    found = []
+    elements = []
     for corners in five:
         offsets = np.array(corners)
         mirrored = offsets * [-1, 1, 1] + [1, 0, 0]
-        for chosen, shift in ((~odd, offsets), (odd, mirrored)):
-            found.append(_flat_index(cell[chosen][:, None] + shift, counts + 1))
-    return nodes, oriented(nodes, np.concatenate(found))
+        for parity, shift in ((~odd, offsets), (odd, mirrored)):
+            elements.append(_flat_index(cell[parity][:, None] + shift, counts + 1))
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
@@ -187,14 +187,14 @@ def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
     offsets = np.concatenate([np.zeros((1, 3)), ring])
     nodes = (radii[:, None, None] * offsets + along[:, None, None] * [1.0, 0.0, 0.0]).reshape(-1, 3)
     ids = np.arange(len(nodes)).reshape(len(radii), around + 1)
-    found = []
+    elements = []
     for k in range(around):
         bottom = np.sort(np.stack([ids[:-1, 0], ids[:-1, 1 + k], ids[:-1, 1 + (k + 1) % around]], axis=1), axis=1)
         top = bottom + around + 1
         a, b, c = bottom.T
         d, e, f = top.T
-        found += [np.stack(t, axis=1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
-    return nodes, oriented(nodes, np.concatenate(found))
+        elements += [np.stack(t, axis=1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def embed(points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

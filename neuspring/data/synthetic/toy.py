@@ -21,7 +21,7 @@ TRAIN_FRACTION = 0.7
 RUN = (3, 8)
 """Shortest and longest occlusion, frames."""
 ANNOTATED = 16
-"""Tracks kept for scoring, without noise."""
+"""Number of tracks for scoring; they have no noise."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.check import check_layout, find_cases
 from neuspring.data.departure import Departure, note
 from neuspring.data.released import Released
-from neuspring.scores.released.findings import Absent, Finding, Published, of_means
-from neuspring.scores.released.run import Tools, check_case, read_observations
+from neuspring.scores.released.findings import Absent, Finding, Published, Tools, of_means
+from neuspring.scores.released.run import check_case, read_observations
 
 OF_RESULTS, OF_DATA = (1, 2, 3, 4), (1, 4)
 """Checks of a case with a root, and of one without: it has no released results."""

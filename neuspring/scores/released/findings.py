@@ -14,6 +14,7 @@ import pandas as pd
 
 from neuspring.core.errors import InputError
 from neuspring.data.cases import released_cases
+from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import TASKS, UNITS, averages
 
 Outcome = Literal["passed", "failed", "measured", "skipped"]
@@ -120,6 +121,17 @@ class Published:
         """Published means of a task and metric, the one with most digits first."""
         keys = [(name, task, metric) for name in MEANS]
         return [self.scores[key] for key in keys if key in self.scores]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tools:
+    """What the checks of every case share."""
+
+    published: Published
+    device: str = "cpu"
+    """Where checks 5 and 6 run."""
+    lpips: Lpips | str = ""
+    """The metric, or the reason why there is none."""
 
 
 def of_scores(

@@ -28,7 +28,7 @@ from neuspring.data.released import (
 from neuspring.scores import images as image_metrics
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
-from neuspring.scores.released.findings import Absent, Finding, Published, of_scores, require
+from neuspring.scores.released.findings import Absent, Finding, Tools, of_scores, require
 from neuspring.splats.draw import COVERED, moved, picture, view_of
 from neuspring.splats.model import Splats
 from neuspring.splats.train import restricted
@@ -47,7 +47,7 @@ LIFTED = 1e-4
 TRUE, MIRRORED = "c_x", "W - c_x"
 
 
-def deprojection(case: Released, seen: Observations) -> list[Finding]:
+def deprojection(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     """Check 4: lifting the tracked pixels of frame 0 with one of two principal points must give the released points.
 
     Every released point of frame 0 must have a lifted one close to it, over all cameras. The converse would not hold: the released
@@ -78,17 +78,14 @@ def deprojection(case: Released, seen: Observations) -> list[Finding]:
     return findings
 
 
-def renderer(case: Released, seen: Observations, lpips: Lpips | str, device: str, published: Published) -> list[Finding]:
-    """Check 5: the released splats, moved by the released prediction, drawn and scored as released.
-
-    `lpips` is the metric, or the reason why there is none.
-    """
+def renderer(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
+    """Check 5: the released splats, moved by the released prediction, drawn and scored as released."""
     calibration = (case.folder / phystwin.METADATA, case.folder / CALIBRATION)
     require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colours, *calibration)
-    rows = frame_scores(case, seen, lpips, device)
+    rows = frame_scores(case, seen, tools.lpips, tools.device)
     scores = metrics.score_images(rows, seen.scenario, seen.scenario.frame_count, "released", 0)
-    missing = {"lpips": f"not computed: {lpips}"} if isinstance(lpips, str) else {}
-    return of_scores(Finding(check=5, scenario=case.name, quantity=""), scores, SCORED, published, missing)
+    missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
+    return of_scores(Finding(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
 
 
 def frame_scores(case: Released, seen: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED) -> pd.DataFrame:

@@ -14,7 +14,7 @@ from neuspring.data import phystwin
 from neuspring.data.cases import released_cases
 from neuspring.data.released import Checkpoint, Released, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
-from neuspring.scores.released.findings import Finding, Published, of_scores, require
+from neuspring.scores.released.findings import Finding, Tools, of_scores, require
 from neuspring.twin.rollout import simulate
 from neuspring.twin.search import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.topology import uniform_topology
@@ -27,7 +27,7 @@ SPREAD = 10.0
 not defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
 
 
-def sizes(case: Released, seen: Observations) -> list[Finding]:
+def sizes(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     """Check 1: sizes of the case against the table of released cases."""
     row = released_cases().get(case.name)
     quantities = {
@@ -47,7 +47,7 @@ def sizes(case: Released, seen: Observations) -> list[Finding]:
     return findings
 
 
-def first_frame(case: Released, seen: Observations) -> list[Finding]:
+def first_frame(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     """Check 1: frame 0 of the released prediction is [object_points[0] | surface_points | interior_points] in float32."""
     positions = _prediction(case, seen)
     different = np.flatnonzero((positions[0] != seen.nodes).any(axis=1))
@@ -59,7 +59,7 @@ def first_frame(case: Released, seen: Observations) -> list[Finding]:
     return [replace(finding, ours=len(different)).against(0, 0)]
 
 
-def topology(case: Released, seen: Observations) -> list[Finding]:
+def topology(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     """Check 2: the rebuilt springs against the checkpoint and the table of released cases, which also knows the best epoch."""
     require(case.root, case.parameters, case.checkpoint)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
@@ -80,17 +80,17 @@ def topology(case: Released, seen: Observations) -> list[Finding]:
     ]
 
 
-def evaluator(case: Released, seen: Observations, published: Published) -> list[Finding]:
+def evaluator(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
     """Check 3: our metrics of the released prediction."""
     positions = _prediction(case, seen)
     trajectory = Trajectory(positions=positions, frame_count=len(positions))
     scores = metrics.score(trajectory, seen, "released", 0)
     missing = {} if seen.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
     base = Finding(check=3, scenario=case.name, quantity="", file=case.prediction)
-    return of_scores(base, scores, DISTANCES, published, missing)
+    return of_scores(base, scores, DISTANCES, tools.published, missing)
 
 
-def simulator(case: Released, seen: Observations, device: str) -> list[Finding]:
+def simulator(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
     """Check 6: replays of the checkpoint against the released prediction.
 
     One replay truncates the dampings to whole numbers, as the released code does; one does not. A third with the springs in another
@@ -101,6 +101,7 @@ def simulator(case: Released, seen: Observations, device: str) -> list[Finding]:
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
     twin = released_twin(seen, parameters, checkpoint, case)
     truncated = damped(twin, *(float(int(parameters[key])) for key in ("drag_damping", "dashpot_damping")))
+    device = tools.device
     first = replay(truncated, seen.controller_points, device, case.name)
     second = replay(_reordered(truncated), seen.controller_points, device, f"{case.name}, other order")
     exact = replay(twin, seen.controller_points, device, f"{case.name}, float damping")

@@ -23,7 +23,7 @@ from neuspring.data.released import Released
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.released import images, physics
-from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, of_means, require
+from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, Tools, of_means, require
 
 CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",
@@ -98,17 +98,6 @@ def verify_released(
     return report
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tools:
-    """What the checks of every case share."""
-
-    published: Published
-    device: str = "cpu"
-    """Where checks 5 and 6 run."""
-    lpips: Lpips | str = ""
-    """The metric, or the reason why there is none."""
-
-
 def _report(findings: Sequence[Finding], names: Sequence[str], tools: Tools) -> Report:
     complete = (*findings, *of_means(findings, tools.published))
     return Report(findings=complete, text=_text(complete, names, tools.published, tools.device))
@@ -156,12 +145,12 @@ def read_observations(case: Released) -> Observations:
 
 _Check = Callable[[Released, Observations, Tools], list[Finding]]
 _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
-    1: (lambda case, seen, _: physics.sizes(case, seen), lambda case, seen, _: physics.first_frame(case, seen)),
-    2: (lambda case, seen, _: physics.topology(case, seen),),
-    3: (lambda case, seen, tools: physics.evaluator(case, seen, tools.published),),
-    4: (lambda case, seen, _: images.deprojection(case, seen),),
-    5: (lambda case, seen, tools: images.renderer(case, seen, tools.lpips, tools.device, tools.published),),
-    6: (lambda case, seen, tools: physics.simulator(case, seen, tools.device),),
+    1: (physics.sizes, physics.first_frame),
+    2: (physics.topology,),
+    3: (physics.evaluator,),
+    4: (images.deprojection,),
+    5: (images.renderer,),
+    6: (physics.simulator,),
 }
 
 
