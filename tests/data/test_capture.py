@@ -56,8 +56,8 @@ def test_lifting_and_projecting_are_inverse():
     pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     camera = Camera("0", 32, 24, np.array(entry().intrinsics), pose)
     pixels, depth = rng.uniform(0, 24, (50, 2)), rng.uniform(0.3, 1.5, 50)
-    found, distance = camera.project(camera.lift(pixels, depth))
-    np.testing.assert_allclose(found, pixels, atol=1e-9)
+    projected, distance = camera.project(camera.lift(pixels, depth))
+    np.testing.assert_allclose(projected, pixels, atol=1e-9)
     np.testing.assert_allclose(distance, depth)
 
 

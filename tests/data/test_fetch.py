@@ -224,8 +224,8 @@ def said() -> tuple[list[str], Callable[[str], None]]:
 
 def files(root: Path) -> dict[str, bytes]:
     """All files below `root` but the hidden and the record."""
-    found = (path for path in root.rglob("*") if path.is_file() and path.name not in (LOCK, RECORD))
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in found}
+    paths = (path for path in root.rglob("*") if path.is_file() and path.name not in (LOCK, RECORD))
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in paths}
 
 
 def test_everything_lands_where_the_reader_looks_and_is_recorded(

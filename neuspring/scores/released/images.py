@@ -47,7 +47,7 @@ LIFTED = 1e-4
 TRUE, MIRRORED = "c_x", "W - c_x"
 
 
-def deprojection(case: Released, seen: Observations, _: Tools) -> list[Finding]:
+def deprojection(case: Released, observations: Observations, _: Tools) -> list[Finding]:
     """Check 4: lifting the tracked pixels of frame 0 with one of two principal points must give the released points.
 
     Every released point of frame 0 must have a lifted one close to it, over all cameras. The converse would not hold: the released
@@ -62,7 +62,7 @@ def deprojection(case: Released, seen: Observations, _: Tools) -> list[Finding]:
         lifted = np.concatenate([gated_lift(camera, *raw[camera.name]) for camera in used])
         if not len(lifted):
             raise Absent("no tracked pixel of frame 0 has a depth within the gate")
-        residuals[convention] = float(np.median(cKDTree(lifted).query(seen.object_points[0])[0]))
+        residuals[convention] = float(np.median(cKDTree(lifted).query(observations.object_points[0])[0]))
     if max(residuals.values()) <= LIFTED:
         raise Absent(f"c_x and W - c_x give the same points: {residuals[TRUE]:.3g} and {residuals[MIRRORED]:.3g} m")
     better = min(residuals, key=lambda name: residuals[name])
@@ -78,17 +78,19 @@ def deprojection(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     return findings
 
 
-def renderer(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
+def renderer(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
     """Check 5: the released splats, moved by the released prediction, drawn and scored as released."""
     calibration = (case.folder / phystwin.METADATA, case.folder / CALIBRATION)
     require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colours, *calibration)
-    rows = frame_scores(case, seen, tools.lpips, tools.device)
-    scores = metrics.score_images(rows, seen.scenario, seen.scenario.frame_count, "released", 0)
+    rows = frame_scores(case, observations, tools.lpips, tools.device)
+    scores = metrics.score_images(rows, observations.scenario, observations.scenario.frame_count, "released", 0)
     missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
     return of_scores(Finding(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
 
 
-def frame_scores(case: Released, seen: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED) -> pd.DataFrame:
+def frame_scores(
+    case: Released, observations: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED
+) -> pd.DataFrame:
     """Columns frame, camera, metric, value of every frame but the first, seen by the first camera."""
     cameras = read_cameras(case.folder)
     if len(cameras) < 2:
@@ -96,7 +98,7 @@ def frame_scores(case: Released, seen: Observations, lpips: Lpips | str, device:
     camera, borrowed = cameras[0], cameras[1] if images.released_quirks.second_camera_intrinsics else None
     view = view_of(camera, images, device, borrowed)
     splats = restricted(Splats.load(case.splats), images.opacity)
-    positions = read_prediction(case.prediction, seen.scenario.frame_count, len(seen.nodes))
+    positions = read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
     progress = Progress(f"pictures {case.name}", len(positions))
     rows = []
     for frame, gaussians in enumerate(moved(splats, positions, images, device)):

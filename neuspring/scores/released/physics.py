@@ -27,14 +27,14 @@ SPREAD = 10.0
 not defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
 
 
-def sizes(case: Released, seen: Observations, _: Tools) -> list[Finding]:
+def sizes(case: Released, observations: Observations, _: Tools) -> list[Finding]:
     """Check 1: sizes of the case against the table of released cases."""
     row = released_cases().get(case.name)
     quantities = {
-        "frames": seen.scenario.frame_count,
-        "train_end": seen.scenario.train_end,
-        "object_points": seen.object_points.shape[1],
-        "nodes": len(seen.nodes),
+        "frames": observations.scenario.frame_count,
+        "train_end": observations.scenario.train_end,
+        "object_points": observations.object_points.shape[1],
+        "nodes": len(observations.nodes),
     }
     findings = []
     for name, count in quantities.items():
@@ -47,23 +47,23 @@ def sizes(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     return findings
 
 
-def first_frame(case: Released, seen: Observations, _: Tools) -> list[Finding]:
+def first_frame(case: Released, observations: Observations, _: Tools) -> list[Finding]:
     """Check 1: frame 0 of the released prediction is [object_points[0] | surface_points | interior_points] in float32."""
-    positions = _prediction(case, seen)
-    different = np.flatnonzero((positions[0] != seen.nodes).any(axis=1))
+    positions = _prediction(case, observations)
+    different = np.flatnonzero((positions[0] != observations.nodes).any(axis=1))
     note = "frame 0 must equal [object_points[0] | surface_points | interior_points] in float32"
     if len(different):
-        largest = float(np.abs(positions[0] - seen.nodes).max())
+        largest = float(np.abs(positions[0] - observations.nodes).max())
         note += f"; first other node {different[0]}, largest difference {largest:.3g} m"
     finding = Finding(check=1, scenario=case.name, quantity="other nodes in frame 0", note=note, file=case.prediction)
     return [replace(finding, ours=len(different)).against(0, 0)]
 
 
-def topology(case: Released, seen: Observations, _: Tools) -> list[Finding]:
+def topology(case: Released, observations: Observations, _: Tools) -> list[Finding]:
     """Check 2: the rebuilt springs against the checkpoint and the table of released cases, which also knows the best epoch."""
     require(case.root, case.parameters, case.checkpoint)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
-    rebuilt = _springs(seen, parameters)
+    rebuilt = _springs(observations, parameters)
     counts = [
         ("springs", len(rebuilt.springs), len(checkpoint.stiffness), "the checkpoint"),
         ("object springs", rebuilt.object_spring_count, checkpoint.object_springs, "the checkpoint"),
@@ -80,31 +80,31 @@ def topology(case: Released, seen: Observations, _: Tools) -> list[Finding]:
     ]
 
 
-def evaluator(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
+def evaluator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
     """Check 3: our metrics of the released prediction."""
-    positions = _prediction(case, seen)
+    positions = _prediction(case, observations)
     trajectory = Trajectory(positions=positions, frame_count=len(positions))
-    scores = metrics.score(trajectory, seen, "released", 0)
-    missing = {} if seen.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
+    scores = metrics.score(trajectory, observations, "released", 0)
+    missing = {} if observations.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
     base = Finding(check=3, scenario=case.name, quantity="", file=case.prediction)
     return of_scores(base, scores, DISTANCES, tools.published, missing)
 
 
-def simulator(case: Released, seen: Observations, tools: Tools) -> list[Finding]:
+def simulator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
     """Check 6: replays of the checkpoint against the released prediction.
 
     One replay truncates the dampings to whole numbers, as the released code does; one does not. A third with the springs in another
     order measures the effect of the order of additions alone.
     """
     require(case.root, case.parameters, case.checkpoint)
-    released = _prediction(case, seen)
+    released = _prediction(case, observations)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
-    twin = released_twin(seen, parameters, checkpoint, case)
+    twin = released_twin(observations, parameters, checkpoint, case)
     truncated = damped(twin, *(float(int(parameters[key])) for key in ("drag_damping", "dashpot_damping")))
     device = tools.device
-    first = replay(truncated, seen.controller_points, device, case.name)
-    second = replay(_reordered(truncated), seen.controller_points, device, f"{case.name}, other order")
-    exact = replay(twin, seen.controller_points, device, f"{case.name}, float damping")
+    first = replay(truncated, observations.controller_points, device, case.name)
+    second = replay(_reordered(truncated), observations.controller_points, device, f"{case.name}, other order")
+    exact = replay(twin, observations.controller_points, device, f"{case.name}, float damping")
     order = _apart(first.positions, second.positions).mean(axis=1)
     findings = _replayed(case.name, "dampings truncated", first, released, order)
     findings.append(_largest(case.name, "mean distance of nodes, springs in another order", order))
@@ -115,9 +115,9 @@ def simulator(case: Released, seen: Observations, tools: Tools) -> list[Finding]
     return findings
 
 
-def released_twin(seen: Observations, parameters: dict[str, float], checkpoint: Checkpoint, case: Released) -> Twin:
+def released_twin(observations: Observations, parameters: dict[str, float], checkpoint: Checkpoint, case: Released) -> Twin:
     """The checkpoint as a twin with the searched dampings. Raises InputError if springs and checkpoint do not belong together."""
-    springs = _springs(seen, parameters)
+    springs = _springs(observations, parameters)
     if len(springs.springs) != len(checkpoint.stiffness):
         rule = f"one stiffness for each of the {len(springs.springs)} rebuilt springs is required"
         raise InputError(case.checkpoint, rule, len(checkpoint.stiffness), "See check 2.")
@@ -130,7 +130,7 @@ def released_twin(seen: Observations, parameters: dict[str, float], checkpoint: 
         contact_distance=parameters["collision_dist"],
         **checkpoint.contact,  # type: ignore[arg-type]
     )
-    scenario = seen.scenario
+    scenario = observations.scenario
     simulation = Simulation(
         frame_time=RELEASED_FRAME_TIME,
         substeps=RELEASED_SUBSTEPS,
@@ -153,15 +153,15 @@ def replay(twin: Twin, controller_points: np.ndarray, device: str, label: str) -
     return simulate(twin, controller_points, device, progress.update)
 
 
-def _prediction(case: Released, seen: Observations) -> np.ndarray:
+def _prediction(case: Released, observations: Observations) -> np.ndarray:
     require(case.root, case.prediction)
-    return read_prediction(case.prediction, seen.scenario.frame_count, len(seen.nodes))
+    return read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
 
 
-def _springs(seen: Observations, parameters: dict[str, float]) -> Topology:
+def _springs(observations: Observations, parameters: dict[str, float]) -> Topology:
     return uniform_topology(
-        seen.nodes,
-        seen.controller_points[0],
+        observations.nodes,
+        observations.controller_points[0],
         parameters["object_radius"],
         int(parameters["object_max_neighbours"]),
         parameters["controller_radius"],

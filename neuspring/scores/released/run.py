@@ -85,12 +85,12 @@ def verify_released(
     progress = Progress("verify", len(names), every=0.0)
     for done, name in enumerate(names, start=1):
         case = Released(root=root, name=name)
-        seen: Observations | Exception
+        observations: Observations | Exception
         try:
-            seen = read_observations(case)
+            observations = read_observations(case)
         except (Absent, InputError) as error:
-            seen = error
-        findings += check_case(case, seen, sorted(set(checks)), tools)
+            observations = error
+        findings += check_case(case, observations, sorted(set(checks)), tools)
         # After every scenario: all of them take hours on a CPU.
         report = _report(findings, names[:done], tools)
         _write(report, output)
@@ -119,14 +119,16 @@ def _present(root: Path) -> list[str]:
     return names
 
 
-def check_case(case: Released, seen: Observations | Exception, checks: Sequence[int], tools: Tools) -> list[Finding]:
+def check_case(case: Released, observations: Observations | Exception, checks: Sequence[int], tools: Tools) -> list[Finding]:
     """The findings of `checks` for one case. A check that cannot be carried out has one finding, skipped or failed.
 
-    `seen` is the processed case, or why the reader refuses it (`read_observations`).
+    `observations`: the processed case, or the exception of `read_observations`.
     """
-    return [
-        finding for check in checks for function in _FUNCTIONS[check] for finding in _guarded(function, check, case, seen, tools)
-    ]
+    findings = list[Finding]()
+    for check in checks:
+        for function in _FUNCTIONS[check]:
+            findings += _guarded(function, check, case, observations, tools)
+    return findings
 
 
 def read_observations(case: Released) -> Observations:
@@ -154,12 +156,12 @@ _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
 }
 
 
-def _guarded(function: _Check, check: int, case: Released, seen: Observations | Exception, tools: Tools) -> list[Finding]:
+def _guarded(function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools) -> list[Finding]:
     blank = Finding(check=check, scenario=case.name, quantity=CHECKS[check])
     try:
-        if isinstance(seen, Exception):
-            raise seen
-        return function(case, seen, tools)
+        if isinstance(observations, Exception):
+            raise observations
+        return function(case, observations, tools)
     except Absent as reason:
         return [replace(blank, outcome="skipped", note=str(reason), file=reason.file)]
     except (InputError, NumericalFailure) as error:

@@ -51,7 +51,7 @@ NAME = "single_lift_thing"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def conforming(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A conforming stand-in, for reading only."""
     root = tmp_path_factory.mktemp("released")
     write_released(root, NAME)
@@ -59,16 +59,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def case(made: Path, tmp_path: Path) -> Released:
+def case(conforming: Path, tmp_path: Path) -> Released:
     """A copy that may be altered."""
-    shutil.copytree(made, tmp_path / "root")
+    shutil.copytree(conforming, tmp_path / "root")
     return Released(root=tmp_path / "root", name=NAME)
 
 
 @pytest.fixture(scope="module")
-def published(made: Path) -> Published:
+def published(conforming: Path) -> Published:
     """What others would have published about the stand-in, computed with loops."""
-    return published_of(Released(root=made, name=NAME))
+    return published_of(Released(root=conforming, name=NAME))
 
 
 def verify(case: Released, published: Published, *checks: int) -> Report:
@@ -79,8 +79,8 @@ def of(report: Report, outcome: str) -> set[int]:
     return {finding.check for finding in report.findings if finding.outcome == outcome}
 
 
-def test_a_conforming_case_passes_every_check(made, published, tmp_path):
-    report = verify_released(made, tmp_path, device="cpu", published=published)
+def test_a_conforming_case_passes_every_check(conforming, published, tmp_path):
+    report = verify_released(conforming, tmp_path, device="cpu", published=published)
     assert report.status == 0
     assert of(report, "passed") == {1, 2, 3, 4, 5, 6}
     assert of(report, "failed") == set()
@@ -197,8 +197,8 @@ def test_only_the_frames_that_were_altered_fail(case, published):
     assert {f.task for f in report.findings if f.outcome == "passed"} == {"reconstruction"}
 
 
-def test_both_dampings_are_reported_and_the_wrong_one_is_far(made, published, tmp_path):
-    report = verify_released(made, tmp_path, checks=[6], device="cpu", published=published)
+def test_both_dampings_are_reported_and_the_wrong_one_is_far(conforming, published, tmp_path):
+    report = verify_released(conforming, tmp_path, checks=[6], device="cpu", published=published)
     by_quantity = {f.quantity: f for f in report.findings}
     truncated, floats = (by_quantity[f"mean distance of nodes, {label}"] for label in ("dampings truncated", "float dampings"))
     assert truncated.ours < truncated.tolerance < 0.2 * floats.ours
@@ -339,20 +339,20 @@ def test_lpips_is_taken_as_released(case):
     heads = [torch.rand((1, channels, 1, 1), generator=generator) for channels in CHANNELS[1:]]
     metric = Lpips(kernels, [torch.zeros(channels) for channels in CHANNELS[1:]], heads)
     table = frame_scores(case, read_observations(case), metric, "cpu")
-    found = table[(table["metric"] == "lpips") & (table["frame"] == 2)]["value"].item()
+    score = table[(table["metric"] == "lpips") & (table["frame"] == 2)]["value"].item()
     rgba = drawn(case)[2]
     observed = cv2.imread(str(case.colours / "2.png"))[..., ::-1]
     mask, human = (cv2.imread(str(f / "2.png"), cv2.IMREAD_GRAYSCALE) / 255 for f in (case.object_masks, case.human_masks))
     pair = [
         torch.tensor(p * (1 - human)[..., None] / 255).permute(2, 0, 1).float() for p in (observed * mask[..., None], rgba[..., :3])
     ]
-    assert found == pytest.approx(float(metric(*pair, released_range=True)), rel=0.01)
-    assert found != pytest.approx(float(metric(*pair)), rel=0.05)
+    assert score == pytest.approx(float(metric(*pair, released_range=True)), rel=0.01)
+    assert score != pytest.approx(float(metric(*pair)), rel=0.05)
 
 
 @pytest.mark.parametrize("quirk", ["second_camera_intrinsics", "corner_pixels"])
-def test_an_error_in_drawing_exceeds_the_tolerance(made, quirk):
-    case = Released(root=made, name=NAME)
+def test_an_error_in_drawing_exceeds_the_tolerance(conforming, quirk):
+    case = Released(root=conforming, name=NAME)
     wrong = replace(RELEASED, released_quirks=replace(RELEASED.released_quirks, **{quirk: False}))
     first, second = (frame_scores(case, read_observations(case), "none", "cpu", images) for images in (RELEASED, wrong))
     for metric, values in first.groupby("metric")["value"]:
@@ -396,8 +396,8 @@ def test_means_weigh_scenarios_for_distances_and_frames_for_pictures(published):
     assert {f.quantity: f.ours for f in of_means(findings, published)} == {"chamfer": 2.5, "psnr": 3.0}
 
 
-def test_the_report_is_written_as_table_and_text(made, published, tmp_path):
-    report = verify_released(made, tmp_path / "out", checks=[2, 3], device="cpu", published=published)
+def test_the_report_is_written_as_table_and_text(conforming, published, tmp_path):
+    report = verify_released(conforming, tmp_path / "out", checks=[2, 3], device="cpu", published=published)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["verify.csv", "verify.md", "verify_frames.csv"]
     assert (tmp_path / "out" / "verify.md").read_text() == report.text
     table = pd.read_csv(tmp_path / "out" / "verify.csv")
@@ -410,9 +410,9 @@ def test_the_report_is_written_as_table_and_text(made, published, tmp_path):
 @pytest.mark.parametrize(
     ("options", "named"), [({"scenarios": ["nothing"]}, NAME), ({"checks": [7]}, "--checks"), ({"device": "gpu"}, "device")]
 )
-def test_unknown_scenarios_checks_and_devices_are_refused(made, tmp_path, options, named):
+def test_unknown_scenarios_checks_and_devices_are_refused(conforming, tmp_path, options, named):
     with pytest.raises(InputError, match=named):
-        verify_released(made, tmp_path / "out", **options)
+        verify_released(conforming, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
