@@ -170,12 +170,15 @@ class Capture:
 
     def colour(self, camera: str, frame: int) -> np.ndarray:
         """RGB [H, W, 3] uint8. Raises InputError."""
-        return _image(self.path("color", camera, frame), self.cameras[camera], cv2.IMREAD_COLOR)[..., ::-1]
+        return self._image("color", camera, frame, cv2.IMREAD_COLOR)[..., ::-1]
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
         """Depth [H, W], m, 0 where nothing was measured. Raises InputError."""
-        path, of = self.path("depth", camera, frame), self.cameras[camera]
-        values = _image(path, of, cv2.IMREAD_UNCHANGED) if path.suffix == ".png" else _array(path, of)
+        path = self.path("depth", camera, frame)
+        if path.suffix == ".png":
+            values = self._image("depth", camera, frame, cv2.IMREAD_UNCHANGED)
+        else:
+            values = read_array(path, self.cameras[camera])
         if values.dtype.kind == "f":
             return np.where(np.isfinite(values), values, 0.0)
         if values.dtype != np.uint16:
@@ -185,12 +188,16 @@ class Capture:
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
         path = self.path("mask", camera, frame)
-        labels = _image(path, self.cameras[camera], cv2.IMREAD_UNCHANGED)
+        labels = self._image("mask", camera, frame, cv2.IMREAD_UNCHANGED)
         if labels.dtype != np.uint8 or labels.ndim != 2:
             raise InputError(path, "masks are gray images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
         if labels.max() > HANDS:
             raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
         return labels
+
+    def _image(self, what: Literal["color", "depth", "mask"], camera: str, frame: int, flag: int) -> np.ndarray:
+        remedy = f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
+        return read_image(self.path(what, camera, frame), self.cameras[camera], flag, remedy)
 
     def tracks(self) -> np.ndarray:
         """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
@@ -227,7 +234,7 @@ class Writer:
         if path.suffix == ".png":
             _write_png(path, depth)
         else:
-            _make_way(path)
+            make_way(path)
             np.save(path, depth, allow_pickle=False)
         if mask is not None:
             self.mask(camera, frame, mask)
@@ -289,9 +296,9 @@ def description_departures(path: Path, description: Description) -> list[Departu
     return departures
 
 
-def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:
+def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:
+    """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
     if not path.is_file():
-        remedy = f"List the frame in cameras.{camera.name}.missing of {CAPTURE} if the camera does not have it."
         raise InputError(path, "this image must exist", "no such file", remedy)
     image = cv2.imread(str(path), flag)
     if image is None:
@@ -300,7 +307,8 @@ def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:
     return image
 
 
-def _array(path: Path, camera: Camera) -> np.ndarray:
+def read_array(path: Path, camera: Camera) -> np.ndarray:
+    """An .npy image [H, W] of the camera's size. Raises InputError."""
     try:
         array = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -317,13 +325,13 @@ def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
         raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to color.")
 
 
-def _make_way(path: Path) -> None:
+def make_way(path: Path) -> None:
     """Remove the old file. It may be a link to the original of an imported capture, which must not be overwritten."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    _make_way(path)
+    make_way(path)
     if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
         raise InputError(path, "this file must be writable")

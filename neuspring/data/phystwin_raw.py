@@ -18,7 +18,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data import phystwin
 from neuspring.data.calibration import metadata_departures, poses_departures
-from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer
+from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer, make_way, read_image
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
@@ -41,7 +41,6 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     case = Path(case)
     metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
     refuse(raw_departures(case, metadata, poses))
-    width, height = metadata["WH"]
     frames = int(metadata["frame_num"])
     has_masks = (case / "mask").is_dir()
     description = Description(
@@ -60,13 +59,13 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     )
     writer = Writer(folder, description)
     capture = writer.capture
-    for camera in capture.cameras:
-        ids = _detections(case, camera) if has_masks else {}
+    for name, camera in capture.cameras.items():
+        ids = _detections(case, name) if has_masks else {}
         for frame in range(frames):
-            _link(case / "color" / camera / f"{frame}.png", capture.path("color", camera, frame))
-            _link(case / "depth" / camera / f"{frame}.npy", capture.path("depth", camera, frame))
+            _link(case / "color" / name / f"{frame}.png", capture.path("color", name, frame))
+            _link(case / "depth" / name / f"{frame}.npy", capture.path("depth", name, frame))
             if has_masks:
-                writer.mask(camera, frame, _labels(case, camera, frame, ids, (height, width)))
+                writer.mask(name, frame, _labels(case, camera, frame, ids))
     return writer.finish(_tracks(case, frames))
 
 
@@ -116,18 +115,11 @@ def _detections(case: Path, camera: str) -> dict[int, list[str]]:
     return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
 
 
-def _labels(case: Path, camera: str, frame: int, ids: dict[int, list[str]], size: tuple[int, int]) -> np.ndarray:
-    labels = np.zeros(size, dtype=np.uint8)
+def _labels(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
+    labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
     for label, names in sorted(ids.items()):
         for name in names:
-            path = case / "mask" / camera / name / f"{frame}.png"
-            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if mask is None:
-                raise InputError(
-                    path, "this mask must be a readable PNG", "no such file" if not path.exists() else "a damaged file"
-                )
-            if mask.shape != size:
-                raise InputError(path, f"masks have the size of the images, {size[1]} x {size[0]}", mask.shape[::-1])
+            mask = read_image(case / "mask" / camera.name / name / f"{frame}.png", camera, cv2.IMREAD_GRAYSCALE)
             labels[mask > 0] = label
     return labels
 
@@ -153,8 +145,7 @@ def _train_end(case: Path, frames: int) -> int | None:
 def _link(source: Path, target: Path) -> None:
     if not source.is_file():
         raise InputError(source, "this image must exist", "no such file")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
+    make_way(target)
     try:
         os.link(source, target)
     except OSError:

@@ -7,6 +7,7 @@ key. None runs code that a file holds.
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera
+from neuspring.data.capture import Camera, read_array, read_image
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.json_file import load_json
 from neuspring.data.phystwin_raw import CALIBRATION, cameras_of, raw_departures
@@ -219,18 +220,15 @@ def read_cameras(folder: Path) -> list[Camera]:
 
 def visible_pixels(path: Path) -> np.ndarray:
     """Frame-0 pixels [Q, 2] (row, column) of the visible tracks of cotracker/{camera}.npz."""
-    stored = _numpy(path)
     try:
-        tracks, visible = stored["tracks"], stored["visibility"]
-    except (KeyError, IndexError) as error:
+        with np.load(path, allow_pickle=False) as stored:
+            tracks, visible = stored["tracks"], stored["visibility"]
+    except KeyError as error:
         raise InputError(path, "arrays `tracks` and `visibility` are required", str(error)) from error
-    if (
-        tracks.ndim != 3
-        or tracks.shape[2] != 2
-        or visible.shape != tracks.shape[:2]
-        or not len(tracks)
-        or visible.dtype != np.bool_
-    ):
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(path, "this file must be a NumPy file (npz) without pickle", f"{type(error).__name__}: {error}") from error
+    has_pixels = tracks.ndim == 3 and tracks.shape[2] == 2 and len(tracks) > 0
+    if not has_pixels or visible.shape != tracks.shape[:2] or visible.dtype != np.bool_:
         received = f"{tracks.shape} and {visible.shape} {visible.dtype}"
         raise InputError(path, "tracks [T, Q, 2] and bool visibility [T, Q] are required", received)
     pixels: np.ndarray = tracks[0][visible[0]].astype(np.float64)
@@ -241,24 +239,10 @@ def visible_pixels(path: Path) -> np.ndarray:
 
 def depth_image(path: Path, camera: Camera) -> np.ndarray:
     """Depth of one frame [H, W], uint16, of depth/{camera}/{frame}.npy."""
-    depth = _numpy(path)
-    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype != np.uint16:
-        raise InputError(path, "a uint16 image [H, W] is required", getattr(depth, "dtype", type(depth).__name__))
-    if depth.shape != (camera.height, camera.width):
-        raise InputError(path, f"[height, width] must match WH = [{camera.width}, {camera.height}]", depth.shape)
+    depth = read_array(path, camera)
+    if depth.dtype != np.uint16:
+        raise InputError(path, "a uint16 image [H, W] is required", depth.dtype)
     return depth
-
-
-def _numpy(path: Path) -> Any:
-    """An .npy array or the arrays of an .npz, without pickle."""
-    try:
-        stored = np.load(path, allow_pickle=False)
-        if isinstance(stored, np.ndarray):
-            return stored
-        with stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, "this file must be a NumPy file without pickle", f"{type(error).__name__}: {error}") from error
 
 
 def gated_lift(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -285,11 +269,6 @@ def mirrored(camera: Camera) -> Camera:
 
 def read_picture(path: Path, camera: Camera, *, gray: bool = False) -> np.ndarray:
     """RGB [H, W, 3] or gray [H, W], uint8."""
-    if not path.is_file():
-        raise InputError(path, "this picture must exist", "no such file")
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(path, "this file must be a readable picture", "a damaged file")
-    if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(path, f"must be {camera.width} x {camera.height} pixels", image.shape[1::-1])
-    return np.asarray(image if gray else image[..., ::-1])
+    if gray:
+        return read_image(path, camera, cv2.IMREAD_GRAYSCALE)
+    return read_image(path, camera, cv2.IMREAD_COLOR)[..., ::-1]

@@ -96,9 +96,9 @@ def test_the_deprojection_convention_is_told(tmp_path: Path, mirrored: bool) -> 
 def test_bad_raw_files_are_reported(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
     write_raw_frame(folder, mirrored=False)
-    np.save(folder / "depth" / "0" / "0.npy", np.zeros((5, 5)))
+    np.save(folder / "depth" / "0" / "0.npy", np.zeros((48, 64)))
     assert holds(check(folder), "error", "0.npy", "uint16", "float64")
     np.save(folder / "depth" / "0" / "0.npy", np.zeros((5, 5), np.uint16))
-    assert holds(check(folder), "error", "0.npy", "WH")
+    assert holds(check(folder), "error", "0.npy", "camera 0 has images of 64 x 48", "5 x 5")
     (folder / "cotracker" / "0.npz").write_bytes(b"PK\x03\x04 damaged")
     assert holds(check(folder), "error", "0.npz", "NumPy file")
