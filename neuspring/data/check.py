@@ -206,30 +206,21 @@ def _check_split(case: Inspection, frames: int | None) -> None:
 
 def _check_tracks(case: Inspection, frames: int | None) -> None:
     path = case.folder / phystwin.TRACKS
-    if not path.exists():
-        case.skip(path, "annotated tracks and the track error are")
-        return
-    tracks = case.load(path, load_pickle)
+    tracks = case.load_optional(path, load_pickle, "annotated tracks and the track error are")
     if tracks is not None:
         case.departures += phystwin.tracks_departures(path, tracks, frames)
 
 
 def _check_calibration(case: Inspection) -> None:
     path = case.folder / CALIBRATION
-    if not path.exists():
-        case.skip(path, "the calibration check is")
-        return
-    poses = case.load(path, load_pickle)
+    poses = case.load_optional(path, load_pickle, "the calibration check is")
     if poses is not None:
         case.departures += poses_departures(path, poses, CAMERAS)
 
 
 def _check_metadata(case: Inspection, frames: int | None) -> None:
     path = case.folder / phystwin.METADATA
-    if not path.exists():
-        case.skip(path, "the check of intrinsics and frame rate is")
-        return
-    metadata = case.load(path, load_json)
+    metadata = case.load_optional(path, load_json, "the check of intrinsics and frame rate is")
     if metadata is None:
         return
     case.departures += phystwin.frame_rate_departures(path, metadata)

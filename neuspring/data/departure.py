@@ -74,6 +74,9 @@ class Inspection:
             self.departures.append(Departure(path, "error", str(error).removeprefix(f"{path}: ")))
             return None
 
-    def skip(self, path: Path, what: str) -> None:
-        """Note that `path` is missing and `what` (with its verb: "the check is") is therefore skipped."""
-        self.departures.append(note(path, f"not found: {what} skipped"))
+    def load_optional(self, path: Path, reader: Callable[[Path], Any], skipped: str) -> Any:
+        """As `load`, with a note if `path` is missing: what is therefore `skipped`, with its verb ("the check is")."""
+        if path.exists():
+            return self.load(path, reader)
+        self.departures.append(note(path, f"not found: {skipped} skipped"))
+        return None
