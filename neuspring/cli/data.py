@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neuspring.stages import options as shared
+
+if TYPE_CHECKING:
+    from neuspring.data.departure import Departure
 
 
 def fetch_options(parser: ArgumentParser) -> None:
@@ -21,14 +25,11 @@ def fetch_options(parser: ArgumentParser) -> None:
 
 def fetch(a: Namespace) -> int:
     """`neuspring fetch`: 2 where what came is broken."""
-    from neuspring.data import check
     from neuspring.data.fetch import fetch
+    from neuspring.scores.released.check_data import check
 
-    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run)
-    if a.dry_run:
-        return 0
-    print(check.render(departures))
-    return 2 if any(departure.level == "error" for departure in departures) else 0
+    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)
+    return 0 if a.dry_run else _tell(departures)
 
 
 def check_data_options(parser: ArgumentParser) -> None:
@@ -38,10 +39,16 @@ def check_data_options(parser: ArgumentParser) -> None:
 
 def check_data(a: Namespace) -> int:
     """`neuspring check-data`: 2 where the data cannot be used."""
-    from neuspring.data import check
+    from neuspring.scores.released.check_data import check
 
-    departures = check.check(a.folder)
-    print(check.render(departures))
+    return _tell(check(a.folder))
+
+
+def _tell(departures: list[Departure]) -> int:
+    """Print departures; returns 2 where the data cannot be used."""
+    from neuspring.data.check import render
+
+    print(render(departures))
     return 2 if any(departure.level == "error" for departure in departures) else 0
 
 
@@ -49,7 +56,7 @@ def verify_released_options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring verify-released`."""
     parser.add_argument("data_root", type=Path, help="folder that holds data, experiments and the other released folders")
     parser.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
-    checks = "2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
+    checks = "1 table points, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
     parser.add_argument("--checks", nargs="+", type=int, help=checks)
     shared.add_settings(parser)
     shared.add_device(parser)

@@ -2,13 +2,13 @@
 
     capture.json                       everything but images, see `Description`
     color/<camera>/<frame>.png         8-bit RGB
-    depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float metres (npy); along the optical axis,
+    depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
                                        0: none
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
     tracks.json                        optional, for scoring alone: [K][T] of [x, y, z] m in the world, or null where not annotated
 
-Frames are numbered from 0 with five digits. Pixel centres lie at whole coordinates, x right, y down, z forward (OpenCV). The world
-is right-handed, metres, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
+Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
+is right-handed, meters, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
 and has no files.
 """
 
@@ -19,7 +19,7 @@ import json
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -30,59 +30,15 @@ from neuspring.config.types import STRICT, Finite, Name, Positive
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
+from neuspring.data.calibration import TEXT_TOLERANCE, intrinsics_departures, pose_departures
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 
 CAPTURE, TRACKS = "capture.json", "tracks.json"
-FORMAT = 1
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
-RIGID_TOLERANCE = 1e-4
-"""Of R^T R - 1; leaves room for matrices that went through text with five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraEntry:
-    """One camera of capture.json."""
-
-    __pydantic_config__ = STRICT
-    name: Name
-    """Its folder under color, depth and mask."""
-    width: Annotated[int, Field(ge=16)]
-    height: Annotated[int, Field(ge=16)]
-    intrinsics: tuple[Row3, Row3, Row3]
-    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
-    camera_to_world: tuple[Row4, Row4, Row4, Row4]
-    """Rigid, m."""
-    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    """Frames that this camera does not have."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Description:
-    """capture.json."""
-
-    __pydantic_config__ = STRICT
-    format: Literal[1]
-    name: Name
-    category: str
-    """What the object is, in words: cloth, rope, package, ..."""
-    frame_count: Annotated[int, Field(ge=5)]
-    frame_rate: Positive
-    """Frames per second."""
-    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
-    depth_unit: Positive = 0.001
-    """Metres per count of an integer depth image."""
-    depth_format: Literal["png", "npy"] = "png"
-    up: Literal["+z", "-z"] = "+z"
-    """Which way is up along the world's z axis."""
-    train_end: Annotated[int, Field(ge=2)] | None = None
-    """Training frames are [0, train_end); null: the first 70 %."""
-    masks: bool = False
-    """Whether mask/ is there."""
-    provenance: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +52,12 @@ class Camera:
     """K [3, 3], pixels."""
     camera_to_world: np.ndarray
     """[4, 4], m."""
+
+    def entry(self) -> CameraEntry:
+        """Its entry in capture.json."""
+        intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
+        pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
+        return CameraEntry(name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose)
 
     def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
@@ -116,6 +78,52 @@ class Camera:
         return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CameraEntry:
+    """One camera of capture.json."""
+
+    __pydantic_config__ = STRICT
+    name: Name
+    """Its folder under color, depth and mask."""
+    width: Annotated[int, Field(ge=16)]
+    height: Annotated[int, Field(ge=16)]
+    intrinsics: tuple[Row3, Row3, Row3]
+    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
+    camera_to_world: tuple[Row4, Row4, Row4, Row4]
+    """Rigid, m."""
+    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Frames that this camera does not have."""
+
+    def camera(self) -> Camera:
+        """The calibrated camera."""
+        return Camera(self.name, self.width, self.height, np.array(self.intrinsics), np.array(self.camera_to_world))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """capture.json."""
+
+    __pydantic_config__ = STRICT
+    format: Literal[1]
+    name: Name
+    category: str
+    """Kind of object: cloth, rope, package, ..."""
+    frame_count: Annotated[int, Field(ge=5)]
+    frame_rate: Positive
+    """Frames per second."""
+    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    depth_unit: Positive = 0.001
+    """Meters per count of an integer depth image."""
+    depth_format: Literal["png", "npy"] = "png"
+    up: Literal["+z", "-z"] = "+z"
+    """Direction of up along the world's z axis."""
+    train_end: Annotated[int, Field(ge=2)] | None = None
+    """Training frames are [0, train_end); null: the first 70 %."""
+    masks: bool = False
+    """Whether the capture has masks."""
+    provenance: dict[str, str] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """A capture folder, its images read on demand."""
@@ -134,11 +142,8 @@ class Capture:
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
-        """By name, in the order of capture.json."""
-        return {
-            c.name: Camera(c.name, c.width, c.height, np.array(c.intrinsics), np.array(c.camera_to_world))
-            for c in self.description.cameras
-        }
+        """Cameras by name, in the order of capture.json."""
+        return {entry.name: entry.camera() for entry in self.description.cameras}
 
     @property
     def frame_count(self) -> int:
@@ -170,27 +175,34 @@ class Capture:
 
     def colour(self, camera: str, frame: int) -> np.ndarray:
         """RGB [H, W, 3] uint8. Raises InputError."""
-        return _image(self.path("color", camera, frame), self.cameras[camera], cv2.IMREAD_COLOR)[..., ::-1]
+        return self._image("color", camera, frame, cv2.IMREAD_COLOR)[..., ::-1]
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
         """Depth [H, W], m, 0 where nothing was measured. Raises InputError."""
-        path, of = self.path("depth", camera, frame), self.cameras[camera]
-        values = _image(path, of, cv2.IMREAD_UNCHANGED) if path.suffix == ".png" else _array(path, of)
+        path = self.path("depth", camera, frame)
+        if path.suffix == ".png":
+            values = self._image("depth", camera, frame, cv2.IMREAD_UNCHANGED)
+        else:
+            values = read_array(path, self.cameras[camera])
         if values.dtype.kind == "f":
             return np.where(np.isfinite(values), values, 0.0)
         if values.dtype != np.uint16:
-            raise InputError(path, "depth must be 16-bit integers, or floating-point metres (npy)", values.dtype)
+            raise InputError(path, "depth must be 16-bit integers, or floating-point meters (npy)", values.dtype)
         return values * self.description.depth_unit
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
         path = self.path("mask", camera, frame)
-        labels = _image(path, self.cameras[camera], cv2.IMREAD_UNCHANGED)
+        labels = self._image("mask", camera, frame, cv2.IMREAD_UNCHANGED)
         if labels.dtype != np.uint8 or labels.ndim != 2:
-            raise InputError(path, "masks are grey images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
+            raise InputError(path, "masks are gray images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
         if labels.max() > HANDS:
             raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
         return labels
+
+    def _image(self, what: Literal["color", "depth", "mask"], camera: str, frame: int, flag: int) -> np.ndarray:
+        remedy = f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
+        return read_image(self.path(what, camera, frame), self.cameras[camera], flag, remedy)
 
     def tracks(self) -> np.ndarray:
         """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
@@ -227,7 +239,7 @@ class Writer:
         if path.suffix == ".png":
             _write_png(path, depth)
         else:
-            _make_way(path)
+            make_way(path)
             np.save(path, depth, allow_pickle=False)
         if mask is not None:
             self.mask(camera, frame, mask)
@@ -268,48 +280,30 @@ def read_description(path: Path) -> Description:
 
 
 def description_departures(path: Path, description: Description) -> list[Departure]:
-    """What types cannot say: calibration, frame numbers, the split."""
-    found = []
+    """Rules that types cannot express: calibration, frame numbers, the split."""
+    departures = []
     names = [camera.name for camera in description.cameras]
     if len(set(names)) < len(names):
-        found.append(broken(path, "cameras", "names must differ", names))
+        departures.append(broken(path, "cameras", "names must differ", names))
     if description.train_end is not None and description.train_end > description.frame_count:
-        found.append(broken(path, "train_end", f"must be at most frame_count = {description.frame_count}", description.train_end))
+        rule = f"must be at most frame_count = {description.frame_count}"
+        departures.append(broken(path, "train_end", rule, description.train_end))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
-        found += _calibration_departures(path, where, camera)
+        size = (camera.width, camera.height)
+        departures += intrinsics_departures(path, f"{where}.intrinsics", np.array(camera.intrinsics), size)
+        departures += pose_departures(path, f"{where}.camera_to_world", np.array(camera.camera_to_world), TEXT_TOLERANCE)
         beyond = [frame for frame in camera.missing if frame >= description.frame_count]
         if beyond:
-            found.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
+            departures.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
         if 0 in camera.missing:
-            found.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
-    return found
+            departures.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+    return departures
 
 
-def _calibration_departures(path: Path, where: str, camera: CameraEntry) -> list[Departure]:
-    found = []
-    k = np.array(camera.intrinsics)
-    if not (k[0, 0] > 0 and k[1, 1] > 0 and k[0, 1] == 0 and np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])):
-        found.append(broken(path, f"{where}.intrinsics", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0", k.tolist()))
-    elif not (0 <= k[0, 2] < camera.width and 0 <= k[1, 2] < camera.height):
-        found.append(
-            broken(path, f"{where}.intrinsics", f"(cx, cy) must lie in the {camera.width} x {camera.height} image", k.tolist())
-        )
-    pose = np.array(camera.camera_to_world)
-    error = float(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max())
-    if error > RIGID_TOLERANCE or np.linalg.det(pose[:3, :3]) < 0:
-        rule = "the upper left 3 x 3 block must be a rotation (orthonormal, right-handed)"
-        found.append(
-            broken(path, f"{where}.camera_to_world", rule, f"a departure of {error:.3g} from R^T R = 1, or a mirror image")
-        )
-    if not np.array_equal(pose[3], [0, 0, 0, 1]):
-        found.append(broken(path, f"{where}.camera_to_world", "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
-    return found
-
-
-def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:
+def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:
+    """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
     if not path.is_file():
-        remedy = f"List the frame in cameras.{camera.name}.missing of {CAPTURE} if the camera does not have it."
         raise InputError(path, "this image must exist", "no such file", remedy)
     image = cv2.imread(str(path), flag)
     if image is None:
@@ -318,7 +312,8 @@ def _image(path: Path, camera: Camera, flag: int) -> np.ndarray:
     return image
 
 
-def _array(path: Path, camera: Camera) -> np.ndarray:
+def read_array(path: Path, camera: Camera) -> np.ndarray:
+    """An .npy image [H, W] of the camera's size. Raises InputError."""
     try:
         array = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -332,16 +327,16 @@ def _array(path: Path, camera: Camera) -> np.ndarray:
 def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
     if image.shape[:2] != (camera.height, camera.width):
         rule = f"camera {camera.name} has images of {camera.width} x {camera.height}"
-        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to colour.")
+        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to color.")
 
 
-def _make_way(path: Path) -> None:
-    """A file in the way may be a link to the original of an imported capture: it is replaced, never written into."""
+def make_way(path: Path) -> None:
+    """Remove the old file. It may be a link to the original of an imported capture, which must not be overwritten."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    _make_way(path)
+    make_way(path)
     if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
         raise InputError(path, "this file must be writable")

@@ -1,4 +1,4 @@
-"""The table of the 22 released PhysTwin cases, which says what is known of them before any data are read."""
+"""The table of the 22 released PhysTwin cases: sizes, category, springs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What departs from the described layout of a data set, and the case under inspection that collects it."""
+"""Departures of a data set from its described layout, and the inspection that collects them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,18 @@ Level = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Departure:
-    """`error`: the reader refuses the file, or numbers would be wrong. `warning`: readable, but not as released. `note`: a
-    measurement, or a check that was skipped."""
+    """One departure. `error`: the reader refuses the file, or numbers would be wrong. `warning`: readable, but not as released.
+    `note`: a measurement, or a check that was skipped."""
 
     file: Path
     level: Level
     message: str
+
+    @classmethod
+    def of_error(cls, error: InputError | str) -> Departure:
+        """The error of a reader, or its text, which begins with the file."""
+        file, _, message = str(error).partition(": ")
+        return cls(Path(file), "error", message)
 
 
 def broken(file: Path, key: str, rule: str, value: object = None) -> Departure:
@@ -54,28 +60,23 @@ def refuse(departures: list[Departure]) -> None:
 
 
 @dataclass
-class Case:
-    """One case under inspection and what was found so far."""
+class Inspection:
+    """A folder under inspection and its departures so far."""
 
     folder: Path
-    root: Path | None
-    """Folder that holds `data`, `experiments` and `experiments_optimization`, if known."""
-    found: list[Departure] = field(default_factory=list)
-    scores: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """The folder's name, also where the folder is given as `.`."""
-        return self.folder.resolve().name
+    departures: list[Departure] = field(default_factory=list)
 
     def load(self, path: Path, reader: Callable[[Path], Any]) -> Any:
-        """The content of `path`, or None (with a departure) where it is missing or damaged."""
+        """The content of `path`, or None (with a departure) if it is missing or damaged."""
         try:
             return reader(path)
         except InputError as error:
-            self.found.append(Departure(path, "error", str(error).removeprefix(f"{path}: ")))
+            self.departures.append(Departure(path, "error", str(error).removeprefix(f"{path}: ")))
             return None
 
-    def skip(self, path: Path, what: str) -> None:
-        """Note that `path` is missing and `what` (with its verb: "the check is") therefore skipped."""
-        self.found.append(note(path, f"not found: {what} skipped"))
+    def load_optional(self, path: Path, reader: Callable[[Path], Any], skipped: str) -> Any:
+        """As `load`, with a note if `path` is missing: what is therefore `skipped`, with its verb ("the check is")."""
+        if path.exists():
+            return self.load(path, reader)
+        self.departures.append(note(path, f"not found: {skipped} skipped"))
+        return None

@@ -11,7 +11,7 @@ from neuspring.core.errors import InputError
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of all that the file shows, as one closed surface, outward.
+    """Vertices [V, 3] and outward faces [F, 3] of the file's whole geometry as one closed surface.
 
     Raises InputError for a file that is missing, unreadable, empty, not finite or not closed.
     """
@@ -20,7 +20,7 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         mesh = trimesh.load_mesh(path, process=True, maintain_order=False)
     except Exception as error:
-        # trimesh's readers raise whatever their formats make of damaged bytes.
+        # trimesh's readers have no common exception for damaged bytes.
         raise InputError(
             path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", f"{type(error).__name__}: {error}"
         ) from error

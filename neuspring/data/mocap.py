@@ -1,8 +1,8 @@
 """Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
 
-One pickle is one recording: positions [T, 3, n], float64, metres, 100 Hz, z up; released as nested lists, arrays are accepted
-too. Markers run along the cable. The two at either end are held by robots (controllers), the others are observed. There is no
-surface, so the body is sampled as rings around a smooth centreline through the markers of frame 0.
+One pickle is one recording: positions [T, 3, n], float64, meters, 100 Hz, z up; released as nested lists, arrays are accepted
+too. Markers run along the cable. Robots hold the two at either end: they are the controllers. The others are observed. There is no
+surface, so the body is sampled as rings around a smooth centerline through the markers of frame 0.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ MIN_MARKERS = 6
 """Two controllers at either end and at least two observed markers."""
 MIN_FRAMES = 4
 MIN_DISTANCE = 1e-4
-"""Nodes must be further apart, m: shorter springs are not made."""
+"""Nodes must be farther apart than this, m; otherwise their spring would have no length."""
 RELEASED_SAMPLES = 500
 MAX_STRETCH = 0.5
-"""Marker distances of the released cables stay within a third of their median; more suggests swapped or lost markers."""
+"""Relative change of a marker distance from its median above which markers may be swapped or lost. The released cables stay
+below a third."""
 OVERSAMPLING = 64
 """Evaluations of the spline per marker interval, for its arc length."""
 
 
 def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
-    """Read one recording; options in `settings` (config, `mocap`). Metres, float32, world with +z up.
+    """Read one recording; options in `settings` (config, `mocap`). Meters, float32, world with +z up.
 
     Frame rate 100 Hz / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
     """
@@ -55,14 +56,14 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         rule = f"mocap.train_fraction = {settings.train_fraction} must leave a frame after frame 0 for training"
         raise InputError(file, rule, f"{train_end} of {frames} frames", "Choose a larger fraction.")
 
-    held = [0, 1, count - 2, count - 1]
+    controllers = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
     body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
     _require_distance(file, markers[0], body)
     rest_shape = NO_REST_SHAPE
     if settings.rest_shape == "straight":
         line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
-        rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
+        rest_shape = np.concatenate([line[2:-2], rest_body, line[controllers]])
     motion_valid = np.ones(observed.shape[:2], dtype=bool)
     motion_valid[-1] = False
     return Observations(
@@ -81,7 +82,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         object_points=observed,
         object_visibility=np.ones(observed.shape[:2], dtype=bool),
         object_motion_valid=motion_valid,
-        controller_points=markers[:, held],
+        controller_points=markers[:, controllers],
         surface_points=body,
         interior_points=np.zeros((0, 3)),
         tracks=observed,
@@ -103,11 +104,11 @@ def _require_distance(file: Path, markers: np.ndarray, body: np.ndarray) -> None
 
 
 def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number: int | None = None) -> np.ndarray:
-    """Nodes [R * count, 3], m, on R circles around the centreline through `markers` [n, 3], ring after ring.
+    """Nodes [R * count, 3], m, on R circles around the centerline through `markers` [n, 3], ring after ring.
 
-    The first and last ring lie at the first and last marker; between them rings are equally spaced along the arc, as near to
-    `spacing` as divides it evenly, or as many as `number` says. Each circle lies in the plane normal to the tangent. Its first
-    node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
+    The first and last ring lie at the first and last marker. Between them rings are equally spaced along the arc: `number` rings
+    in all, or the spacing nearest to `spacing` that divides the arc evenly. Each circle lies in the plane normal to the tangent.
+    Its first node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
     """
     centres, tangents = centreline(markers, spacing, number)
     normals = _transported_normals(tangents)
@@ -119,9 +120,9 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number
 
 
 def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same cable straight and without twist: its markers [n, 3] and the nodes of its rings [number * count, 3], m, along x.
+    """The cable laid out along x without twist: its markers [n, 3] and the nodes of its `number` rings [number * count, 3], m.
 
-    Arc lengths along the centreline are kept; the body is that of `rings` with as many circles.
+    Arc lengths along the centerline are kept.
     """
     _, knots, dense, arc = _arc(markers)
     line = np.zeros((len(markers), 3))
@@ -142,7 +143,7 @@ def centreline(markers: np.ndarray, spacing: float, number: int | None = None) -
 
 
 def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.ndarray]:
-    """Spline through the markers, its parameters at the markers, many parameters, and the arc length [m] at each of these."""
+    """Spline through the markers, its parameters at the markers, dense parameters, and the arc length, m, at each dense one."""
     knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
     spline = CubicSpline(knots, markers, bc_type="natural")
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
@@ -162,7 +163,7 @@ def _transported_normals(tangents: np.ndarray) -> np.ndarray:
 
 
 def recording_departures(file: Path, raw: Any) -> list[Departure]:
-    """Everything about one recording that the reader refuses (errors) or that is not as released (warnings)."""
+    """Departures of one recording: what the reader refuses (errors) and what is not as released (warnings)."""
     if not isinstance(raw, (np.ndarray, list, tuple)):
         return [broken(file, "", "positions [T, 3, n] are required", type(raw).__name__)]
     try:
@@ -173,40 +174,42 @@ def recording_departures(file: Path, raw: Any) -> list[Departure]:
         return [broken(file, "", "the shape must be [T, 3, n]", data.shape)]
     if data.dtype.kind != "f":
         return [broken(file, "", "the dtype must be floating point", data.dtype)]
-    found = []
+    departures = []
     if data.shape[2] < MIN_MARKERS:
-        found.append(broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are held)", data.shape[2]))
+        departures.append(
+            broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are controllers)", data.shape[2])
+        )
     if len(data) < MIN_FRAMES:
-        found.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
+        departures.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
     bad = np.argwhere(~np.isfinite(data))
     if len(bad):
         frame, axis, marker = (int(i) for i in bad[0])
         place = f"{data[frame, axis, marker]} at frame {frame}, marker {marker} ({len(bad)} in all)"
-        found.append(broken(file, "", "every coordinate must be finite", place))
-    return found or _marker_departures(file, data)
+        departures.append(broken(file, "", "every coordinate must be finite", place))
+    return departures or _marker_departures(file, data)
 
 
 def _marker_departures(file: Path, data: np.ndarray) -> list[Departure]:
-    found = []
+    departures = []
     if data.dtype != np.float64:
-        found.append(unusual(file, "", "the released dtype is float64", data.dtype))
+        departures.append(unusual(file, "", "the released dtype is float64", data.dtype))
     if len(data) != RELEASED_SAMPLES:
-        found.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
+        departures.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
     length = np.linalg.norm(np.diff(data, axis=2), axis=1)
     short = np.argwhere(length[0] < MIN_DISTANCE)
     if len(short):
         i = int(short[0, 0])
-        found.append(
-            broken(file, "", f"neighbouring markers must be {MIN_DISTANCE} m apart in frame 0", f"markers {i} and {i + 1}")
+        departures.append(
+            broken(file, "", f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0", f"markers {i} and {i + 1}")
         )
-        return found
+        return departures
     stretch = np.abs(length / np.median(length, axis=0) - 1)
     frame, segment = np.unravel_index(int(stretch.argmax()), stretch.shape)
     if stretch[frame, segment] > MAX_STRETCH:
         place = f"{length[frame, segment]:.3f} m between markers {segment} and {segment + 1} in frame {frame}"
         rule = f"marker distances usually stay within {MAX_STRETCH:.0%} of their median {np.median(length[:, segment]):.3f} m"
-        found.append(unusual(file, "", rule, place))
-    return found
+        departures.append(unusual(file, "", rule, place))
+    return departures
 
 
 def check_mocap(file: Path) -> list[Departure]:

@@ -21,7 +21,7 @@ from neuspring.data.unpickle import load_pickle
 
 FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
 FILES = (FINAL_DATA, SPLIT, TRACKS, METADATA)
-"""All that the reader looks for in a case's folder."""
+"""The files that the reader looks for in a case's folder."""
 RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 MAX_FRAME_RATE = 1e6
@@ -29,14 +29,14 @@ MAX_FRAME_RATE = 1e6
 
 @dataclass(frozen=True)
 class ArrayRule:
-    """What one array of a pickle must be. Dimensions: letters agree within the file, digits are fixed."""
+    """The rule for one array of a pickle. In its shape, names stand for sizes that agree within the file; digits are fixed."""
 
     key: str
     shape: tuple[str, ...]
     kind: str
     """NumPy's letter: f (finite floating point) or b (bool)."""
     required: bool = True
-    """The reader uses it."""
+    """Whether the reader uses it."""
 
 
 ARRAYS = (
@@ -49,7 +49,7 @@ ARRAYS = (
     ArrayRule("object_colors", ("T", "No", "3"), "f", required=False),
 )
 IGNORED = ("controller_mask",)
-"""Left-over key of the released processing: accepted, not read."""
+"""A left-over key of the released processing, which is accepted and not read."""
 KIND_NAMES = {"f": "floating point", "b": "bool"}
 
 
@@ -57,7 +57,7 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     """Read one processed case from its `folder`.
 
     Uses final_data.pkl and split.json; gt_track_3d.pkl (else no tracks) and metadata.json (else 30 frames per second) where
-    present. Metres, float32, world with -z up. Raises InputError naming file and key.
+    present. Meters, float32, world with -z up. Raises InputError naming file and key.
     """
     folder = Path(folder)
     data_path, split_path = folder / FINAL_DATA, folder / SPLIT
@@ -105,46 +105,61 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
 
 def final_data_departures(path: Path, data: Any) -> list[Departure]:
     """Keys, shapes, dtypes and finiteness of final_data.pkl, and the rules without which nothing can be simulated."""
+    departures = structure_departures(path, data)
+    if not isinstance(data, dict):
+        return departures
+    for rule in ARRAYS:
+        value = data.get(rule.key)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f" == rule.kind and value.ndim == len(rule.shape):
+            departures += _number_departures(path, rule, value)
+    if not any(d.level == "error" for d in departures):
+        departures += _content_departures(path, data)
+    return departures
+
+
+def structure_departures(path: Path, data: Any) -> list[Departure]:
+    """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
         return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
-    found: list[Departure] = []
-    known = {rule.key for rule in ARRAYS} | set(IGNORED)
-    found += [unusual(path, str(key), "unknown key, not read") for key in data if key not in known]
+    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
+    departures = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
     sizes: dict[str, int] = {}
     for rule in ARRAYS:
         if rule.key in data:
-            found += array_departures(path, rule, data[rule.key], sizes)
+            departures += _array_departures(path, rule, data[rule.key], sizes)
         else:
-            found.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
-    if not any(d.level == "error" for d in found):
-        found += _content_departures(path, data)
-    return found
+            departures.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
+    return departures
 
 
-def array_departures(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Departure]:
-    """Type, dtype, shape and finiteness of one array. `sizes` collects the symbolic dimensions of the file."""
-    declared = f"[{', '.join(rule.shape)}]"
+def _array_departures(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Departure]:
+    """Type, shape and dtype of one array. `sizes` collects the symbolic dimensions of the file."""
+    shape = f"[{', '.join(rule.shape)}]"
     severity = broken if rule.required else unusual
     if not isinstance(value, np.ndarray):
-        return [severity(path, rule.key, f"an array {declared} is required", type(value).__name__)]
+        return [severity(path, rule.key, f"an array {shape} is required", type(value).__name__)]
     if value.ndim != len(rule.shape):
-        return [severity(path, rule.key, f"the shape must be {declared}", value.shape)]
-    found = []
+        return [severity(path, rule.key, f"the shape must be {shape}", value.shape)]
+    departures = []
     for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
         wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
         if size != wanted:
-            found.append(
-                severity(path, rule.key, f"the shape must be {declared} with {wanted} entries along axis {axis}", value.shape)
-            )
+            message = f"the shape must be {shape} with {wanted} entries along axis {axis}"
+            departures.append(severity(path, rule.key, message, value.shape))
     if value.dtype.kind != rule.kind:
-        found.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
-    elif rule.kind == "f":
-        if value.dtype != np.float64:
-            found.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
-        bad = np.argwhere(~np.isfinite(value))
-        if len(bad):
-            found.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
-    return found
+        departures.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
+    return departures
+
+
+def _number_departures(path: Path, rule: ArrayRule, value: np.ndarray) -> list[Departure]:
+    departures = []
+    if value.dtype != np.float64:
+        departures.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
+    bad = np.argwhere(~np.isfinite(value))
+    if len(bad):
+        severity = broken if rule.required else unusual
+        departures.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
+    return departures
 
 
 def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
@@ -155,49 +170,50 @@ def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
 
 
 def _content_departures(path: Path, data: dict[str, Any]) -> list[Departure]:
-    found = []
+    departures = []
     frames, points = data["object_visibilities"].shape
     if points == 0:
-        found.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
+        departures.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
     if data["controller_points"].shape[1] == 0:
-        found.append(broken(path, "controller_points", "at least one controller point is required", "none"))
+        departures.append(broken(path, "controller_points", "at least one controller point is required", "none"))
     if frames < 2:
-        found.append(broken(path, "object_points", "at least 2 frames are required", frames))
+        departures.append(broken(path, "object_points", "at least 2 frames are required", frames))
     hidden = np.flatnonzero(~data["object_visibilities"][0]) if frames else np.zeros(0, int)
     if len(hidden):
         rule = "every tracked point must be visible in frame 0, which is the rest state"
-        found.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
-    return found
+        departures.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
+    return departures
 
 
 def split_departures(path: Path, split: Any, frames: int) -> list[Departure]:
     """split.json against the number of frames: half-open ranges [start, end) inside [0, frames]."""
     if not isinstance(split, dict):
         return [broken(path, "", "a JSON object with train and test is required", type(split).__name__)]
-    found = []
+    departures = []
     for key in ("train", "test"):
         value = split.get(key)
         if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)):
-            found.append(broken(path, key, "two whole numbers [start, end) are required", value if key in split else "nothing"))
+            received = value if key in split else "nothing"
+            departures.append(broken(path, key, "two whole numbers [start, end) are required", received))
         elif not 0 <= value[0] <= value[1] <= frames:
-            found.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
+            departures.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
         elif key == "train" and value[1] < 2:
-            found.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
-    if not found:
-        found += _split_warnings(path, split, frames)
-    return found
+            departures.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
+    if not departures:
+        departures += _split_warnings(path, split, frames)
+    return departures
 
 
 def _split_warnings(path: Path, split: dict[str, Any], frames: int) -> list[Departure]:
     end = int(0.7 * frames)
-    found = []
+    departures = []
     for key, wanted in (("train", [0, end]), ("test", [end, frames])):
         if split[key] != wanted:
             meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
-            found.append(unusual(path, key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
+            departures.append(unusual(path, key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
     if split.get("frame_len") != frames:
-        found.append(unusual(path, "frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
-    return found
+        departures.append(unusual(path, "frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
+    return departures
 
 
 def tracks_departures(path: Path, tracks: Any, frames: int | None) -> list[Departure]:
@@ -208,20 +224,22 @@ def tracks_departures(path: Path, tracks: Any, frames: int | None) -> list[Depar
         return [broken(path, "", "the shape must be [T, K, 3]", tracks.shape)]
     if tracks.dtype.kind != "f":
         return [broken(path, "", "the dtype must be floating point", tracks.dtype)]
-    found = []
+    departures = []
     if frames is not None and len(tracks) != frames:
-        found.append(broken(path, "", f"{FINAL_DATA} has {frames} frames", tracks.shape))
+        departures.append(broken(path, "", f"{FINAL_DATA} has {frames} frames", tracks.shape))
     if tracks.dtype != np.float64:
-        found.append(unusual(path, "", "the released dtype is float64", tracks.dtype))
+        departures.append(unusual(path, "", "the released dtype is float64", tracks.dtype))
     infinite = np.argwhere(np.isinf(tracks))
     if len(infinite):
-        found.append(broken(path, "", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite)))
+        departures.append(
+            broken(path, "", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite))
+        )
     missing = np.isnan(tracks)
     partial = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
     if len(partial):
         place = f"frame {partial[0][0]}, point {partial[0][1]} ({len(partial)} in all)"
-        found.append(unusual(path, "", "a point is NaN in all three coordinates or in none", place))
-    return found
+        departures.append(unusual(path, "", "a point is NaN in all three coordinates or in none", place))
+    return departures
 
 
 def frame_rate_departures(path: Path, metadata: Any) -> list[Departure]:

@@ -17,20 +17,21 @@ from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data import phystwin
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer, description_departures
+from neuspring.data.calibration import metadata_departures, poses_departures
+from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer, make_way, read_image
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
 
 CALIBRATION = "calibrate.pkl"
 FILES = (phystwin.METADATA, CALIBRATION, phystwin.SPLIT, phystwin.TRACKS)
-"""All but images that the importer looks for in a case's folder."""
+"""The files beside images that the importer looks for in a case's folder."""
 HAND_PHRASE = "hand"
-"""The detected phrase of hands; the one other phrase of a camera is the object."""
+"""The detected phrase of hands. The one detection of a camera with another phrase is the object."""
 
 
 def has_images(case: Path) -> bool:
-    """Whether a case's folder holds images, masks and calibration: what a capture with masks is made of."""
+    """Whether a case's folder holds what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (phystwin.METADATA, CALIBRATION))
     return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 
@@ -40,26 +41,15 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     case = Path(case)
     metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
     refuse(raw_departures(case, metadata, poses))
-    width, height = metadata["WH"]
     frames = int(metadata["frame_num"])
     has_masks = (case / "mask").is_dir()
-    cameras = tuple(
-        CameraEntry(
-            name=str(index),
-            width=width,
-            height=height,
-            intrinsics=_rows(intrinsics),
-            camera_to_world=_rows(pose),
-        )
-        for index, (intrinsics, pose) in enumerate(zip(metadata["intrinsics"], poses, strict=True))
-    )
     description = Description(
         format=1,
         name=row.scenario,
         category=row.category,
         frame_count=frames,
         frame_rate=float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
-        cameras=cameras,
+        cameras=tuple(camera.entry() for camera in cameras_of(metadata, poses)),
         depth_unit=0.001,
         depth_format="npy",
         up="-z",
@@ -67,16 +57,15 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         masks=has_masks,
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (phystwin.METADATA, CALIBRATION)},
     )
-    refuse(description_departures(case / CALIBRATION, description))
     writer = Writer(folder, description)
     capture = writer.capture
-    for camera in capture.cameras:
-        ids = _detections(case, camera) if has_masks else {}
+    for name, camera in capture.cameras.items():
+        ids = _detections(case, name) if has_masks else {}
         for frame in range(frames):
-            _link(case / "color" / camera / f"{frame}.png", capture.path("color", camera, frame))
-            _link(case / "depth" / camera / f"{frame}.npy", capture.path("depth", camera, frame))
+            _link(case / "color" / name / f"{frame}.png", capture.path("color", name, frame))
+            _link(case / "depth" / name / f"{frame}.npy", capture.path("depth", name, frame))
             if has_masks:
-                writer.mask(camera, frame, _labels(case, camera, frame, ids, (height, width)))
+                writer.mask(name, frame, _labels(case, camera, frame, ids))
     return writer.finish(_tracks(case, frames))
 
 
@@ -91,29 +80,30 @@ def camera_count(case: Path) -> int:
 
 
 def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
-    """Keys and shapes of metadata.json and calibrate.pkl."""
-    path, calibration = case / phystwin.METADATA, case / CALIBRATION
+    """Frame rate, frame count and calibration in metadata.json and calibrate.pkl."""
+    path = case / phystwin.METADATA
+    departures = phystwin.frame_rate_departures(path, metadata)
     if not isinstance(metadata, dict):
-        return [broken(path, "", "a JSON object is required", type(metadata).__name__)]
-    found = phystwin.frame_rate_departures(path, metadata)
-    size, count = metadata.get("WH"), metadata.get("frame_num")
-    if not (isinstance(size, list) and len(size) == 2 and all(type(v) is int and v > 0 for v in size)):
-        found.append(broken(path, "WH", "[width, height] in pixels is required", size))
+        return departures
+    count, intrinsics = metadata.get("frame_num"), metadata.get("intrinsics")
     if type(count) is not int or count < 5:
-        found.append(broken(path, "frame_num", "at least 5 frames are required", count))
-    intrinsics: Any = metadata.get("intrinsics")
-    if not isinstance(intrinsics, list) or any(np.shape(k) != (3, 3) for k in intrinsics):
-        found.append(broken(path, "intrinsics", "a list of 3 x 3 matrices is required", np.shape(intrinsics) or "nothing"))
-        intrinsics = []
-    if not isinstance(poses, list) or any(np.shape(pose) != (4, 4) for pose in poses):
-        found.append(broken(calibration, "", "a list of 4 x 4 camera-to-world matrices is required", type(poses).__name__))
-    elif len(poses) != len(intrinsics):
-        found.append(broken(calibration, "", f"{phystwin.METADATA} has {len(intrinsics)} cameras", f"{len(poses)} matrices"))
-    return found
+        departures.append(broken(path, "frame_num", "at least 5 frames are required", count))
+    departures += metadata_departures(path, metadata)
+    return departures + poses_departures(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
+
+
+def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera]:
+    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_departures` must have no errors."""
+    width, height = metadata["WH"]
+    intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
+    return [
+        Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
+        for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
+    ]
 
 
 def _detections(case: Path, camera: str) -> dict[int, list[str]]:
-    """Label -> ids of the detections with it. Exactly one detection is not a hand."""
+    """Label -> ids of its detections. Exactly one detection is not a hand."""
     path = case / "mask" / f"mask_info_{camera}.json"
     info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
@@ -125,18 +115,11 @@ def _detections(case: Path, camera: str) -> dict[int, list[str]]:
     return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
 
 
-def _labels(case: Path, camera: str, frame: int, ids: dict[int, list[str]], size: tuple[int, int]) -> np.ndarray:
-    labels = np.zeros(size, dtype=np.uint8)
+def _labels(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
+    labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
     for label, names in sorted(ids.items()):
         for name in names:
-            path = case / "mask" / camera / name / f"{frame}.png"
-            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if mask is None:
-                raise InputError(
-                    path, "this mask must be a readable PNG", "no such file" if not path.exists() else "a damaged file"
-                )
-            if mask.shape != size:
-                raise InputError(path, f"masks have the size of the images, {size[1]} x {size[0]}", mask.shape[::-1])
+            mask = read_image(case / "mask" / camera.name / name / f"{frame}.png", camera, cv2.IMREAD_GRAYSCALE)
             labels[mask > 0] = label
     return labels
 
@@ -159,15 +142,10 @@ def _train_end(case: Path, frames: int) -> int | None:
     return int(split["train"][1])
 
 
-def _rows(matrix: Any) -> Any:
-    return tuple(tuple(float(value) for value in row) for row in np.asarray(matrix))
-
-
 def _link(source: Path, target: Path) -> None:
     if not source.is_file():
         raise InputError(source, "this image must exist", "no such file")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
+    make_way(target)
     try:
         os.link(source, target)
     except OSError:

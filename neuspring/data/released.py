@@ -1,12 +1,13 @@
-"""What PhysTwin released beside its data: searched parameters, checkpoint, prediction, splats; and the cameras and raw files.
+"""Readers of what PhysTwin released beside its data: searched parameters, checkpoint, prediction, splats, cameras and raw files.
 
-Written to the layout of the archives and tried on stand-ins in that layout only. Every reader raises InputError naming file and
-key, and runs nothing that a file holds.
+They are written to the described layout of the archives and tried on stand-ins only. Every reader raises InputError naming file and
+key. None runs code that a file holds.
 """
 
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,20 +17,20 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera, CameraEntry, Capture, Description, description_departures
+from neuspring.data.capture import Camera, read_array, read_image
 from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.json_file import load_json
-from neuspring.data.phystwin_raw import CALIBRATION, raw_departures
+from neuspring.data.phystwin_raw import CALIBRATION, cameras_of, raw_departures
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
 """Camera depths that the released lifting keeps, m."""
 DEPTH_SCALE = 1000.0
-"""Depth units per metre."""
+"""Depth units per meter."""
 HUMAN = "0"
 """The only detection that the released evaluation reads of a person's masks."""
 LARGEST = 1e30
-"""No parameter comes near; also refuses infinity and NaN."""
+"""Larger values are refused, like infinity and NaN."""
 OPTIMAL_KEYS = (
     "global_spring_Y",
     "object_radius",
@@ -60,22 +61,30 @@ class Released:
 
     root: Path
     name: str
+    loose: Path | None = None
+    """Folder of a processed case that lies elsewhere. No released results are known for it."""
 
     @property
     def folder(self) -> Path:
         """The processed case."""
-        return self.root / "data" / "different_types" / self.name
+        return self.loose or self.root / "data" / "different_types" / self.name
 
     @property
     def parameters(self) -> Path:
-        """What the search found."""
+        """The searched parameters."""
         return self.root / "experiments_optimization" / self.name / "optimal_params.pkl"
 
     @property
     def checkpoint(self) -> Path:
-        """best_{epoch}.pth, of the highest epoch if there are several; a pattern where there is none."""
+        """best_{epoch}.pth of the highest epoch; a pattern if there is none."""
         folder = self.root / "experiments" / self.name / "train"
-        return best_checkpoint(folder) or folder / "best_*.pth"
+        numbered = [path for path in folder.glob("best_*.pth") if path.stem.removeprefix("best_").isdecimal()]
+        return max(numbered, key=_epoch, default=folder / "best_*.pth")
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the checkpoint, which must be there."""
+        return _epoch(self.checkpoint)
 
     @property
     def prediction(self) -> Path:
@@ -84,13 +93,13 @@ class Released:
 
     @property
     def splats(self) -> Path:
-        """The last splats; a pattern where there are none. Raises InputError if several trainings lie side by side."""
+        """The last splats; a pattern if there are none. Raises InputError if several trainings lie side by side."""
         folder = self.root / "gaussian_output" / self.name
-        found = sorted(folder.glob(f"*/{SPLATS}"))
-        if len(found) > 1:
-            names = [path.relative_to(folder).parts[0] for path in found]
+        paths = sorted(folder.glob(f"*/{SPLATS}"))
+        if len(paths) > 1:
+            names = [path.relative_to(folder).parts[0] for path in paths]
             raise InputError(folder, "one training of splats is expected", names, "Move the others away.")
-        return found[0] if found else folder / "*" / SPLATS
+        return paths[0] if paths else folder / "*" / SPLATS
 
     @property
     def colours(self) -> Path:
@@ -117,29 +126,27 @@ class Released:
         return self.folder / "depth" / camera / "0.npy"
 
 
-def best_checkpoint(folder: Path) -> Path | None:
-    """The released best_{epoch}.pth in `folder`, of the highest epoch if there are several."""
-    numbered = [path for path in folder.glob("best_*.pth") if path.stem.removeprefix("best_").isdecimal()]
-    return max(numbered, key=lambda path: int(path.stem.removeprefix("best_")), default=None)
+def _epoch(checkpoint: Path) -> int:
+    return int(checkpoint.stem.removeprefix("best_"))
 
 
 def parameter_departures(path: Path, parameters: Any) -> list[Departure]:
     """Keys and values of optimal_params.pkl."""
     if not isinstance(parameters, dict):
         return [broken(path, "", "a dict of 12 numbers is required", type(parameters).__name__)]
-    found = []
+    departures = []
     for key in OPTIMAL_KEYS:
         value = parameters.get(key)
         if key not in parameters:
-            found.append(broken(path, key, "this key is missing"))
+            departures.append(broken(path, key, "this key is missing"))
         elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
-            found.append(broken(path, key, "a finite number is required", value))
+            departures.append(broken(path, key, "a finite number is required", value))
         elif key.endswith("neighbours") and value != int(value):
-            found.append(broken(path, key, "a whole number is required", value))
+            departures.append(broken(path, key, "a whole number is required", value))
         elif key.endswith(("neighbours", "radius")) and value <= 0:
-            found.append(broken(path, key, "a positive number is required", value))
-    found += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
-    return found
+            departures.append(broken(path, key, "a positive number is required", value))
+    departures += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
+    return departures
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -156,7 +163,7 @@ class Checkpoint:
     object_springs: int
     """Springs between object nodes; they come first."""
     stiffness: np.ndarray
-    """Of every spring [S], N, as stored: the simulator clamps it."""
+    """Stiffness of every spring [S], N, as stored; the simulator clamps it."""
     contact: dict[str, float] | None
     """The scalars of `CONTACT_KEYS` under our names, as stored: the simulator clamps them. None where they are not all there."""
 
@@ -183,64 +190,45 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(object_springs=springs, stiffness=stiffness, contact=contact)
 
 
+def prediction_departures(path: Path, positions: Any, frames: int, nodes: int) -> list[Departure]:
+    """Shape, dtype and finiteness of inference.pkl."""
+    shape = (frames, nodes, 3)
+    if not isinstance(positions, np.ndarray) or positions.dtype.kind != "f" or positions.shape != shape:
+        received = f"{positions.shape} {positions.dtype}" if isinstance(positions, np.ndarray) else type(positions).__name__
+        return [broken(path, "", f"floating point positions of shape {shape} are required", received)]
+    departures = []
+    if positions.dtype != np.float32:
+        departures.append(unusual(path, "", "the released dtype is float32", positions.dtype))
+    if not np.isfinite(positions).all():
+        departures.append(broken(path, "", "every coordinate must be finite"))
+    return departures
+
+
 def read_prediction(path: Path, frames: int, nodes: int) -> np.ndarray:
     """Node positions [T, N, 3], m, float32, of inference.pkl."""
     positions = load_pickle(path)
-    wanted = (frames, nodes, 3)
-    if not isinstance(positions, np.ndarray) or positions.dtype.kind != "f" or positions.shape != wanted:
-        received = f"{positions.shape} {positions.dtype}" if isinstance(positions, np.ndarray) else type(positions).__name__
-        raise InputError(path, f"floating point positions of shape {wanted} are required", received)
-    if not np.isfinite(positions).all():
-        raise InputError(path, "every coordinate must be finite")
-    return positions.astype(np.float32)
+    refuse(prediction_departures(path, positions, frames, nodes))
+    return np.asarray(positions, dtype=np.float32)
 
 
 def read_cameras(folder: Path) -> list[Camera]:
     """The calibrated cameras of a case, from metadata.json and calibrate.pkl."""
-    metadata_path, calibration = folder / phystwin.METADATA, folder / CALIBRATION
-    metadata, poses = load_json(metadata_path), load_pickle(calibration)
+    metadata, poses = load_json(folder / phystwin.METADATA), load_pickle(folder / CALIBRATION)
     refuse(raw_departures(folder, metadata, poses))
-    width, height = metadata["WH"]
-    entries = tuple(
-        CameraEntry(
-            name=str(index),
-            width=width,
-            height=height,
-            intrinsics=_rows(metadata_path, matrix),
-            camera_to_world=_rows(calibration, pose),
-        )
-        for index, (matrix, pose) in enumerate(zip(metadata["intrinsics"], poses, strict=True))
-    )
-    frames, rate = metadata["frame_num"], phystwin.RELEASED_FRAME_RATE
-    described = Description(format=1, name=folder.name, category="", frame_count=frames, frame_rate=rate, cameras=entries)
-    refuse(description_departures(calibration, described))
-    return list(Capture(folder, described).cameras.values())
-
-
-def _rows(path: Path, matrix: Any) -> Any:
-    try:
-        values = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(path, "matrices must hold numbers", str(error)) from error
-    if not np.isfinite(values).all():
-        raise InputError(path, "every number of a matrix must be finite")
-    return tuple(map(tuple, values.tolist()))
+    return cameras_of(metadata, poses)
 
 
 def visible_pixels(path: Path) -> np.ndarray:
     """Frame-0 pixels [Q, 2] (row, column) of the visible tracks of cotracker/{camera}.npz."""
-    stored = _numpy(path)
     try:
-        tracks, visible = stored["tracks"], stored["visibility"]
-    except (KeyError, IndexError) as error:
+        with np.load(path, allow_pickle=False) as stored:
+            tracks, visible = stored["tracks"], stored["visibility"]
+    except KeyError as error:
         raise InputError(path, "arrays `tracks` and `visibility` are required", str(error)) from error
-    if (
-        tracks.ndim != 3
-        or tracks.shape[2] != 2
-        or visible.shape != tracks.shape[:2]
-        or not len(tracks)
-        or visible.dtype != np.bool_
-    ):
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(path, "this file must be a NumPy file (npz) without pickle", f"{type(error).__name__}: {error}") from error
+    has_pixels = tracks.ndim == 3 and tracks.shape[2] == 2 and len(tracks) > 0
+    if not has_pixels or visible.shape != tracks.shape[:2] or visible.dtype != np.bool_:
         received = f"{tracks.shape} and {visible.shape} {visible.dtype}"
         raise InputError(path, "tracks [T, Q, 2] and bool visibility [T, Q] are required", received)
     pixels: np.ndarray = tracks[0][visible[0]].astype(np.float64)
@@ -249,33 +237,19 @@ def visible_pixels(path: Path) -> np.ndarray:
     return pixels
 
 
-def depth_image(path: Path) -> np.ndarray:
+def depth_image(path: Path, camera: Camera) -> np.ndarray:
     """Depth of one frame [H, W], uint16, of depth/{camera}/{frame}.npy."""
-    depth = _numpy(path)
-    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype != np.uint16:
-        raise InputError(path, "a uint16 image [H, W] is required", getattr(depth, "dtype", type(depth).__name__))
+    depth = read_array(path, camera)
+    if depth.dtype != np.uint16:
+        raise InputError(path, "a uint16 image [H, W] is required", depth.dtype)
     return depth
-
-
-def _numpy(path: Path) -> Any:
-    """An .npy array or the arrays of an .npz, without pickle."""
-    try:
-        stored = np.load(path, allow_pickle=False)
-        if isinstance(stored, np.ndarray):
-            return stored
-        with stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, "this file must be a NumPy file without pickle", f"{type(error).__name__}: {error}") from error
 
 
 def gated_lift(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """World points [P, 3], m, of those pixels [Q, 2] (row, column) whose depth [H, W] lies within the gate.
 
-    As released: whole pixels, never below the table (z > 0). Raises InputError if the image has another size than the camera's.
+    As released: whole pixels, never below the table (z > 0).
     """
-    if depth.shape != (camera.height, camera.width):
-        raise InputError(f"depth of camera {camera.name}", f"must be {camera.width} x {camera.height} pixels", depth.shape[::-1])
     row, column = np.rint(pixels).astype(np.int64).T
     inside = (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
     row, column = row[inside], column[inside]
@@ -293,13 +267,8 @@ def mirrored(camera: Camera) -> Camera:
     return replace(camera, intrinsics=intrinsics)
 
 
-def read_picture(path: Path, camera: Camera, *, grey: bool = False) -> np.ndarray:
-    """RGB [H, W, 3] or grey [H, W], uint8."""
-    if not path.is_file():
-        raise InputError(path, "this picture must exist", "no such file")
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(path, "this file must be a readable picture", "a damaged file")
-    if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(path, f"must be {camera.width} x {camera.height} pixels", image.shape[1::-1])
-    return np.asarray(image if grey else image[..., ::-1])
+def read_picture(path: Path, camera: Camera, *, gray: bool = False) -> np.ndarray:
+    """RGB [H, W, 3] or gray [H, W], uint8."""
+    if gray:
+        return read_image(path, camera, cv2.IMREAD_GRAYSCALE)
+    return read_image(path, camera, cv2.IMREAD_COLOR)[..., ::-1]

@@ -12,7 +12,11 @@ import tempfile
 import time
 from pathlib import Path
 
-ONE = "import sys; from neuspring.cli.main import main; from neuspring.core import device; device.quiet = lambda: None; sys.exit(main())"
+ONE = """import sys
+from neuspring.cli.main import main
+from neuspring.core import device
+device.quiet = lambda: None
+sys.exit(main())"""
 """A command whose Warp says which modules it compiled and which it found."""
 
 

@@ -1,29 +1,14 @@
 """The capture folder: what is written is read, and every refusal names the file, the field and the value."""
 
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, Camera, CameraEntry, Capture, Description, Writer
-
-FRAMES = 5
-POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))
-
-
-def entry(name: str = "0", width: int = 32, height: int = 24, missing: tuple[int, ...] = ()) -> CameraEntry:
-    intrinsics = ((40.0, 0.0, (width - 1) / 2), (0.0, 40.0, (height - 1) / 2), (0.0, 0.0, 1.0))
-    return CameraEntry(name=name, width=width, height=height, intrinsics=intrinsics, camera_to_world=POSE, missing=missing)
-
-
-def describe(**changes) -> Description:
-    plain = Description(
-        format=1, name="thing", category="rope", frame_count=FRAMES, frame_rate=30.0, cameras=(entry(),), masks=True
-    )
-    return replace(plain, **changes)
+from neuspring.data.capture import CAPTURE, Camera, Capture, Description, Writer
+from tests.support.captures import FRAMES, POSE, describe, entry
 
 
 def write(folder, description: Description | None = None, tracks: np.ndarray | None = None) -> Capture:
@@ -71,8 +56,8 @@ def test_lifting_and_projecting_are_inverse():
     pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     camera = Camera("0", 32, 24, np.array(entry().intrinsics), pose)
     pixels, depth = rng.uniform(0, 24, (50, 2)), rng.uniform(0.3, 1.5, 50)
-    found, distance = camera.project(camera.lift(pixels, depth))
-    np.testing.assert_allclose(found, pixels, atol=1e-9)
+    projected, distance = camera.project(camera.lift(pixels, depth))
+    np.testing.assert_allclose(projected, pixels, atol=1e-9)
     np.testing.assert_allclose(distance, depth)
 
 
@@ -155,7 +140,7 @@ def test_a_missing_image_says_how_to_declare_it(tmp_path):
 def test_depth_of_another_size_than_colour_is_refused(tmp_path):
     capture = write(tmp_path)
     cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((12, 16), np.uint16))
-    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to colour"):
+    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to color"):
         capture.depth("0", 1)
 
 
@@ -199,7 +184,7 @@ def test_tracks_do_not_outlive_their_capture_and_may_be_none(tmp_path):
 def test_masks_of_sixteen_bits_are_refused(tmp_path):
     capture = write(tmp_path)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.ones((24, 32), np.uint16))
-    with pytest.raises(InputError, match="masks are grey images of 8 bits; received uint16"):
+    with pytest.raises(InputError, match="masks are gray images of 8 bits; received uint16"):
         capture.mask("0", 2)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from neuspring.data.capture import CAPTURE
-from neuspring.data.check import check
-from tests.data.test_check import of_level, serious
+from neuspring.data.check import check_layout
+from tests.support.departures import of_level, serious
 from tests.support.filmed import film
 
 
@@ -25,12 +25,12 @@ def edit(capture, change) -> None:
 
 
 def errors(capture) -> str:
-    return "\n".join(of_level(check(capture.folder), "error"))
+    return "\n".join(of_level(check_layout(capture.folder), "error"))
 
 
 def test_a_good_capture_and_a_folder_of_them(capture):
-    assert serious(check(capture.folder)) == []
-    assert serious(check(capture.folder.parent)) == []
+    assert serious(check_layout(capture.folder)) == []
+    assert serious(check_layout(capture.folder.parent)) == []
 
 
 def test_depth_in_the_wrong_unit(capture):
@@ -59,7 +59,7 @@ def relabel(capture, change) -> None:
 
 
 def warnings(capture) -> str:
-    return "\n".join(of_level(check(capture.folder), "warning"))
+    return "\n".join(of_level(check_layout(capture.folder), "warning"))
 
 
 @pytest.mark.parametrize(("label", "what"), [(1, "the object"), (2, "a hand")])

@@ -15,6 +15,7 @@ import threading
 import zipfile
 from collections import namedtuple
 from collections.abc import Callable, Iterator
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from neuspring.core.errors import InputError
 from neuspring.data import phystwin
 from neuspring.data.fetch import hub as fetch_hub
 from neuspring.data.fetch.fetch import LOCK, RECORD, fetch
+from neuspring.scores.released.check_data import check
 from tests.support.phystwin_case import write_case
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -38,7 +40,7 @@ FINAL_DATA = f"data/different_types/{CASE}/final_data.pkl"
 
 
 class StandIn(ThreadingHTTPServer):
-    """What huggingface_hub asks of a hub: the list of files of a data set, and ranges of them behind a redirection."""
+    """What huggingface_hub asks of a hub: the files of a data set, twice, and ranges of them behind a redirection."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -87,6 +89,8 @@ class Handler(BaseHTTPRequestHandler):
         dataset = "datasets/Jianghanxiao/PhysTwin"
         if path in (f"/api/{dataset}/revision/main", f"/api/{dataset}/revision/{COMMIT}"):
             self._answer(200, json.dumps(self._listing()).encode())
+        elif path == f"/api/{dataset}/tree/{COMMIT}":
+            self._answer(200, json.dumps(self._tree()).encode())
         elif path.startswith(f"/api/{dataset}/revision/"):
             self._answer(404, b"{}", {"X-Error-Code": "RevisionNotFound"})
         elif path.startswith(f"/{dataset}/resolve/{COMMIT}/"):
@@ -102,6 +106,12 @@ class Handler(BaseHTTPRequestHandler):
             lfs = {"size": len(content), "sha256": hashlib.sha256(content).hexdigest(), "pointerSize": 130}
             files.append({"rfilename": name, "size": len(content), "blobId": "0" * 40, "lfs": lfs})
         return {"id": "Jianghanxiao/PhysTwin", "sha": COMMIT, "siblings": files}
+
+    def _tree(self) -> list[dict[str, Any]]:
+        return [
+            {"type": "file", "oid": "0" * 40, "size": file["size"], "path": file["rfilename"]}
+            for file in self._listing()["siblings"]
+        ]
 
     def _file(self, content: bytes) -> None:
         wanted = self.headers.get("Range", "")
@@ -185,8 +195,9 @@ def server(released: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.delenv("HF_TOKEN", raising=False)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_TELEMETRY", True)  # read at import, which another test may have caused
-    for name, value in {"RETRIES": 0, "BLOCK": 4096, "GAP": 1024, "CHUNK": 16384}.items():  # as small as the archives
+    for name, value in {"BLOCK": 4096, "GAP": 1024}.items():  # as small as the archives
         monkeypatch.setattr(fetch_hub, name, value)
+    retry(monkeypatch, 0)
     close_session()  # its client knows the environment of its first use
     with StandIn() as standin:
         standin.files = dict(released)
@@ -198,6 +209,14 @@ def server(released: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Itera
     close_session()
 
 
+def retry(monkeypatch: pytest.MonkeyPatch, times: int) -> None:
+    """How often the library asks again for a range; otherwise it would do so for half a minute."""
+    from huggingface_hub import hf_file_system
+    from huggingface_hub.utils import http_backoff
+
+    monkeypatch.setattr(hf_file_system, "http_backoff", partial(http_backoff, max_retries=times))
+
+
 def said() -> tuple[list[str], Callable[[str], None]]:
     lines: list[str] = []
     return lines, lines.append
@@ -205,15 +224,15 @@ def said() -> tuple[list[str], Callable[[str], None]]:
 
 def files(root: Path) -> dict[str, bytes]:
     """All files below `root` but the hidden and the record."""
-    found = (path for path in root.rglob("*") if path.is_file() and path.name not in (LOCK, RECORD))
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in found}
+    paths = (path for path in root.rglob("*") if path.is_file() and path.name not in (LOCK, RECORD))
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in paths}
 
 
 def test_everything_lands_where_the_reader_looks_and_is_recorded(
     server: StandIn, released: dict[str, bytes], tmp_path: Path
 ) -> None:
     lines, say = said()
-    departures = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say)
+    departures = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say, check=check)
     expected = {}
     for content in released.values():
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -232,7 +251,7 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
 
 
 def test_a_fetched_case_passes_check_data(server: StandIn, tmp_path: Path) -> None:
-    departures = fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint)
+    departures = fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint, check=check)
     assert {d.level for d in departures} == {"note"}
     assert not [d for d in departures if "not one of the 22" in d.message]
 
@@ -281,7 +300,7 @@ def test_an_interrupted_fetch_continues_where_it_was(server: StandIn, tmp_path: 
 
 
 def test_one_lost_connection_is_tried_again(server: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fetch_hub, "RETRIES", 1)
+    retry(monkeypatch, 1)
     server.left, server.breaks = 100_000, 1
     fetch(tmp_path, [OTHER], ["images"], endpoint=server.endpoint)
     assert server.breaks == 0

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from neuspring.config import Mocap, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
-from neuspring.data.check import check
+from neuspring.data.check import check_layout
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
 REAL = Path(__file__).parents[2].parent / "shared" / "data" / "mocap_dlo"
@@ -46,9 +46,9 @@ def test_a_straightened_cable_keeps_its_arc_lengths() -> None:
 def test_a_straight_cable_is_its_own_rest_shape(tmp_path: Path) -> None:
     markers = np.linspace([0.1, 0.2, 0.3], [0.5, 0.9, 0.4], 12)
     path = write(tmp_path, np.repeat(markers.T[None], 40, axis=0))
-    seen = mocap.read(ROW, path, Mocap(rest_shape="straight"))
-    frame0 = np.concatenate([seen.nodes, seen.controller_points[0]])
-    distances = [np.linalg.norm(points[:, None] - points[None], axis=2) for points in (seen.canonical, frame0)]
+    observations = mocap.read(ROW, path, Mocap(rest_shape="straight"))
+    frame0 = np.concatenate([observations.nodes, observations.controller_points[0]])
+    distances = [np.linalg.norm(points[:, None] - points[None], axis=2) for points in (observations.canonical, frame0)]
     np.testing.assert_allclose(*distances, atol=1e-6)
 
 
@@ -81,32 +81,34 @@ def write(tmp_path: Path, value: Any) -> Path:
 def test_markers_and_time(tmp_path: Path, as_lists: bool) -> None:
     data = recording()
     path = write(tmp_path, data.tolist() if as_lists else data)
-    seen = mocap.read(ROW, path, Mocap(stride=2))
-    scenario = seen.scenario
+    observations = mocap.read(ROW, path, Mocap(stride=2))
+    scenario = observations.scenario
     assert (scenario.frame_count, scenario.train_end, scenario.frame_rate, scenario.up) == (20, 14, 50.0, "+z")
     assert not scenario.ground
-    np.testing.assert_array_equal(seen.object_points, data[::2, :, 2:-2].transpose(0, 2, 1).astype(np.float32))
-    np.testing.assert_array_equal(seen.controller_points, data[::2][:, :, [0, 1, -2, -1]].transpose(0, 2, 1).astype(np.float32))
-    np.testing.assert_array_equal(seen.tracks, seen.object_points)
-    assert seen.object_visibility.all()
-    assert seen.object_motion_valid[:-1].all()
-    assert not seen.object_motion_valid[-1].any()
-    assert len(seen.interior_points) == 0
+    np.testing.assert_array_equal(observations.object_points, data[::2, :, 2:-2].transpose(0, 2, 1).astype(np.float32))
+    np.testing.assert_array_equal(
+        observations.controller_points, data[::2][:, :, [0, 1, -2, -1]].transpose(0, 2, 1).astype(np.float32)
+    )
+    np.testing.assert_array_equal(observations.tracks, observations.object_points)
+    assert observations.object_visibility.all()
+    assert observations.object_motion_valid[:-1].all()
+    assert not observations.object_motion_valid[-1].any()
+    assert len(observations.interior_points) == 0
     assert scenario.provenance["7.pkl"].startswith("sha256:")
     assert "stride=2" in scenario.provenance["options"]
 
 
 def test_frames_are_cut_after_the_stride(tmp_path: Path) -> None:
-    seen = mocap.read(ROW, write(tmp_path, recording()), Mocap(stride=3, frames=10))
-    assert seen.scenario.frame_count == 10
-    np.testing.assert_array_equal(seen.object_points[9], recording()[27, :, 2:-2].T.astype(np.float32))
+    observations = mocap.read(ROW, write(tmp_path, recording()), Mocap(stride=3, frames=10))
+    assert observations.scenario.frame_count == 10
+    np.testing.assert_array_equal(observations.object_points[9], recording()[27, :, 2:-2].T.astype(np.float32))
 
 
 def test_the_beginning_can_be_left_out(tmp_path: Path) -> None:
     path = write(tmp_path, recording())
-    whole, seen = mocap.read(ROW, path, Mocap(stride=3)), mocap.read(ROW, path, Mocap(stride=3, start=6))
-    np.testing.assert_array_equal(seen.object_points, whole.object_points[2:])
-    np.testing.assert_array_equal(seen.controller_points, whole.controller_points[2:])
+    whole, observations = mocap.read(ROW, path, Mocap(stride=3)), mocap.read(ROW, path, Mocap(stride=3, start=6))
+    np.testing.assert_array_equal(observations.object_points, whole.object_points[2:])
+    np.testing.assert_array_equal(observations.controller_points, whole.controller_points[2:])
 
 
 @pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
@@ -196,9 +198,9 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
     data[30, :, [4, 5]] = data[30, :, [5, 4]]
     path = write(tmp_path, data.tolist())
     for target in (path, tmp_path):
-        found = check(target)
-        assert [d.level for d in found] == ["warning"]
-        assert "in frame 30" in found[0].message
+        departures = check_layout(target)
+        assert [d.level for d in departures] == ["warning"]
+        assert "in frame 30" in departures[0].message
     assert [d.message for d in mocap.check_mocap(write(tmp_path, recording(samples=400)))] == [
         "released recordings have 500 samples; received 400"
     ]
@@ -206,15 +208,15 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 def test_released_recordings() -> None:
-    assert [d for d in check(REAL) if d.level != "note"] == []
+    assert [d for d in check_layout(REAL) if d.level != "note"] == []
     settings = Mocap()
     for cable in ("DLO1", "DLO2", "DLO4"):
         file = next((REAL / cable / "train").glob("*.pkl"))
-        seen = mocap.read(dataclasses.replace(ROW, scenario=cable), file, settings)
-        assert seen.scenario.frame_count == 250
-        assert seen.object_points.shape[1] == (9 if cable == "DLO1" else 8)
-        assert 300 < len(seen.nodes) < 380
-        assert_no_twist(seen.surface_points, settings.ring)
+        observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, settings)
+        assert observations.scenario.frame_count == 250
+        assert observations.object_points.shape[1] == (9 if cable == "DLO1" else 8)
+        assert 300 < len(observations.nodes) < 380
+        assert_no_twist(observations.surface_points, settings.ring)
 
 
 def test_a_given_number_of_rings_spaces_them_equally_from_end_to_end() -> None:

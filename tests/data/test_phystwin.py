@@ -21,18 +21,23 @@ ROW = ScenarioRow(scenario="thing", source="phystwin", category="toy", path="x",
 def test_a_conforming_case(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
     data = stored(folder)
-    seen = phystwin.read(ROW, folder)
-    assert (seen.scenario.frame_count, seen.scenario.train_end, seen.scenario.frame_rate, seen.scenario.up) == (10, 7, 30.0, "-z")
-    assert seen.scenario.self_collision
-    assert seen.scenario.ground
-    np.testing.assert_array_equal(seen.object_points, data["object_points"].astype(np.float32))
-    np.testing.assert_array_equal(seen.object_motion_valid, data["object_motions_valid"])
-    assert seen.nodes.shape == (40 + 12 + 6, 3)
-    assert seen.surface_count == 52
-    assert seen.tracks.shape == (10, 5, 3)
-    assert np.isnan(seen.tracks).any()
+    observations = phystwin.read(ROW, folder)
+    assert (
+        observations.scenario.frame_count,
+        observations.scenario.train_end,
+        observations.scenario.frame_rate,
+        observations.scenario.up,
+    ) == (10, 7, 30.0, "-z")
+    assert observations.scenario.self_collision
+    assert observations.scenario.ground
+    np.testing.assert_array_equal(observations.object_points, data["object_points"].astype(np.float32))
+    np.testing.assert_array_equal(observations.object_motion_valid, data["object_motions_valid"])
+    assert observations.nodes.shape == (40 + 12 + 6, 3)
+    assert observations.surface_count == 52
+    assert observations.tracks.shape == (10, 5, 3)
+    assert np.isnan(observations.tracks).any()
     files = ("final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json")
-    assert seen.scenario.provenance == {name: f"sha256:{digest_file(folder / name)}" for name in files}
+    assert observations.scenario.provenance == {name: f"sha256:{digest_file(folder / name)}" for name in files}
 
 
 def test_optional_files(tmp_path: Path) -> None:
@@ -40,10 +45,10 @@ def test_optional_files(tmp_path: Path) -> None:
     for name in ("gt_track_3d.pkl", "metadata.json", "calibrate.pkl"):
         (folder / name).unlink()
     edit(folder, controller_mask=None, object_colors=None)
-    seen = phystwin.read(ROW, folder)
-    assert seen.tracks.shape == (10, 0, 3)
-    assert seen.scenario.frame_rate == phystwin.RELEASED_FRAME_RATE
-    assert len(seen.nodes) == 40
+    observations = phystwin.read(ROW, folder)
+    assert observations.tracks.shape == (10, 0, 3)
+    assert observations.scenario.frame_rate == phystwin.RELEASED_FRAME_RATE
+    assert len(observations.nodes) == 40
 
 
 def test_frame_rate_comes_from_the_metadata(tmp_path: Path) -> None:

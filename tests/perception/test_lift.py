@@ -13,7 +13,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import choose_controllers, fill_rigidly, hands_of, rigid_motion
 from neuspring.perception.results import Masks, PixelTracks
-from tests.data.test_capture import FRAMES, describe, entry
+from tests.support.captures import FRAMES, describe, entry
 
 SETTINGS = Lift(neighbourhood=0.03, outlier_neighbours=460.0, least_neighbours=3, least_controllers=3, controllers=4)
 

@@ -7,7 +7,7 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.perception import segment_opencv
-from tests.data.test_capture import describe, entry
+from tests.support.captures import describe, entry
 from tests.support.filmed import FRAMES, film
 
 

@@ -15,8 +15,7 @@ from neuspring.data.synthetic.sensor import quantised
 from neuspring.perception import shape_mesh, shape_prior
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside, on_table, structure
-from tests.data.synthetic.test_camera import K
-from tests.data.test_capture import FRAMES, describe
+from tests.support.captures import FRAMES, K, describe
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
 EYES = ((0.45, -0.35, 0.4), (-0.2, 0.55, 0.4), (-0.4, -0.4, 0.45))

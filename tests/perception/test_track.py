@@ -11,7 +11,7 @@ from neuspring.config.perception import CoTracker3, OpenCvTracking
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Writer
 from neuspring.perception import track_cotracker, track_opencv
-from tests.data.test_capture import describe, entry
+from tests.support.captures import describe, entry
 
 SHIFT = np.array([1.5, -0.75])
 """Pixels per frame."""

@@ -44,7 +44,7 @@ def final_data(frames: int, points: int, surface: int, interior: int, controller
 
 
 def camera() -> tuple[np.ndarray, np.ndarray]:
-    """Camera-to-world matrix of a camera 0.5 m above the table looking down, and intrinsics with an off-centre c_x."""
+    """Camera-to-world matrix of a camera 0.5 m above the table looking down, and intrinsics with an off-center c_x."""
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -0.5]
     return pose, np.array([[60.0, 0.0, WIDTH / 2 + 5.0], [0.0, 60.0, HEIGHT / 2], [0.0, 0.0, 1.0]])
@@ -118,7 +118,10 @@ def write_results(folder: Path) -> None:
 
 
 def write_raw_frame(folder: Path, *, mirrored: bool) -> None:
-    """Write depth/0/0.npy and cotracker/0.npz and make the frame-0 points their lift, with c_x or with the mirrored W - c_x."""
+    """Write the same depth and tracks of frame 0 for all cameras, and make the points of frame 0 their lift.
+
+    They are lifted with c_x, or with the mirrored W - c_x.
+    """
     rng = np.random.default_rng(1)
     pose, intrinsics = camera()
     pixels = rng.permutation(WIDTH * HEIGHT)[:200]
@@ -128,15 +131,16 @@ def write_raw_frame(folder: Path, *, mirrored: bool) -> None:
     centre = WIDTH - intrinsics[0, 2] if mirrored else intrinsics[0, 2]
     lifted = np.stack([z * (column - centre) / 60, z * (row - intrinsics[1, 2]) / 60, z], axis=1) + pose[:3, 3]
     data = pickle.loads((folder / "final_data.pkl").read_bytes())
-    chosen = np.unique(lifted, axis=0)[: data["object_points"].shape[1]]
-    data["object_points"][0] = chosen
+    points = np.unique(lifted, axis=0)[: data["object_points"].shape[1]]
+    data["object_points"][0] = points
     dump(folder / "final_data.pkl", data)
-    keep = (lifted[:, None] == chosen[None]).all(axis=2).any(axis=1)
-    (folder / "depth" / "0").mkdir(parents=True)
+    visible = (lifted[:, None] == points[None]).all(axis=2).any(axis=1)
     (folder / "cotracker").mkdir()
-    np.save(folder / "depth" / "0" / "0.npy", depth)
     tracks = np.stack([row, column], axis=1).astype(np.float32)[None]
-    np.savez(folder / "cotracker" / "0.npz", tracks=tracks, visibility=keep[None])
+    for index in "012":
+        (folder / "depth" / index).mkdir(parents=True)
+        np.save(folder / "depth" / index / "0.npy", depth)
+        np.savez(folder / "cotracker" / f"{index}.npz", tracks=tracks, visibility=visible[None])
 
 
 def edit(folder: Path, **changes: Any) -> None:

@@ -56,13 +56,13 @@ def write_released(root: Path, name: str = "single_lift_thing", *, mirrored: boo
 
 def poses() -> list[np.ndarray]:
     """Camera-to-world matrices of three cameras above the table (z = 0, up is -z), looking down."""
-    found = []
+    matrices = []
     for k, angle in enumerate((0.0, 5.0, -6.0)):
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         pose[:3, 3] = [-0.035 * angle / 5, 0.004 * k, -0.5]
-        found.append(pose)
-    return found
+        matrices.append(pose)
+    return matrices
 
 
 def intrinsics(camera: int) -> np.ndarray:
@@ -175,7 +175,7 @@ def write_prediction(case: Released, twin: Twin, drag: float, dashpot: float) ->
 
 
 def write_pictures(case: Released, nodes: np.ndarray) -> None:
-    """One splat per node, and what cameras and evaluation saw: the moved splats, other colours in part, masks shifted."""
+    """One splat per node, and what cameras and evaluation saw: the moved splats, other colors in part, masks shifted."""
     rng = np.random.default_rng(4)
     path = case.root / "gaussian_output" / case.name / SPLATS
     colours = rng.uniform(0.2, 0.9, (len(nodes), 3)).astype(np.float32)
@@ -205,14 +205,14 @@ def write_png(path: Path, image: np.ndarray) -> None:
 def drawn(case: Released) -> list[np.ndarray]:
     """RGBA [H, W, 4] uint8 of every frame: camera 0 with the intrinsics of camera 1, faint splats left out."""
     splats = Splats.load(next((case.root / "gaussian_output" / case.name).rglob("*.ply")))
-    kept = splats.opacity_logits > np.log(0.1 / 0.9)
+    opaque = splats.opacity_logits > np.log(0.1 / 0.9)
     view = View(torch.tensor(np.linalg.inv(poses()[0])), torch.tensor(intrinsics(1)), WIDTH, HEIGHT)
     positions = positions_of(case)
-    colours = torch.tensor(0.5 + C0 * splats.harmonics[kept, 0], dtype=torch.float64).clamp_min(0)
-    opacity = torch.sigmoid(torch.tensor(splats.opacity_logits[kept], dtype=torch.float64))
-    scales = torch.exp(torch.tensor(splats.log_scales[kept], dtype=torch.float64)).expand(-1, 3)
+    colours = torch.tensor(0.5 + C0 * splats.harmonics[opaque, 0], dtype=torch.float64).clamp_min(0)
+    opacity = torch.sigmoid(torch.tensor(splats.opacity_logits[opaque], dtype=torch.float64))
+    scales = torch.exp(torch.tensor(splats.log_scales[opaque], dtype=torch.float64)).expand(-1, 3)
     skin, pictures = Skin(positions[0], released_degeneracy=True), []
-    for means, turned in skin.carry(positions, torch.tensor(splats.means[kept]), torch.tensor(splats.quaternions[kept])):
+    for means, turned in skin.carry(positions, torch.tensor(splats.means[opaque]), torch.tensor(splats.quaternions[opaque])):
         rgb, alpha, _ = rasteriser.rasterise(means.double(), turned.double(), scales, opacity, colours, view)
         picture = torch.cat([rgb, alpha[..., None]], dim=2).clamp(0, 1)
         pictures.append((255 * picture + 0.5).floor().to(torch.uint8).numpy())
@@ -246,16 +246,16 @@ def distances(case: Released) -> dict[str, list[float]]:
 
 def picture_scores(case: Released) -> dict[str, list[float]]:
     """PSNR and IoU per frame."""
-    found: dict[str, list[float]] = {"psnr": [], "iou": []}
+    scores: dict[str, list[float]] = {"psnr": [], "iou": []}
     for t, rgba in enumerate(drawn(case)):
         observed = cv2.imread(str(case.colours / f"{t}.png"))[..., ::-1] / 255
         mask, human = (cv2.imread(str(f / f"{t}.png"), cv2.IMREAD_GRAYSCALE) / 255 for f in (case.object_masks, case.human_masks))
         shown = (1 - human)[..., None]
         error = observed * mask[..., None] * shown - rgba[..., :3] / 255 * shown
-        found["psnr"].append(20 * np.log10(1 / np.sqrt((error**2).mean())))
+        scores["psnr"].append(20 * np.log10(1 / np.sqrt((error**2).mean())))
         alpha = rgba[..., 3] * (1 - human)
-        found["iou"].append(((mask > 0) & (alpha > 0)).sum() / ((mask > 0) | (alpha > 0)).sum())
-    return found
+        scores["iou"].append(((mask > 0) & (alpha > 0)).sum() / ((mask > 0) | (alpha > 0)).sum())
+    return scores
 
 
 def positions_of(case: Released) -> np.ndarray:

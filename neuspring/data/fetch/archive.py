@@ -1,6 +1,6 @@
 """The released PhysTwin archives: which of their files belong to which part of which scenario, and where they go.
 
-Nobody here has seen them. The folders that hold scenarios are found inside an archive, not assumed.
+The real archives have not been opened yet. The folders that hold scenarios are searched for inside an archive, not assumed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import stat
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.progress import Progress
 from neuspring.data import phystwin
 from neuspring.data.cases import released_cases
-from neuspring.data.fetch.hub import Hub, HubFile, RemoteFile
+from neuspring.data.fetch.hub import HubFile, RemoteFile
 
 CASES = "data/different_types"
 """Where processed cases lie below data_root."""
@@ -61,77 +60,69 @@ class Member:
 
     @property
     def parts(self) -> set[str]:
-        """What it is part of; a file may serve two."""
+        """The parts that it belongs to; a file may belong to two."""
         if self.tree != CASES:
             return set(TREES[self.tree][1])
-        found = {name for name, pattern in (("data", _DATA), ("images", _IMAGES)) if pattern.fullmatch(self.rest)}
-        return found or {"other"}
+        parts = {name for name, pattern in (("data", _DATA), ("images", _IMAGES)) if pattern.fullmatch(self.rest)}
+        return parts or {"other"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What one archive has to give."""
+    """What is to be extracted from one archive."""
 
     file: HubFile
-    remote: RemoteFile
     archive: zipfile.ZipFile
     members: int
-    """Files in the archive."""
+    """Number of files in the archive."""
     wanted: list[Member]
+    """The files that were asked for."""
     missing: list[Member]
-    """Of the wanted: not on disk in the archive's state. In the archive's order."""
+    """The wanted files that are not on disk in the archive's state, in the archive's order."""
     differing: int
-    """Of the missing: files on disk with other content."""
+    """Number of missing files for which the disk has a file of other content."""
     absent: dict[str, list[str]]
-    """Part -> scenarios that the archive does not have it of."""
+    """Part -> scenarios for which the archive does not have it."""
     cost: int
     """Bytes to fetch."""
 
 
 def archives(parts: set[str]) -> list[str]:
     """The archives that hold `parts`."""
-    return list(dict.fromkeys(archive for archive, held in TREES.values() if parts & set(held)))
+    return list(dict.fromkeys(archive for archive, contents in TREES.values() if parts & set(contents)))
 
 
-def make_plan(hub: Hub, name: str, cases: list[str], parts: set[str], data_root: Path) -> Plan:
-    """What the archive `name` has to give for `parts` of `cases`, given what lies below `data_root`. Reads its table of contents.
+def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[str], data_root: Path) -> Plan:
+    """Plan what to extract from the archive `file`, open as `remote`, for `parts` of `cases`. Reads its table of contents.
 
-    Raises InputError where it is not at the hub, is no zip archive, holds nothing of what is asked for, or holds a link, an
-    encrypted file or a path that leads elsewhere among it.
+    Raises InputError if it is no zip archive, holds nothing that was asked for, or holds an unsafe file: a link, an encrypted file
+    or a path that leads elsewhere.
     """
-    if name not in hub.files:
-        there = ", ".join(sorted(hub.files)) or "nothing"
-        raise InputError(f"{hub.repository} at {hub.commit}", f"{name} is required", there, "Choose another --revision.")
-    remote = hub.open(hub.files[name])
     try:
         archive = zipfile.ZipFile(remote)
-        files = [info for info in archive.infolist() if not info.is_dir()]
-        wanted = _wanted(name, files, cases, parts)
-        missing, differing = _missing(name, wanted, data_root)
-        return Plan(
-            file=hub.files[name],
-            remote=remote,
-            archive=archive,
-            members=len(files),
-            wanted=wanted,
-            missing=missing,
-            differing=differing,
-            absent=_absent(name, wanted, cases, parts),
-            cost=remote.expect(_spans(archive, missing)),
-        )
-    except BaseException as error:
-        remote.close()
-        if isinstance(error, zipfile.BadZipFile | NotImplementedError):
-            raise InputError(name, "must be a zip archive", str(error), "Choose another --revision.") from error
-        raise
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputError(file.name, "must be a zip archive", str(error), "Choose another --revision.") from error
+    files = [info for info in archive.infolist() if not info.is_dir()]
+    wanted = _wanted(file.name, files, cases, parts)
+    missing, differing = _missing(file.name, wanted, data_root)
+    return Plan(
+        file=file,
+        archive=archive,
+        members=len(files),
+        wanted=wanted,
+        missing=missing,
+        differing=differing,
+        absent=_absent(file.name, wanted, cases, parts),
+        cost=remote.expect(_spans(archive, missing)),
+    )
 
 
 def _wanted(name: str, files: list[zipfile.ZipInfo], cases: list[str], parts: set[str]) -> list[Member]:
     for info in files:
         _refuse(name, info, _path_faults(info.filename))
     trees = [tree for tree, (archive, _) in TREES.items() if archive == name]
-    found = _one_prefix(member for info in files if (member := _locate(info, trees)) is not None)
-    wanted = [member for member in found if member.parts & parts and member.case in ("", *cases)]
+    located = _one_prefix([member for info in files if (member := _locate(info, trees)) is not None])
+    wanted = [member for member in located if member.parts & parts and member.case in ("", *cases)]
     if not wanted:
         folders = sorted({"/".join(info.filename.split("/")[:3]) for info in files})
         rule = f"must hold the parts {', '.join(sorted(parts))} of {', '.join(cases)}"
@@ -160,14 +151,13 @@ def _locate(info: zipfile.ZipInfo, trees: list[str]) -> Member | None:
     return Member(info, tree, prefix, names[place], "/".join(names[place + 1 :]))
 
 
-def _one_prefix(members: Iterable[Member]) -> list[Member]:
-    """One folder per tree: with the tree's name if there is one, then with most files, then the shortest path."""
-    found = list(members)
-    counts = Counter((member.tree, member.prefix) for member in found)
+def _one_prefix(members: list[Member]) -> list[Member]:
+    """Keep one folder per tree: the one with the tree's name, else with most files, else with the shortest path."""
+    counts = Counter((member.tree, member.prefix) for member in members)
     ranked = sorted(counts, key=lambda place: (_is_named(*place), counts[place], -len(place[1])))
     prefixes = dict(ranked)
     # In a zip archive, the last of several entries with one name counts.
-    return list({member.path: member for member in found if member.prefix == prefixes[member.tree]}.values())
+    return list({member.path: member for member in members if member.prefix == prefixes[member.tree]}.values())
 
 
 def _is_named(tree: str, prefix: str) -> bool:
@@ -194,7 +184,7 @@ def _kind_faults(info: zipfile.ZipInfo) -> dict[str, bool]:
 
 
 def _missing(name: str, wanted: list[Member], data_root: Path) -> tuple[list[Member], int]:
-    """The members that are not on disk with their size and CRC-32, and how many files on disk have another content."""
+    """Members that are not on disk with their size and CRC-32, and how many files on disk have another content."""
     there = [member for member in wanted if (data_root / member.path).exists()]
     progress = Progress(f"{name}: checking files that are there", len(there))
     finished = set()
@@ -224,14 +214,11 @@ def _spans(archive: zipfile.ZipFile, members: list[Member]) -> list[tuple[int, i
 
 
 def _absent(name: str, wanted: list[Member], cases: list[str], parts: set[str]) -> dict[str, list[str]]:
-    """Part (and its folder) -> scenarios without it. Not for `other` and `extra`, of which nothing is known."""
+    """Part (and its folder) -> scenarios without it. `other` and `extra` are left out: what they should hold is unknown."""
     present = {(member.tree, member.case, part) for member in wanted for part in member.parts}
-    asked = [
-        (tree, part)
-        for tree, (archive, held) in TREES.items()
-        if archive == name
-        for part in held
-        if part in parts - {"other", "extra"}
-    ]
-    lacking = {f"{part} ({tree})": [case for case in cases if (tree, case, part) not in present] for tree, part in asked}
-    return {what: without for what, without in lacking.items() if without}
+    absent = {}
+    for tree, (archive, contents) in TREES.items():
+        for part in contents:
+            if archive == name and part in parts - {"other", "extra"}:
+                absent[f"{part} ({tree})"] = [case for case in cases if (tree, case, part) not in present]
+    return {part: without for part, without in absent.items() if without}

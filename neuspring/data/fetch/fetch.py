@@ -1,11 +1,11 @@
 """`neuspring fetch phystwin`: the released PhysTwin archives, from the Hugging Face hub into the folders that the readers expect.
 
-Only the members asked for are read, by HTTP range requests: one scenario does not cost an archive, no archive is stored, and the
-same command continues what was interrupted, since a file with the size and CRC-32 of its member is finished.
+Only the files that were asked for are read, by HTTP range requests: one scenario does not cost an archive, and no archive is
+stored. The same command continues an interrupted fetch: a file with the size and CRC-32 of its archive member is finished, any
+other starts again. The archive's SHA-256 is recorded, the CRC-32 of every file is checked.
 
-Verified against a local stand-in server only, with archives made to a description of the released ones: neither the real hub nor
-the real archives have been met. A file that was interrupted starts again; the archive's SHA-256 is recorded, the CRC-32 of every
-file is checked.
+It is tested against a local stand-in server with archives in the described layout. Neither the real hub nor the real archives
+have been met.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.progress import Progress
 from neuspring.core.records import now, read_json
-from neuspring.data import phystwin
 from neuspring.data.cases import released_cases
+from neuspring.data.check import check_layout, is_case
 from neuspring.data.departure import Departure, broken
 from neuspring.data.fetch.archive import CASES, Plan, archives, make_plan
 from neuspring.data.fetch.hub import Hub
@@ -34,11 +34,12 @@ REPOSITORY = "Jianghanxiao/PhysTwin"
 RECORD, RECORD_FORMAT = "fetched.json", 1
 LOCK = ".fetch.lock"
 PARTS = ("data", "results", "appearance", "images", "other")
-"""Of a scenario: what the reader and check-data read; released parameters, checkpoints and predictions; released splats, with
-masks and pictures of frame 0 and of the published evaluation; colour, depth and masks of every frame; what else lies with it."""
+"""Parts of a scenario. data: what the reader and check-data read. results: released parameters, checkpoints and predictions.
+appearance: released splats, with masks and pictures of frame 0 and of the published evaluation. images: color, depth and masks of
+every frame. other: everything else."""
 DEFAULT_PARTS = ("data", "results")
 ALLOCATION = 4096
-"""Bytes that file systems round a file up to."""
+"""File systems round the size of a file up to a multiple of this, bytes."""
 
 
 def fetch(
@@ -50,24 +51,28 @@ def fetch(
     dry_run: bool = False,
     endpoint: str | None = None,
     say: Callable[[str], None] = print,
+    check: Callable[[Path], list[Departure]] = check_layout,
 ) -> list[Departure]:
-    """Bring `parts` (of PARTS; "all": every one of these; "extra": the additional clothes) of `scenarios` (default: all 22) below
-    `data_root`, and check every scenario whose processed data are there.
+    """Fetch `parts` of `scenarios` (default: all 22) below `data_root`, and check every scenario whose processed data are there.
 
-    Says first what is to be fetched and the space it takes; a dry run stops there. Files of another content are replaced. Returns
-    what check-data finds. Writes fetched.json: commit, archives, digests. Raises InputError, also where the disk is too small, an
-    archive is damaged or unsafe, or the hub does not answer.
+    `parts` are of PARTS; "all" stands for every one of these, "extra" for the additional clothes. What will be fetched and the
+    space it takes is said first; a dry run stops there. Files of other content are replaced. fetched.json records commit, archives
+    and digests. Returns what `check` finds. Raises InputError, also if the disk is too small, an archive is damaged or unsafe, or
+    the hub does not answer.
     """
     data_root = Path(data_root)
-    cases, chosen = _scenarios(scenarios), _parts(parts)
+    cases, part_names = _scenarios(scenarios), _parts(parts)
     with ExitStack() as stack:
         stack.enter_context(_alone(data_root, dry_run))
         hub = Hub(REPOSITORY, revision, endpoint)
         say(f"{hub.repository} at {hub.commit} ({hub.endpoint})")
         plans = []
-        for name in archives(chosen):
-            plan = make_plan(hub, name, cases, chosen, data_root)
-            stack.callback(plan.remote.close)
+        for name in archives(part_names):
+            if name not in hub.files:
+                there = ", ".join(sorted(hub.files)) or "nothing"
+                raise InputError(f"{hub.repository} at {hub.commit}", f"{name} is required", there, "Choose another --revision.")
+            remote = stack.enter_context(hub.open(hub.files[name]))
+            plan = make_plan(hub.files[name], remote, cases, part_names, data_root)
             say(_described(plan))
             plans.append(plan)
         _check_space(data_root, plans, say)
@@ -75,30 +80,30 @@ def fetch(
             return []
         for plan in plans:
             _extract(plan, data_root)
-            _record(data_root / RECORD, hub, plan, cases, chosen)
-    return _check(data_root, cases, "data" in chosen)
+            _record(data_root / RECORD, hub, plan, cases, part_names)
+    return _check(data_root, cases, "data" in part_names, check)
 
 
 def _scenarios(names: Sequence[str]) -> list[str]:
-    known = list(released_cases())
+    released = list(released_cases())
     for name in names:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=3) or known
+        if name not in released:
+            close = difflib.get_close_matches(name, released, n=3) or released
             raise InputError("SCENARIO", "must be one of the 22 released scenarios", name, f"Close to it: {', '.join(close)}.")
-    return [name for name in known if name in names] if names else known
+    return [name for name in released if name in names] if names else released
 
 
 def _parts(names: Sequence[str]) -> set[str]:
-    known = (*PARTS, "extra", "all")
+    choices = (*PARTS, "extra", "all")
     for name in names:
-        if name not in known:
-            raise InputError("--parts", f"must be among {', '.join(known)}", name)
+        if name not in choices:
+            raise InputError("--parts", f"must be among {', '.join(choices)}", name)
     return {part for name in names for part in (PARTS if name == "all" else (name,))}
 
 
 @contextmanager
 def _alone(data_root: Path, dry_run: bool) -> Iterator[None]:
-    """No other fetch into `data_root`; trouble with its files as InputError."""
+    """Lock `data_root` against other fetches. Raises trouble with its files as InputError."""
     from filelock import FileLock, Timeout
 
     try:
@@ -164,31 +169,29 @@ def _extract(plan: Plan, data_root: Path) -> None:
         progress.update(count, f"{_size(done)} {member.case}")
 
 
-def _record(path: Path, hub: Hub, plan: Plan, cases: list[str], chosen: set[str]) -> None:
-    """Add to fetched.json what was fetched; nothing where nothing was missing and the same was recorded before."""
+def _record(path: Path, hub: Hub, plan: Plan, cases: list[str], parts: set[str]) -> None:
+    """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
     entries = read_json(path, RECORD_FORMAT)["fetched"] if path.exists() else []
-    what = {
+    content = {
         "repository": hub.repository,
         "revision": hub.commit,
         "archive": plan.file.name,
         "sha256": plan.file.sha256,
         "size": plan.file.size,
-        "parts": sorted(chosen & {part for member in plan.wanted for part in member.parts}),
+        "parts": sorted(parts & {part for member in plan.wanted for part in member.parts}),
         "scenarios": cases,
     }
-    if not plan.missing and any(what.items() <= entry.items() for entry in entries):
+    if not plan.missing and any(content.items() <= entry.items() for entry in entries):
         return
-    entry = what | {"endpoint": hub.endpoint, "date": now(), "files": len(plan.missing)}
+    entry = content | {"endpoint": hub.endpoint, "date": now(), "files": len(plan.missing)}
     write_text(path, json.dumps({"format": RECORD_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
 
 
-def _check(data_root: Path, cases: list[str], required: bool) -> list[Departure]:
-    """check-data of the cases that have processed data; an error for others where these are `required`."""
-    from neuspring.data import check
-
+def _check(data_root: Path, cases: list[str], required: bool, check: Callable[[Path], list[Departure]]) -> list[Departure]:
+    """Check the cases that have processed data; an error for others if these are `required`."""
     folders = [data_root / CASES / case for case in cases]
-    there = [folder for folder in folders if (folder / phystwin.FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()]
-    lacking = [broken(folder, "", "processed data are required") for folder in folders if required and folder not in there]
-    if len(there) == len(released_cases()):
-        return check.check(data_root)  # compares means over all cases, too
-    return lacking + [departure for folder in there for departure in check.check(folder)]
+    present = [folder for folder in folders if is_case(folder)]
+    absent = [broken(folder, "", "processed data are required") for folder in folders if required and folder not in present]
+    if len(present) == len(released_cases()):
+        return check(data_root)  # also compares means over all cases
+    return absent + [departure for folder in present for departure in check(folder)]

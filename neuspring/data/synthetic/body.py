@@ -1,4 +1,4 @@
-"""What the finite elements simulate and the camera sees: a body at rest, its true materials, its skin with a fixed texture."""
+"""A body at rest, with its true materials and its textured skin."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class Body:
     viscosity: tuple[float, float] = (0.0, 0.1)
     """Maxwell branch: its modulus in parts of Young's modulus, and its relaxation time, s."""
     contact_stiffness: float = 150.0
-    """Of nodes against table and hands, N/m."""
+    """Contact stiffness of nodes against table and hands, N/m."""
     contact_damping: float = 0.02
-    """N s/m."""
+    """Contact damping of nodes against table and hands, N s/m."""
     self_contact: bool = False
     self_contact_stiffness: float = 40.0
     """N/m; nodes repel each other within two radii."""

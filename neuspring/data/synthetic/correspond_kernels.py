@@ -33,8 +33,8 @@ def nearest(
 ):
     """The triangle that holds the point of the mesh nearest to each place, and the weights of its corners."""
     i = wp.tid()
-    found = wp.mesh_query_point_no_sign(mesh, points[i], farthest)
+    hit = wp.mesh_query_point_no_sign(mesh, points[i], farthest)
     face[i] = -1
-    if found.result:
-        face[i] = found.face
-        weights[i] = wp.vec3(found.u, found.v, 1.0 - found.u - found.v)
+    if hit.result:
+        face[i] = hit.face
+        weights[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)

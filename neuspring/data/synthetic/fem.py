@@ -19,7 +19,7 @@ from neuspring.data.synthetic import fem_kernels as kernels
 from neuspring.data.synthetic.body import Body
 from neuspring.data.synthetic.fem_model import GRAVITY, build, lame
 from neuspring.data.synthetic.hands import Hand
-from neuspring.data.synthetic.tetrahedra import edges, volumes
+from neuspring.data.synthetic.tetrahedra import volumes
 
 SAFETY = 0.6
 """Fraction of the critical step."""
@@ -60,15 +60,14 @@ class Clip:
     """[T], J."""
     least_jacobian: np.ndarray
     """[T] smallest det F of a tetrahedron; 1 for sheets."""
-    most_stretch: np.ndarray
-    """[T] largest ratio of an edge to its rest length."""
     substeps: int
 
 
 class FiniteElements:
     """A body with its hands, from `start` (rest shape where None), on one core.
 
-    `substeps` None: as many as the critical step asks for, an even number. `holder` None: a hand holds the nodes in its reach.
+    `substeps` defaults to the even number that the critical step asks for. `holder` [N] says which hand holds each node (-1: none);
+    by default a hand holds the nodes in its reach.
     """
 
     def __init__(
@@ -106,24 +105,23 @@ class FiniteElements:
         return 1.0 / (self.frame_rate * self.substeps)
 
     def again(self, frames: int, start: np.ndarray, substeps: int) -> Self:
-        """The same body and hands anew; they hold the same nodes, whatever the start."""
+        """A new engine for the same body and hands. The hands hold the same nodes even if `start` differs."""
         return type(self)(self.body, self.hands, frames, self.frame_rate, self.damping, start, substeps, self.holder)
 
     def run(self) -> Clip:
         """Simulate all frames. Raises NumericalFailure if nodes escape or become infinite."""
-        found = [self._measure(self.start)]
+        rows = [self._measure(self.start)]
         for frame in range(1, self.frames):
             self._frame()
             position = self.now.particle_q.numpy()
             if not np.isfinite(position).all() or np.abs(position).max() > ESCAPED:
                 raise NumericalFailure(f"the finite-element clip diverged in frame {frame} with {self.substeps} substeps per frame")
-            found.append(self._measure(position))
-        names = ("positions", "kinetic", "potential", "least_jacobian", "most_stretch")
-        arrays = {name: np.array([row[k] for row in found]) for k, name in enumerate(names)}
-        return Clip(**arrays, substeps=self.substeps)
+            rows.append(self._measure(position))
+        positions, kinetic, potential, jacobian = (np.array(column) for column in zip(*rows, strict=True))
+        return Clip(positions, kinetic, potential, jacobian, self.substeps)
 
     def velocities(self) -> np.ndarray:
-        """Of the last frame [N, 3], m/s."""
+        """Velocities of the nodes in the last frame [N, 3], m/s."""
         return np.asarray(self.now.particle_qd.numpy())
 
     def _build(self, fists: int) -> newton.Model:
@@ -132,10 +130,10 @@ class FiniteElements:
     def _solver(self) -> newton.solvers.SolverBase:
         return newton.solvers.SolverSemiImplicit(self.model, enable_tri_contact=False)
 
-    def _choose_substeps(self, wished: int | None) -> int:
+    def _choose_substeps(self, substeps: int | None) -> int:
         step, dashpot = self._critical_step()
         self._set_dashpots(dashpot)
-        return wished or max(2 * int(np.ceil(1.0 / (self.frame_rate * step) / 2)), 2)
+        return substeps or max(2 * int(np.ceil(1.0 / (self.frame_rate * step) / 2)), 2)
 
     def _maxwell_state(self) -> list[wp.array] | None:
         """Tetrahedra, inverse rest shapes, volumes, moduli, strain and stress of the Maxwell branch."""
@@ -156,8 +154,8 @@ class FiniteElements:
             wp.zeros(len(body.tetrahedra), dtype=wp.mat33, device="cpu"),
         ]
 
-    def _hold(self, fists: list[int], known: np.ndarray | None) -> None:
-        """Place the hands, and give them the nodes that they grip in frame 0."""
+    def _hold(self, fists: list[int], earlier: np.ndarray | None) -> None:
+        """Place the hands, and give them the nodes that they grip in frame 0, or those of `earlier`."""
         hands = self.hands
         times = np.arange((self.frames - 1) * self.substeps + 2) * self.substep
         poses = np.stack([hand.poses(times) for hand in hands]) if hands else np.zeros((1, len(times), 7))
@@ -168,9 +166,9 @@ class FiniteElements:
             offset = self.start - poses[index, 0, :3]
             if hand.kind == "grip":
                 within = np.linalg.norm(offset, axis=1) < hand.reach
-                held = (within & (holder < 0)) if known is None else known == index
-                assert held.any(), "a hand must hold something"
-                holder[held], local[held] = index, offset[held]
+                gripped = (within & (holder < 0)) if earlier is None else earlier == index
+                assert gripped.any(), "a hand must hold something"
+                holder[gripped], local[gripped] = index, offset[gripped]
         self.holder = holder
         inverse = np.where((self.mass > 0) & (holder < 0), 1.0 / np.maximum(self.mass, 1e-12), 0.0)
         self.model.particle_inv_mass.assign(inverse.astype(np.float32))
@@ -224,14 +222,14 @@ class FiniteElements:
         wp.launch(kernels.maxwell, len(self.body.tetrahedra), arguments, device="cpu")
 
     def _rub(self, before: newton.State, after: newton.State, dt: float) -> None:
-        found, model = self.contacts, self.model
+        contacts, model = self.contacts, self.model
         arguments = [
-            *(found.soft_contact_count, found.soft_contact_particle, found.soft_contact_shape),
-            *(found.soft_contact_body_pos, found.soft_contact_normal, model.shape_body),
+            *(contacts.soft_contact_count, contacts.soft_contact_particle, contacts.soft_contact_shape),
+            *(contacts.soft_contact_body_pos, contacts.soft_contact_normal, model.shape_body),
             *(self.body.friction, self.body.contact_stiffness, before.body_q, before.body_qd),
             *(model.particle_radius, model.particle_inv_mass, before.particle_q, dt, after.particle_q, after.particle_qd),
         ]
-        wp.launch(kernels.coulomb, found.soft_contact_max, arguments, device="cpu")
+        wp.launch(kernels.coulomb, contacts.soft_contact_max, arguments, device="cpu")
 
     def _damp(self, state: newton.State, dt: float) -> None:
         self._sums.zero_()
@@ -241,8 +239,8 @@ class FiniteElements:
         arguments = [state.particle_q, model.particle_inv_mass, self._sums, *rates, state.particle_qd]
         wp.launch(kernels.damp_deformation, count, arguments, device="cpu")
 
-    def _measure(self, positions: np.ndarray) -> tuple[np.ndarray, float, float, float, float]:
-        """Positions, kinetic and potential energy, smallest Jacobian, largest stretch."""
+    def _measure(self, positions: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+        """Positions, kinetic and potential energy, smallest Jacobian."""
         body, x = self.body, np.asarray(positions, dtype=float)
         speed = self.now.particle_qd.numpy().astype(float)
         kinetic = 0.5 * float((self.mass[:, None] * speed**2).sum())
@@ -250,10 +248,7 @@ class FiniteElements:
         jacobian = 1.0
         if not body.is_sheet:
             jacobian = float((volumes(x, body.tetrahedra) / self.volumes).min())
-        lines = edges(body.triangles if body.is_sheet else body.tetrahedra)
-        length = np.linalg.norm(x[lines[:, 0]] - x[lines[:, 1]], axis=1)
-        rest = np.linalg.norm(body.nodes[lines[:, 0]] - body.nodes[lines[:, 1]], axis=1)
-        return positions.copy(), kinetic, potential, jacobian, float((length / rest).max())
+        return positions.copy(), kinetic, potential, jacobian
 
     def _critical_step(self) -> tuple[float, float]:
         """SAFETY times the largest stable step, s, and the dashpot of every edge, N s/m, that goes with it.

@@ -35,7 +35,7 @@ class Fabric:
 HEM = (3.0, 10.0)
 """Factors of membrane and bending in the hem."""
 SHEET_RADIUS = 0.4
-"""Contact radius of a sheet's nodes in node spacings: below half a spacing neighbours do not repel each other, above 0.36 a
+"""Contact radius of a sheet's nodes in node spacings: below half a spacing neighbors do not repel each other, above 0.36 a
 cell's diagonal is closed."""
 
 
@@ -107,7 +107,7 @@ ROPES = {
     "twine": (0.5, (0.06,), (0.75, 0.68, 0.5)),
     "cord": (0.44, (-0.1, 0.12), (0.3, 0.45, 0.7)),
 }
-"""Length, m; places of knots along x, m; colour."""
+"""Length, m; places of knots along x, m; color."""
 ROPE_RADIUS = 0.006
 KNOT_RADIUS = 0.0095
 KNOT_WIDTH = 0.012
@@ -128,7 +128,7 @@ def rope(name: str, spacing: float, skin_spacing: float) -> Body:
     def paint(p: np.ndarray) -> np.ndarray:
         turn = np.arctan2(p[:, 2] - ROPE_RADIUS - radius, p[:, 1]) / (2 * np.pi)
         strand = (p[:, 0] * 60.0 + turn) % 1.0 < 0.5
-        # Every seventh turn carries a coloured thread, so that one place differs from the next.
+        # Every seventh turn carries a colored thread, so that one place differs from the next.
         thread = ((p[:, 0] * 60.0 + turn) // 1.0) % 7 == 0
         shade = np.where(strand[:, None], 0.55, 1.0) * np.array(colour)
         return np.asarray(np.where(thread[:, None], shade * [0.9, 0.35, 0.3], shade))

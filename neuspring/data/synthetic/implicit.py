@@ -1,6 +1,6 @@
-"""Signed distance functions, negative inside, of which synthetic bodies and hands are made, and their triangle surfaces.
+"""Signed distance functions, negative inside, for synthetic bodies and hands, and their triangle surfaces.
 
-Points are [..., 3], distances [...], metres. The ellipsoid and the smooth union are approximate distances with exact signs away
+Points are [..., 3], distances [...], meters. The ellipsoid and the smooth union are approximate distances with exact signs away
 from the blend, which is all that meshing needs.
 """
 
@@ -81,8 +81,8 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
     values: wp.array = wp.array(sdf((first + spacing * grid).reshape(-1, 3)).reshape(counts), dtype=wp.float32, device="cpu")
     # The extractor rejects a grid's bounds in two forms: lattice coordinates are the plain one, scaled here.
-    found, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
-    vertices, faces = first + spacing * found.numpy().astype(float), indices.numpy().reshape(-1, 3)
+    points, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
+    vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     centres = corners.mean(axis=1)

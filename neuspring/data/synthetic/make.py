@@ -15,7 +15,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.points import farthest
 from neuspring.core.progress import Progress
 from neuspring.core.records import digest_file
-from neuspring.data.capture import Camera, CameraEntry, Capture, Description, Writer
+from neuspring.data.capture import Camera, Capture, Description, Writer
 from neuspring.data.synthetic.body import Body
 from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, certify, settle
 from neuspring.data.synthetic.hands import SKIN, Hand, place
@@ -31,20 +31,21 @@ DEPTH_UNIT = 0.001
 FIELD_OF_VIEW = 55.0
 """Degrees, along the width."""
 AZIMUTHS = (-35.0, 85.0, 205.0)
-"""Degrees, of the cameras around the object; the first looks at its head."""
+"""Directions of the cameras around the object, degrees. The first camera looks at the object's head."""
 ELEVATION = 38.0
 MARGIN = 0.9
-"""Part of the image that object and hands' origins stay in, from its centre."""
+"""Object and hands' origins stay within this fraction of the image, from its center."""
 ANNOTATED = 40
-"""Tracks for scoring."""
+"""Number of tracks for scoring."""
 LEAST_JACOBIAN, SHARE = 0.02, 0.1
-"""A clip is refused if an element falls below this volume ratio in more than this share of frames."""
+"""A clip is refused if an element falls below this volume ratio in more than this fraction of the frames."""
 ENGINES = {"": FiniteElements, "vbd": VertexBlockDescent}
 MOST_DEVIATION = 0.001
-"""m; a clip is refused if twice the substeps move the mean node further, ..."""
+"""m. A clip is refused if twice the substeps move the mean node farther than this and than CHAOS times the effect of a nudge."""
 CHAOS = 3.0
-"""... unless a nudge of the start does the same, within this factor: then the motion is chaotic, not the time step too long."""
+"""If a nudge of the start moves the clip nearly as far, the motion is chaotic and the time step is not too long."""
 CERTIFIED_FRAMES = 20
+"""Frames at the start of a clip that are simulated again with twice the substeps."""
 GRAINS = {"cloth": (45.0, 0.5), "rope": (70.0, 0.5), "package": (35.0, 0.5)}
 """Frequency, 1/m, and contrast of the fine texture by category."""
 PLUSH_GRAIN, HAND_GRAIN = (36.0, 1.1), (45.0, 0.6)
@@ -87,14 +88,14 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     clip = engine.run()
     truth = _truth(body, hands, clip, engine.holder, certify(engine, clip, CERTIFIED_FRAMES))
     _refuse(row.scenario, truth)
-    cameras = place_cameras(body, clip, hands, size, settings.cameras)
+    cameras = place_cameras(clip, hands, size, settings.cameras)
     description = Description(
         format=1,
         name=row.scenario,
         category=row.category,
         frame_count=frames,
         frame_rate=FRAME_RATE,
-        cameras=tuple(_entry(camera) for camera in cameras),
+        cameras=tuple(camera.entry() for camera in cameras),
         depth_unit=DEPTH_UNIT,
         masks=True,
         provenance={
@@ -140,17 +141,16 @@ def _refuse(name: str, truth: Truth) -> None:
     if crushed > SHARE:
         raise NumericalFailure(f"{name}: an element is crushed (det F < {LEAST_JACOBIAN}) in {crushed:.0%} of the frames")
     if truth.certificate > max(MOST_DEVIATION, CHAOS * truth.sensitivity):
-        found = f"{1e3 * truth.certificate:.2f} mm, a start that is 1 um off by {1e3 * truth.sensitivity:.2f} mm"
-        raise NumericalFailure(f"{name}: twice the substeps move the mean node by {found}; not converged")
+        deviations = f"{1e3 * truth.certificate:.2f} mm, a start that is 1 um off by {1e3 * truth.sensitivity:.2f} mm"
+        raise NumericalFailure(f"{name}: twice the substeps move the mean node by {deviations}; not converged")
 
 
-def place_cameras(body: Body, clip: Clip, hands: Sequence[Hand], size: Size, count: int) -> list[Camera]:
+def place_cameras(clip: Clip, hands: Sequence[Hand], size: Size, count: int) -> list[Camera]:
     """Cameras around the object, as near as the motion of object and hands allows, so that they fill the image."""
     focal = 0.5 * size.width / np.tan(np.radians(FIELD_OF_VIEW / 2))
     k = np.array([[focal, 0.0, (size.width - 1) / 2], [0.0, focal, (size.height - 1) / 2], [0.0, 0.0, 1.0]])
     times = np.arange(len(clip.positions)) / FRAME_RATE
-    seen = [clip.positions[::5, ::7].reshape(-1, 3), *(hand.poses(times)[:, :3] for hand in hands)]
-    points = np.concatenate(seen)
+    points = np.concatenate([clip.positions[::5, ::7].reshape(-1, 3), *(hand.poses(times)[:, :3] for hand in hands)])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     cameras = []
     for index, azimuth in enumerate(np.radians(AZIMUTHS[:count])):
@@ -176,17 +176,6 @@ def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
     return pose
-
-
-def _entry(camera: Camera) -> CameraEntry:
-    rows = [tuple(tuple(float(v) for v in row) for row in m) for m in (camera.intrinsics, camera.camera_to_world)]
-    return CameraEntry(
-        name=camera.name,
-        width=camera.width,
-        height=camera.height,
-        intrinsics=rows[0],  # type: ignore[arg-type]
-        camera_to_world=rows[1],  # type: ignore[arg-type]
-    )
 
 
 def _film(
@@ -223,12 +212,12 @@ def _film(
 
 
 def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
-    """Tracks [T, K, 3], m, of vertices that the first camera sees in frame 0, spread over what it sees."""
+    """Tracks [T, K, 3], m, of well spread vertices that `camera` sees in frame 0."""
     vertices = truth.surface(0)
     pixels, depth = camera.project(vertices)
     inside = np.flatnonzero(camera.sees(pixels))
     x, y = np.round(pixels[inside]).astype(int).T
     seen = capture.depth(camera.name, 0)[y, x]
     visible = inside[(capture.mask(camera.name, 0)[y, x] == OBJECT) & (np.abs(seen - depth[inside]) < 0.004)]
-    chosen = visible[farthest(vertices[visible], ANNOTATED)]
-    return np.stack([truth.surface(frame)[chosen] for frame in range(len(truth.nodes))])
+    spread = visible[farthest(vertices[visible], ANNOTATED)]
+    return np.stack([truth.surface(frame)[spread] for frame in range(len(truth.nodes))])

@@ -1,6 +1,6 @@
-"""A ray caster on Warp meshes: colour, depth along the optical axis, and who is seen (0 table, 1 object, 2 hand), per camera.
+"""A ray caster on Warp meshes: color, depth along the optical axis, and who is seen (0 table, 1 object, 2 hand), per camera.
 
-Texture is a function of rest coordinates, so it sticks to the material. Pixel centres lie at whole coordinates, x right, y down,
+Texture is a function of rest coordinates, so it sticks to the material. Pixel centers lie at whole coordinates, x right, y down,
 z forward (OpenCV); the table is the plane z = 0.
 """
 
@@ -22,13 +22,13 @@ LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
 FARTHEST = 8.0
 """m; what lies further is background without depth."""
 SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
-"""Where a pixel's colour is sampled; depth and label are those of the first."""
+"""Where a pixel's color is sampled; depth and label are those of the first."""
 GAMMA = 1.0 / 2.2
 
 
 @dataclass(frozen=True)
 class Part:
-    """One thing that is seen: its triangles, where its texture lives, its colours."""
+    """One thing that is seen: its triangles, where its texture lives, its colors."""
 
     rest: np.ndarray
     """[V, 3], m."""

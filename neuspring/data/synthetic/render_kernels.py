@@ -41,7 +41,7 @@ def cast(
     label: wp.array2d[wp.uint8],
     slope: wp.array2d[float],
 ):
-    """One pixel: colour is the mean over `offsets`, depth, label and slope are those of the first."""
+    """One pixel: color is the mean over `offsets`, depth, label and slope are those of the first."""
     y, x = wp.tid()
     origin = wp.transform_get_translation(pose)
     state = wp.uint32(7)
@@ -59,7 +59,7 @@ def cast(
         shade = wp.vec3(0.55, 0.58, 0.62)
         normal = wp.vec3(0.0, 0.0, 1.0)
         distance = 0.0
-        found = 0
+        seen = 0
         if hit.result and hit.t < to_table:
             a = indices[3 * hit.face]
             b = indices[3 * hit.face + 1]
@@ -70,8 +70,8 @@ def cast(
                 normal = -normal
             place = rest[a] * hit.u + rest[b] * hit.v + rest[c] * w
             base = colours[a] * hit.u + colours[b] * hit.v + colours[c] * w
-            found = labels[hit.face]
-            texture = grains[found]
+            seen = labels[hit.face]
+            texture = grains[seen]
             shade = base * grain(place, texture[0], texture[1], state)
             distance = hit.t
         elif to_table < farthest:
@@ -87,7 +87,7 @@ def cast(
         total += shade / float(offsets.shape[0])
         if s == 0:
             depth[y, x] = distance * axial
-            label[y, x] = wp.uint8(found)
+            label[y, x] = wp.uint8(seen)
             slope[y, x] = wp.abs(wp.dot(normal, ray))
     for k in range(3):
         colour[y, x, k] = wp.uint8(wp.clamp(wp.pow(wp.max(total[k], 0.0), gamma) * 255.0 + 0.5, 0.0, 255.0))

@@ -41,7 +41,7 @@ def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFra
 
 
 def nearest(nodes: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
-    """The node nearest to a place given in parts of the bounding box (0 to 1 along x, y, z)."""
+    """The node nearest to `wanted`, in fractions of the bounding box (0 to 1 along x, y, z)."""
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     return np.asarray(nodes[np.argmin((((nodes - low) / np.maximum(high - low, 1e-9) - np.asarray(wanted)) ** 2).sum(axis=1))])
 
@@ -56,13 +56,13 @@ def lift(*places: Sequence[float], reach: float = 0.02, offsets: Offsets = LIFT,
     """A grip at each place (parts of the bounding box); several move together, out of step by one offset."""
 
     def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
-        found = []
+        grips = []
         for k, wanted in enumerate(places):
             point = nearest(nodes, wanted)
             # The hands of one object take the same heights, not the same detours.
             own = [(x * (1 - 2 * (k % 2)), y, z) for x, y, z in offsets]
-            found.append(Hand(wander(point, own, duration), reach=reach, turn=tuple(turn)))  # type: ignore[arg-type]
-        return tuple(found)
+            grips.append(Hand(wander(point, own, duration), reach=reach, turn=tuple(turn)))  # type: ignore[arg-type]
+        return tuple(grips)
 
     return hands
 
@@ -74,12 +74,12 @@ def stretch(first: Sequence[float], second: Sequence[float], pull: float, reach:
         points = [nearest(nodes, wanted) for wanted in (first, second)]
         apart = (points[0] - points[1]) * [1, 1, 0]
         apart /= np.linalg.norm(apart)
-        found = []
+        grips = []
         for point, side in zip(points, (1.0, -1.0), strict=True):
             far, up = side * pull * apart, np.array([0.0, 0.0, 0.1])
             offsets = [up, up + far, up * 1.3 + 0.2 * far, up + far * 0.8, up * 0.5]
-            found.append(Hand(wander(point, offsets, duration), reach=reach))
-        return tuple(found)
+            grips.append(Hand(wander(point, offsets, duration), reach=reach))
+        return tuple(grips)
 
     return hands
 

@@ -1,5 +1,5 @@
-"""A depth camera's flaws: noise that grows with distance and is alike in neighbouring pixels, dropouts at edges and on grazing
-surfaces, holes, quantisation."""
+"""A depth camera's flaws: noise that grows with distance and is alike in neighboring pixels, dropouts at edges and on grazing
+surfaces, holes, quantization."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NOISE_NEAR, NOISE_FAR = 0.0008, 0.0019
 CORRELATION = 1.2
 """Width of the noise's grain, pixels."""
 EDGE_STEP = 0.02
-"""Neighbouring pixels that differ by more, m, make an edge."""
+"""Neighboring pixels that differ by more, m, make an edge."""
 EDGE_LOSS = 0.6
 """Share of pixels at an edge without depth."""
 GRAZING = 0.18

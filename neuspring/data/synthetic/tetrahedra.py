@@ -1,4 +1,4 @@
-"""Tetrahedral meshes of implicit bodies (body-centred lattice, boundary snapped to the surface), boxes and rods, in NumPy.
+"""Tetrahedral meshes of implicit bodies (body-centered lattice, boundary snapped to the surface), boxes and rods, in NumPy.
 
 Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
 """
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.data.synthetic.implicit import Sdf, gradient
 
 LATTICE_ALTITUDE = np.sqrt(0.5)
-"""Altitude of a tetrahedron of the body-centred lattice, in lattice constants."""
+"""Altitude of a tetrahedron of the body-centered lattice, in lattice constants."""
 LEAST_ALTITUDE = 0.4
 """Snapping never takes a tetrahedron below this fraction of the lattice's altitude."""
 SNAPPING_STEPS = 40
@@ -63,7 +63,7 @@ def edges(elements: np.ndarray) -> np.ndarray:
 
 
 def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
-    """Tetrahedra of the body-centred cubic lattice that covers a box: two cell centres and an edge of the face between them."""
+    """Tetrahedra of the body-centered cubic lattice that covers a box: two cell centers and an edge of the face between them."""
     first = np.asarray(low, float) - spacing
     corners = np.ceil((np.asarray(high, float) + spacing - first) / spacing).astype(int) + 1
     cells = corners - 1
@@ -76,7 +76,7 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
     def centre(index: np.ndarray) -> np.ndarray:
         return len(nodes) - int(np.prod(cells)) + _flat_index(index, cells)
 
-    found = []
+    elements = []
     for axis in range(3):
         step, right, up = np.roll(np.eye(3, dtype=int), axis, axis=1)
         inner = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
@@ -84,8 +84,8 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
         base = cell + step
         ring = [corner(base), corner(base + right), corner(base + right + up), corner(base + up)]
         for k in range(4):
-            found.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
-    return nodes, oriented(nodes, np.concatenate(found))
+            elements.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
@@ -126,15 +126,15 @@ def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nom
 
 
 def _largest_piece(nodes: np.ndarray, tetrahedra: np.ndarray) -> Mesh:
-    """Of the pieces that hang together by faces."""
+    """The largest of the pieces that share no face."""
     labels = pieces(tetrahedra)
-    kept = tetrahedra[labels == np.bincount(labels).argmax()]
-    used, renumbered = np.unique(kept, return_inverse=True)
+    largest = tetrahedra[labels == np.bincount(labels).argmax()]
+    used, renumbered = np.unique(largest, return_inverse=True)
     return nodes[used], renumbered.reshape(-1, 4)
 
 
 def pieces(tetrahedra: np.ndarray) -> np.ndarray:
-    """[E] the piece of each tetrahedron; neighbours share a face."""
+    """[E] the piece of each tetrahedron; neighbors share a face."""
     faces = np.sort(np.concatenate([tetrahedra[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]), axis=1)
     owner = np.tile(np.arange(len(tetrahedra)), 4)
     order = np.lexsort(faces.T)
@@ -149,7 +149,7 @@ def _adjacency(pairs: np.ndarray, count: int) -> csr_matrix:
 
 
 def _averaging(elements: np.ndarray, count: int) -> csr_matrix:
-    """The matrix that replaces each node by the mean of its neighbours."""
+    """The matrix that replaces each node by the mean of its neighbors."""
     graph = _adjacency(edges(elements), count)
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
     return coo_matrix(graph.multiply(1.0 / degree[:, None])).tocsr()
@@ -169,32 +169,32 @@ def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray,
         ((0, 1, 1), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
         ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)),
     )
-    found = []
+    elements = []
     for corners in five:
         offsets = np.array(corners)
         mirrored = offsets * [-1, 1, 1] + [1, 0, 0]
-        for chosen, shift in ((~odd, offsets), (odd, mirrored)):
-            found.append(_flat_index(cell[chosen][:, None] + shift, counts + 1))
-    return nodes, oriented(nodes, np.concatenate(found))
+        for parity, shift in ((~odd, offsets), (odd, mirrored)):
+            elements.append(_flat_index(cell[parity][:, None] + shift, counts + 1))
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
-    """A rod along x, centred: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
-    tetrahedra per prism, split by node order so that neighbours agree."""
+    """A rod along x, centered: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
+    tetrahedra per prism, split by node order so that neighbors agree."""
     along = np.linspace(-length / 2, length / 2, len(radii))
     angles = 2 * np.pi * np.arange(around) / around
     ring = np.stack([np.zeros(around), np.cos(angles), np.sin(angles)], axis=1)
     offsets = np.concatenate([np.zeros((1, 3)), ring])
     nodes = (radii[:, None, None] * offsets + along[:, None, None] * [1.0, 0.0, 0.0]).reshape(-1, 3)
     ids = np.arange(len(nodes)).reshape(len(radii), around + 1)
-    found = []
+    elements = []
     for k in range(around):
         bottom = np.sort(np.stack([ids[:-1, 0], ids[:-1, 1 + k], ids[:-1, 1 + (k + 1) % around]], axis=1), axis=1)
         top = bottom + around + 1
         a, b, c = bottom.T
         d, e, f = top.T
-        found += [np.stack(t, axis=1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
-    return nodes, oriented(nodes, np.concatenate(found))
+        elements += [np.stack(t, axis=1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    return nodes, oriented(nodes, np.concatenate(elements))
 
 
 def embed(points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

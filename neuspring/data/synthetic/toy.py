@@ -21,12 +21,12 @@ TRAIN_FRACTION = 0.7
 RUN = (3, 8)
 """Shortest and longest occlusion, frames."""
 ANNOTATED = 16
-"""Tracks kept for scoring, without noise."""
+"""Number of tracks for scoring; they have no noise."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Metres."""
+    """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Meters."""
 
     tracked: np.ndarray
     surface: np.ndarray

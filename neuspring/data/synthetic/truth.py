@@ -1,4 +1,4 @@
-"""What a synthetic capture knows and methods may not read: motion of every node, correspondences, materials, contact.
+"""The truth of a synthetic capture, which methods may not read: motion of every node, correspondences, materials, contact.
 
 It lies beside the capture's folder, and the capture's provenance holds its digest.
 """
@@ -19,7 +19,7 @@ from neuspring.data.capture import CAPTURE, Capture
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Artifact):
-    """Lies beside the capture, never in it."""
+    """The truth of one capture."""
 
     kind: ClassVar[str] = "truth"
     nodes: np.ndarray = array("T,N,3", np.float32, "m", "positions of the finite-element nodes")
@@ -39,9 +39,10 @@ class Truth(Artifact):
     substeps: int
     """Per frame."""
     certificate: float
-    """Largest mean distance, m, to the same clip with twice the substeps, ..."""
+    """Mean distance of nodes to the same clip with twice the substeps, m, in the worst frame."""
     sensitivity: float
-    """... and to the same clip from a start that is a micrometre off: what cannot be predicted, whatever the time step."""
+    """Mean distance of nodes to the same clip from a start that is a micrometer off, m, in the worst frame. No time step can
+    predict the motion better."""
 
     def surface(self, frame: int) -> np.ndarray:
         """Visible vertices [V, 3], m, in one frame."""

@@ -31,12 +31,12 @@ class VertexBlockDescent(FiniteElements):
     def _solver(self) -> newton.solvers.SolverBase:
         return newton.solvers.SolverVBD(self.model, iterations=ITERATIONS, particle_enable_tile_solve=False)
 
-    def _choose_substeps(self, wished: int | None) -> int:
-        return wished or SUBSTEPS
+    def _choose_substeps(self, substeps: int | None) -> int:
+        return substeps or SUBSTEPS
 
-    def _hold(self, fists: list[int], known: np.ndarray | None) -> None:
-        super()._hold(fists, known)
-        # Without mass a node would still give way to its neighbours.
+    def _hold(self, fists: list[int], earlier: np.ndarray | None) -> None:
+        super()._hold(fists, earlier)
+        # Without mass a node would still give way to its neighbors.
         flags = np.where(self.holder < 0, int(newton.ParticleFlags.ACTIVE), 0)
         self.model.particle_flags.assign(flags.astype(np.int32))
 

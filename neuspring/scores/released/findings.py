@@ -1,4 +1,4 @@
-"""What conformance checks find: our number, the published one, how far they may differ, and the verdict."""
+"""Findings of the conformance checks: our number, the published one, how far they may differ, and the verdict."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from neuspring.core.errors import InputError
 from neuspring.data.cases import released_cases
+from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import TASKS, UNITS, averages
 
 Outcome = Literal["passed", "failed", "measured", "skipped"]
-"""measured: nothing published to compare with."""
+"""measured: there is no published number to compare with."""
 MEAN = "mean"
-"""Stands for the scenario in findings about all of them."""
+"""The scenario of findings about all scenarios."""
 SCORES = "released_phystwin_scores.csv"
 PUBLISHED_NAMES = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
 MEANS = ("MEAN22_REEVAL", "MEAN22_PAPER")
@@ -32,14 +33,18 @@ FRAME_WEIGHTED = ("psnr", "ssim", "lpips", "iou")
 
 
 class Absent(Exception):
-    """A check cannot run, and why."""
+    """The reason why a check cannot run, and the missing file if that is it."""
+
+    def __init__(self, reason: str, file: Path | None = None) -> None:
+        super().__init__(reason)
+        self.file = file
 
 
 def require(root: Path, *paths: Path) -> None:
     """Raise Absent for the first path that is not there."""
     for path in paths:
         if not path.exists():
-            raise Absent(f"{path.relative_to(root)} is not there")
+            raise Absent(f"{path.relative_to(root)} is not there", path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +53,7 @@ class Finding:
 
     check: int
     scenario: str
-    """Or `MEAN`."""
+    """Its name, or MEAN."""
     quantity: str
     unit: str = ""
     task: str = ""
@@ -60,7 +65,9 @@ class Finding:
     outcome: Outcome = "measured"
     note: str = ""
     frames: int = 0
-    """That a score is the mean of."""
+    """Number of frames that a score is the mean of."""
+    file: Path | None = field(default=None, compare=False, repr=False)
+    """The file that is checked."""
     per_frame: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -69,7 +76,7 @@ class Finding:
         return None if self.ours is None or self.published is None else self.ours - self.published
 
     def against(self, published: float, tolerance: float) -> Finding:
-        """Judged: passed or failed, by the tolerance."""
+        """The finding with its verdict: passed or failed, by the tolerance."""
         assert self.ours is not None
         good = abs(self.ours - published) <= tolerance  # false for NaN
         return replace(self, published=published, tolerance=tolerance, outcome="passed" if good else "failed")
@@ -86,21 +93,21 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
-    """Scores of the released results as others published them, keyed by (scenario, task, metric); means under their rows' names."""
+    """Published scores of the released results, keyed by (scenario, task, metric). Means stand under the names in MEANS."""
 
     scores: Mapping[tuple[str, str, str], Reference]
     scenarios: frozenset[str]
-    """Whose mean the means are."""
+    """The scenarios that the means were taken over."""
 
     @classmethod
     def load(cls) -> Published:
-        """The table that ships."""
+        """Load the table that ships."""
         text = resources.files("neuspring.data.tables").joinpath(SCORES).read_text(encoding="utf-8")
         return cls.parse(text, frozenset(released_cases()))
 
     @classmethod
     def parse(cls, text: str, scenarios: frozenset[str]) -> Published:
-        """From CSV text with the columns scenario, split, metric and value."""
+        """Parse CSV text with the columns scenario, split, metric and value."""
         scores = {}
         for row in csv.DictReader(text.splitlines()):
             task, metric = (PUBLISHED_NAMES.get(row[name], row[name]) for name in ("split", "metric"))
@@ -111,29 +118,43 @@ class Published:
         return cls(scores=scores, scenarios=scenarios)
 
     def means(self, task: str, metric: str) -> list[Reference]:
-        """Of a task and metric, the one with most digits first."""
+        """Published means of a task and metric, the one with most digits first."""
         keys = [(name, task, metric) for name in MEANS]
         return [self.scores[key] for key in keys if key in self.scores]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Tools:
+    """What the checks of every case share."""
+
+    published: Published
+    device: str = "cpu"
+    """Where checks 5 and 6 run."""
+    lpips: Lpips | str = ""
+    """The metric, or the reason why there is none."""
+
+
 def of_scores(
-    check: int, scenario: str, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
+    base: Finding, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
 ) -> list[Finding]:
-    """Findings for tidy scores of one scenario; `missing` says of a metric why it has none."""
-    found = {(row["task"], row["metric"]): row for row in scores.to_dict("records")}
+    """Findings for tidy scores of one scenario, with check, scenario and file of `base`.
+
+    `missing`: metric -> the reason why it has no score.
+    """
+    rows = {(row["task"], row["metric"]): row for row in scores.to_dict("records")}
     findings = []
     for metric in metrics:
-        base = Finding(check=check, scenario=scenario, quantity=metric, unit=UNITS[metric])
+        blank = replace(base, quantity=metric, unit=UNITS[metric])
         if metric in missing:
-            findings.append(replace(base, outcome="skipped", note=missing[metric]))
+            findings.append(replace(blank, outcome="skipped", note=missing[metric]))
             continue
         for task in TASKS:
-            if (task, metric) not in found:
-                findings.append(replace(base, task=task, outcome="skipped", note="no frame has it"))
+            if (task, metric) not in rows:
+                findings.append(replace(blank, task=task, outcome="skipped", note="no frame has it"))
                 continue
-            row = found[task, metric]
-            scored = replace(base, task=task, ours=float(row["value"]), frames=int(row["frames"]))
-            findings.append(_judged(scored, published.scores.get((scenario, task, metric))))
+            row = rows[task, metric]
+            score = replace(blank, task=task, ours=float(row["value"]), frames=int(row["frames"]))
+            findings.append(_judged(score, published.scores.get((base.scenario, task, metric))))
     return findings
 
 
@@ -144,7 +165,7 @@ def _judged(score: Finding, reference: Reference | None) -> Finding:
 
 
 def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]:
-    """Findings about means over scenarios; only the complete set can be held against the published ones."""
+    """Findings about means over scenarios. Only means over the complete set are compared with the published ones."""
     rows = [
         {"check": f.check, "scenario": f.scenario, "seed": 0, "task": f.task, "metric": f.quantity, "value": f.ours}
         | {"frames": f.frames}
@@ -154,26 +175,31 @@ def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]
     if not rows:
         return []
     table = pd.DataFrame(rows)
-    found = []
+    means = []
     for row in averages(table, by=("check", "task", "metric")).to_dict("records"):
-        part = table[(table["check"] == row["check"]) & (table["task"] == row["task"]) & (table["metric"] == row["metric"])]
-        weighted = row["metric"] in FRAME_WEIGHTED
-        references = published.means(row["task"], row["metric"])
-        whole = frozenset(part["scenario"]) == published.scenarios
-        note = f"{'frame' if weighted else 'scenario'}-weighted over {len(part)} scenarios"
-        if references and not whole:
-            note += f"; published {references[0].value:g} over {len(published.scenarios)}"
-        elif len(references) > 1:
-            note += f"; paper: {references[1].value:g}"
-        mean = Finding(
-            check=row["check"],
-            scenario=MEAN,
-            quantity=row["metric"],
-            unit=UNITS[row["metric"]],
-            task=row["task"],
-            ours=float(row["frames" if weighted else "equal"]),
-            frames=int(part["frames"].sum()),
-            note=note,
-        )
-        found.append(_judged(mean, references[0] if references and whole else None))
-    return found
+        same = (table["check"] == row["check"]) & (table["task"] == row["task"]) & (table["metric"] == row["metric"])
+        means.append(_mean(row, table[same], published))
+    return means
+
+
+def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) -> Finding:
+    """The mean of one metric in one task; `row` is its average, `scores` are the scores of the scenarios."""
+    weighted = row["metric"] in FRAME_WEIGHTED
+    references = published.means(row["task"], row["metric"])
+    whole = frozenset(scores["scenario"]) == published.scenarios
+    note = f"{'frame' if weighted else 'scenario'}-weighted over {len(scores)} scenarios"
+    if references and not whole:
+        note += f"; published {references[0].value:g} over {len(published.scenarios)}"
+    elif len(references) > 1:
+        note += f"; paper: {references[1].value:g}"
+    mean = Finding(
+        check=row["check"],
+        scenario=MEAN,
+        quantity=row["metric"],
+        unit=UNITS[row["metric"]],
+        task=row["task"],
+        ours=float(row["frames" if weighted else "equal"]),
+        frames=int(scores["frames"].sum()),
+        note=note,
+    )
+    return _judged(mean, references[0] if references and whole else None)

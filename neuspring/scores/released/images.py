@@ -28,7 +28,7 @@ from neuspring.data.released import (
 from neuspring.scores import images as image_metrics
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
-from neuspring.scores.released.findings import Absent, Finding, Published, of_scores, require
+from neuspring.scores.released.findings import Absent, Finding, Tools, of_scores, require
 from neuspring.splats.draw import COVERED, moved, picture, view_of
 from neuspring.splats.model import Splats
 from neuspring.splats.train import restricted
@@ -43,50 +43,54 @@ RELEASED = Images(
 )
 """How the released pictures were made and scored: first view, every quirk."""
 LIFTED = 1e-4
-"""m: lifted as they were, points come back but for rounding; otherwise the nearest lifted point is about a millimetre off."""
+"""m: points lifted with the right principal point come back but for rounding; with the other, the nearest is about 1 mm off."""
 TRUE, MIRRORED = "c_x", "W - c_x"
 
 
-def deprojection(case: Released, seen: Observations) -> list[Finding]:
-    """Check 4: the tracked pixels of frame 0 lifted with either principal point; one of them must give the released points."""
+def deprojection(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+    """Check 4: lifting the tracked pixels of frame 0 with one of two principal points must give the released points.
+
+    Every released point of frame 0 must have a lifted one close to it, over all cameras. The converse would not hold: the released
+    processing drops lifted points.
+    """
     require(case.root, case.folder / phystwin.METADATA, case.folder / CALIBRATION)
     cameras = read_cameras(case.folder)
     require(case.root, *(path for c in cameras for path in (case.pixel_tracks(c.name), case.first_depth(c.name))))
-    raw = {c.name: (visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name))) for c in cameras}
+    raw = {c.name: (visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name), c)) for c in cameras}
     residuals = {}
     for convention, used in ((TRUE, cameras), (MIRRORED, [mirrored(c) for c in cameras])):
         lifted = np.concatenate([gated_lift(camera, *raw[camera.name]) for camera in used])
         if not len(lifted):
             raise Absent("no tracked pixel of frame 0 has a depth within the gate")
-        residuals[convention] = float(np.median(cKDTree(lifted).query(seen.object_points[0])[0]))
+        residuals[convention] = float(np.median(cKDTree(lifted).query(observations.object_points[0])[0]))
     if max(residuals.values()) <= LIFTED:
         raise Absent(f"c_x and W - c_x give the same points: {residuals[TRUE]:.3g} and {residuals[MIRRORED]:.3g} m")
     better = min(residuals, key=lambda name: residuals[name])
-    found = []
+    findings = []
     for convention, residual in residuals.items():
         quantity = f"distance to the points lifted with {convention}"
-        finding = Finding(check=4, scenario=case.name, quantity=quantity, unit="m", ours=residual)
+        file = case.pixel_tracks(cameras[0].name)
+        finding = Finding(check=4, scenario=case.name, quantity=quantity, unit="m", ours=residual, file=file)
         if convention == better:
             note = f"the data follow {convention}" if residual <= LIFTED else "neither fits"
             finding = replace(finding, note=note).against(0.0, LIFTED)
-        found.append(finding)
-    return found
+        findings.append(finding)
+    return findings
 
 
-def renderer(case: Released, seen: Observations, lpips: Lpips | str, device: str, published: Published) -> list[Finding]:
-    """Check 5: the released splats moved by the released prediction, drawn and scored as released.
-
-    `lpips` is the metric, or why there is none.
-    """
+def renderer(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
+    """Check 5: the released splats, moved by the released prediction, drawn and scored as released."""
     calibration = (case.folder / phystwin.METADATA, case.folder / CALIBRATION)
     require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colours, *calibration)
-    rows = frame_scores(case, seen, lpips, device)
-    scores = metrics.score_images(rows, seen.scenario, seen.scenario.frame_count, "released", 0)
-    missing = {"lpips": f"not computed: {lpips}"} if isinstance(lpips, str) else {}
-    return of_scores(5, case.name, scores, SCORED, published, missing)
+    rows = frame_scores(case, observations, tools.lpips, tools.device)
+    scores = metrics.score_images(rows, observations.scenario, observations.scenario.frame_count, "released", 0)
+    missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
+    return of_scores(Finding(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
 
 
-def frame_scores(case: Released, seen: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED) -> pd.DataFrame:
+def frame_scores(
+    case: Released, observations: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED
+) -> pd.DataFrame:
     """Columns frame, camera, metric, value of every frame but the first, seen by the first camera."""
     cameras = read_cameras(case.folder)
     if len(cameras) < 2:
@@ -94,7 +98,7 @@ def frame_scores(case: Released, seen: Observations, lpips: Lpips | str, device:
     camera, borrowed = cameras[0], cameras[1] if images.released_quirks.second_camera_intrinsics else None
     view = view_of(camera, images, device, borrowed)
     splats = restricted(Splats.load(case.splats), images.opacity)
-    positions = read_prediction(case.prediction, seen.scenario.frame_count, len(seen.nodes))
+    positions = read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
     progress = Progress(f"pictures {case.name}", len(positions))
     rows = []
     for frame, gaussians in enumerate(moved(splats, positions, images, device)):
@@ -111,12 +115,14 @@ def _scores(
 ) -> dict[str, float]:
     name, quirks = f"{frame}.png", images.released_quirks
     observed = read_picture(case.colours / name, camera)
-    mask = read_picture(case.object_masks / name, camera, grey=True)
-    human = read_picture(case.human_masks / name, camera, grey=True)
+    mask = read_picture(case.object_masks / name, camera, gray=True)
+    human = read_picture(case.human_masks / name, camera, gray=True)
     truth, prediction = image_metrics.masked_pair(observed, mask, rendered, human)
-    found = {
+    scores = {
         "psnr": float(image_metrics.psnr(prediction, truth)),
         "ssim": float(image_metrics.ssim(prediction, truth)),
         "iou": image_metrics.iou(*image_metrics.silhouettes(mask, rendered, human, 1 if quirks.any_alpha else COVERED)),
     }
-    return found if isinstance(lpips, str) else found | {"lpips": float(lpips(prediction, truth, released_range=quirks.unit_lpips))}
+    if not isinstance(lpips, str):
+        scores["lpips"] = float(lpips(prediction, truth, released_range=quirks.unit_lpips))
+    return scores

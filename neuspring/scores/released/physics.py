@@ -1,4 +1,4 @@
-"""Checks 2, 3 and 6: springs rebuilt from the searched parameters, scores of the released prediction, replay of the checkpoint."""
+"""Checks 1, 2, 3 and 6: the released case, its springs, the scores of its prediction, and the replay of its checkpoint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neuspring.data import phystwin
 from neuspring.data.cases import released_cases
 from neuspring.data.released import Checkpoint, Released, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
-from neuspring.scores.released.findings import Finding, Published, of_scores, require
+from neuspring.scores.released.findings import Finding, Tools, of_scores, require
 from neuspring.twin.rollout import simulate
 from neuspring.twin.search import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.topology import uniform_topology
@@ -23,64 +23,101 @@ DISTANCES = ("chamfer", "track_error")
 POSITION = 2e-5
 """m, mean over nodes: within this, recorded clips of the released simulator are followed."""
 SPREAD = 10.0
-"""A replay may differ from the released one by so many times what the order of additions alone changes: on a GPU that order is not
-defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
+"""A replay may differ from the released one by this many times the effect of the order of additions alone: on a GPU that order is
+not defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
 
 
-def topology(case: Released, seen: Observations) -> list[Finding]:
-    """Check 2: as many springs, and between object nodes, as the checkpoint has, and as are known of the case."""
+def sizes(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+    """Check 1: sizes of the case against the table of released cases."""
+    row = released_cases().get(case.name)
+    quantities = {
+        "frames": observations.scenario.frame_count,
+        "train_end": observations.scenario.train_end,
+        "object_points": observations.object_points.shape[1],
+        "nodes": len(observations.nodes),
+    }
+    findings = []
+    for name, count in quantities.items():
+        finding = Finding(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / phystwin.FINAL_DATA)
+        if row is None:
+            finding = replace(finding, note="not one of the 22 released cases")
+        elif row[name]:
+            finding = replace(finding, note="against the table of released cases").against(int(row[name]), 0)
+        findings.append(finding)
+    return findings
+
+
+def first_frame(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+    """Check 1: frame 0 of the released prediction is [object_points[0] | surface_points | interior_points] in float32."""
+    positions = _prediction(case, observations)
+    different = np.flatnonzero((positions[0] != observations.nodes).any(axis=1))
+    note = "frame 0 must equal [object_points[0] | surface_points | interior_points] in float32"
+    if len(different):
+        largest = float(np.abs(positions[0] - observations.nodes).max())
+        note += f"; first other node {different[0]}, largest difference {largest:.3g} m"
+    finding = Finding(check=1, scenario=case.name, quantity="other nodes in frame 0", note=note, file=case.prediction)
+    return [replace(finding, ours=len(different)).against(0, 0)]
+
+
+def topology(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+    """Check 2: the rebuilt springs against the checkpoint and the table of released cases, which also knows the best epoch."""
     require(case.root, case.parameters, case.checkpoint)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
-    rebuilt = _springs(seen, parameters)
+    rebuilt = _springs(observations, parameters)
     counts = [
         ("springs", len(rebuilt.springs), len(checkpoint.stiffness), "the checkpoint"),
         ("object springs", rebuilt.object_spring_count, checkpoint.object_springs, "the checkpoint"),
     ]
-    known = released_cases().get(case.name)
-    if known is not None:
-        counts.append(("springs", len(rebuilt.springs), int(known["springs"]), "the table of released cases"))
+    row = released_cases().get(case.name)
+    if row is not None:
+        counts.append(("springs", len(rebuilt.springs), int(row["springs"]), "the table of released cases"))
+        counts.append(("best epoch", case.epoch, int(row["best_epoch"]), "the table of released cases"))
     return [
-        Finding(check=2, scenario=case.name, quantity=name, ours=ours, note=f"against {whose}").against(theirs, 0)
-        for name, ours, theirs, whose in counts
+        Finding(check=2, scenario=case.name, quantity=name, ours=ours, note=f"against {source}", file=case.checkpoint).against(
+            theirs, 0
+        )
+        for name, ours, theirs, source in counts
     ]
 
 
-def evaluator(case: Released, seen: Observations, published: Published) -> list[Finding]:
+def evaluator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
     """Check 3: our metrics of the released prediction."""
-    require(case.root, case.prediction)
-    positions = read_prediction(case.prediction, seen.scenario.frame_count, len(seen.nodes))
+    positions = _prediction(case, observations)
     trajectory = Trajectory(positions=positions, frame_count=len(positions))
-    scores = metrics.score(trajectory, seen, "released", 0)
-    missing = {} if seen.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
-    return of_scores(3, case.name, scores, DISTANCES, published, missing)
+    scores = metrics.score(trajectory, observations, "released", 0)
+    missing = {} if observations.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
+    base = Finding(check=3, scenario=case.name, quantity="", file=case.prediction)
+    return of_scores(base, scores, DISTANCES, tools.published, missing)
 
 
-def simulator(case: Released, seen: Observations, device: str) -> list[Finding]:
-    """Check 6: replays of the checkpoint against the released prediction, dampings truncated to whole numbers as released, and not.
+def simulator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
+    """Check 6: replays of the checkpoint against the released prediction.
 
-    What the order of additions alone changes is measured by a replay with the springs in another order.
+    One replay truncates the dampings to whole numbers, as the released code does; one does not. A third with the springs in another
+    order measures the effect of the order of additions alone.
     """
-    require(case.root, case.parameters, case.checkpoint, case.prediction)
+    require(case.root, case.parameters, case.checkpoint)
+    released = _prediction(case, observations)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
-    released = read_prediction(case.prediction, seen.scenario.frame_count, len(seen.nodes))
-    twin = released_twin(seen, parameters, checkpoint, case)
+    twin = released_twin(observations, parameters, checkpoint, case)
     truncated = damped(twin, *(float(int(parameters[key])) for key in ("drag_damping", "dashpot_damping")))
-    first = replay(truncated, seen.controller_points, device, case.name)
-    second = replay(_reordered(truncated), seen.controller_points, device, f"{case.name}, other order")
-    exact = replay(twin, seen.controller_points, device, f"{case.name}, float damping")
+    device = tools.device
+    first = replay(truncated, observations.controller_points, device, case.name)
+    second = replay(_reordered(truncated), observations.controller_points, device, f"{case.name}, other order")
+    exact = replay(twin, observations.controller_points, device, f"{case.name}, float damping")
     order = _apart(first.positions, second.positions).mean(axis=1)
-    found = [*_replayed(case.name, "dampings truncated", first, released, order)]
-    found.append(_largest(case.name, "mean distance of nodes, springs in another order", order))
+    findings = _replayed(case.name, "dampings truncated", first, released, order)
+    findings.append(_largest(case.name, "mean distance of nodes, springs in another order", order))
     whole = truncated.material.drag == twin.material.drag and np.array_equal(truncated.material.dashpot, twin.material.dashpot)
     note = "both dampings are whole numbers: the same replay" if whole else ""
     for name, values in _distances("float dampings", _apart(exact.positions, released)).items():
-        found.append(_largest(case.name, name, values, "; ".join(filter(None, (note, exact.reason)))))
-    return found
+        findings.append(_largest(case.name, name, values, "; ".join(filter(None, (note, exact.reason)))))
+    return findings
 
 
-def released_twin(seen: Observations, parameters: dict[str, float], checkpoint: Checkpoint, case: Released) -> Twin:
-    """The checkpoint as a twin, dampings as searched. Raises InputError where springs and checkpoint do not belong together."""
-    springs = _springs(seen, parameters)
+def released_twin(observations: Observations, parameters: dict[str, float], checkpoint: Checkpoint, case: Released) -> Twin:
+    """The checkpoint as a twin with the searched dampings. Raises InputError if springs and checkpoint do not belong together."""
+    springs = _springs(observations, parameters)
     if len(springs.springs) != len(checkpoint.stiffness):
         rule = f"one stiffness for each of the {len(springs.springs)} rebuilt springs is required"
         raise InputError(case.checkpoint, rule, len(checkpoint.stiffness), "See check 2.")
@@ -93,7 +130,7 @@ def released_twin(seen: Observations, parameters: dict[str, float], checkpoint: 
         contact_distance=parameters["collision_dist"],
         **checkpoint.contact,  # type: ignore[arg-type]
     )
-    scenario = seen.scenario
+    scenario = observations.scenario
     simulation = Simulation(
         frame_time=RELEASED_FRAME_TIME,
         substeps=RELEASED_SUBSTEPS,
@@ -111,15 +148,20 @@ def damped(twin: Twin, drag: float, dashpot: float) -> Twin:
 
 
 def replay(twin: Twin, controller_points: np.ndarray, device: str, label: str) -> Trajectory:
-    """As the released simulator would: without asking whether the substep is within our bound."""
+    """Simulate as the released simulator does: without our bound on the substep."""
     progress = Progress(f"replay {label}", len(controller_points) - 1)
     return simulate(twin, controller_points, device, progress.update)
 
 
-def _springs(seen: Observations, parameters: dict[str, float]) -> Topology:
+def _prediction(case: Released, observations: Observations) -> np.ndarray:
+    require(case.root, case.prediction)
+    return read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
+
+
+def _springs(observations: Observations, parameters: dict[str, float]) -> Topology:
     return uniform_topology(
-        seen.nodes,
-        seen.controller_points[0],
+        observations.nodes,
+        observations.controller_points[0],
         parameters["object_radius"],
         int(parameters["object_max_neighbours"]),
         parameters["controller_radius"],
@@ -154,18 +196,18 @@ def _distances(label: str, apart: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, order: np.ndarray) -> list[Finding]:
-    """The mean distance, judged in the frame where it exceeds most what is allowed there; the largest, as it is."""
+    """The mean distance, judged in its worst frame relative to the allowance there, and the largest distance, measured."""
     (name, mean), (other, largest) = _distances(label, _apart(own.positions, released)).items()
     # Until the next frame: which of two replays flips a contact first is chance.
     reached = np.maximum.accumulate(np.append(order[1:], order[-1]))
     allowed = POSITION + SPREAD * np.pad(reached, (0, len(mean) - len(order)), mode="edge")
     worst = int(np.argmax(mean / allowed))
-    rule = f"allowed: {POSITION:g} m and {SPREAD:g} times what the order of springs changes"
-    found = _at(scenario, name, mean, worst, rule).against(0.0, float(allowed[worst]))
+    rule = f"allowed: {POSITION:g} m plus {SPREAD:g} times the effect of the order of springs"
+    judged = _at(scenario, name, mean, worst, rule).against(0.0, float(allowed[worst]))
     if own.diverged_frame is not None:
-        found = replace(found, outcome="failed", note=own.reason)
+        judged = replace(judged, outcome="failed", note=own.reason)
     overflow = f"{own.collision_overflow} collision candidates did not fit" if own.collision_overflow else ""
-    return [found, _largest(scenario, other, largest, overflow)]
+    return [judged, _largest(scenario, other, largest, overflow)]
 
 
 def _largest(scenario: str, quantity: str, per_frame: np.ndarray, note: str = "") -> Finding:

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
+from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.core.progress import Progress
-from neuspring.data.departure import Case
-from neuspring.data.phystwin import FINAL_DATA, SPLIT
+from neuspring.data import phystwin
+from neuspring.data.cases import released_cases
 from neuspring.data.released import Released
-from neuspring.report.tables.summary import markdown
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.released import images, physics
-from neuspring.scores.released.conformance import read_case
-from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, of_means, require
+from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, Tools, of_means, require
 
 CHECKS = {
+    1: "sizes of the case, and frame 0 of the released prediction",
     2: "springs rebuilt from the searched parameters",
     3: "scores of the released prediction",
     4: "deprojection of the tracked pixels",
@@ -38,11 +39,13 @@ COLUMNS = (
     *("outcome", "frames", "note"),
 )
 CASES = Path("data") / "different_types"
+SELF_COLLIDING = ("cloth", "package")
+"""Released cases with one of these words in their name use the cloth configuration, in which nodes collide with each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Everything that was found."""
+    """All findings, and the report as text."""
 
     findings: tuple[Finding, ...]
     text: str
@@ -66,9 +69,9 @@ def verify_released(
 ) -> Report:
     """Check the released results below `root` (the folder that holds data, experiments, ...); write the report to folder `output`.
 
-    No scenarios: all that are there. A file that is not there skips a check of its scenario, a damaged one fails it; the others go
-    on, and the report is written after each. `published`: None for the numbers that ship. Raises InputError if there are no cases,
-    and for unknown scenarios, checks and devices.
+    `scenarios` defaults to all that are there, `published` to the table that ships. A missing file skips a check of its scenario, a
+    damaged one fails it, and the other checks go on. The report is written after every scenario. Raises InputError if there are no
+    cases, and for unknown scenarios, checks and devices.
     """
     present = _present(root)
     if unknown := [name for name in scenarios if name not in present]:
@@ -76,14 +79,18 @@ def verify_released(
     if wrong := [check for check in checks if check not in CHECKS]:
         raise InputError("--checks", f"must be of {', '.join(map(str, CHECKS))}", wrong)
     device = resolve_device(device)
-    tools = _Tools(published or Published.load(), device, _metric(lpips or LpipsWeights(), device) if 5 in checks else "")
+    metric = _metric(lpips or LpipsWeights(), device) if 5 in checks else ""
+    tools = Tools(published=published or Published.load(), device=device, lpips=metric)
     names, findings = list(dict.fromkeys(scenarios)) or present, list[Finding]()
     progress = Progress("verify", len(names), every=0.0)
     for done, name in enumerate(names, start=1):
         case = Released(root=root, name=name)
-        seen = _observations(case)
-        for check in sorted(set(checks)):
-            findings += _guarded(case, check, seen, tools)
+        observations: Observations | Exception
+        try:
+            observations = read_observations(case)
+        except (Absent, InputError) as error:
+            observations = error
+        findings += check_case(case, observations, sorted(set(checks)), tools)
         # After every scenario: all of them take hours on a CPU.
         report = _report(findings, names[:done], tools)
         _write(report, output)
@@ -91,16 +98,9 @@ def verify_released(
     return report
 
 
-@dataclass(frozen=True)
-class _Tools:
-    published: Published
-    device: str
-    lpips: Lpips | str
-
-
-def _report(findings: Sequence[Finding], names: Sequence[str], tools: _Tools) -> Report:
-    found = (*findings, *of_means(findings, tools.published))
-    return Report(findings=found, text=_text(found, names, tools.published, tools.device))
+def _report(findings: Sequence[Finding], names: Sequence[str], tools: Tools) -> Report:
+    complete = (*findings, *of_means(findings, tools.published))
+    return Report(findings=complete, text=_text(complete, names, tools.published, tools.device))
 
 
 def _metric(settings: LpipsWeights, device: str) -> Lpips | str:
@@ -119,45 +119,53 @@ def _present(root: Path) -> list[str]:
     return names
 
 
-class _Refused(Exception):
-    """The reader refuses the processed case."""
+def check_case(case: Released, observations: Observations | Exception, checks: Sequence[int], tools: Tools) -> list[Finding]:
+    """The findings of `checks` for one case. A check that cannot be carried out has one finding, skipped or failed.
+
+    `observations`: the processed case, or the exception of `read_observations`.
+    """
+    findings = list[Finding]()
+    for check in checks:
+        for function in _FUNCTIONS[check]:
+            findings += _guarded(function, check, case, observations, tools)
+    return findings
 
 
-def _observations(case: Released) -> Observations | Absent | _Refused:
-    """What the reader makes of the processed case, or why it makes nothing of it."""
+def read_observations(case: Released) -> Observations:
+    """The processed case. Raises Absent if its files are missing, InputError if the reader refuses them."""
+    require(case.root, case.folder / phystwin.FINAL_DATA, case.folder / phystwin.SPLIT)
+    row = ScenarioRow(
+        scenario=case.name,
+        source="phystwin",
+        category=released_cases().get(case.name, {}).get("category", "unknown"),
+        path=str(case.folder),
+        self_collision=any(word in case.name for word in SELF_COLLIDING),
+        ground=True,
+    )
+    return phystwin.read(row, case.folder)
+
+
+_Check = Callable[[Released, Observations, Tools], list[Finding]]
+_FUNCTIONS: dict[int, tuple[_Check, ...]] = {
+    1: (physics.sizes, physics.first_frame),
+    2: (physics.topology,),
+    3: (physics.evaluator,),
+    4: (images.deprojection,),
+    5: (images.renderer,),
+    6: (physics.simulator,),
+}
+
+
+def _guarded(function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools) -> list[Finding]:
+    blank = Finding(check=check, scenario=case.name, quantity=CHECKS[check])
     try:
-        require(case.root, case.folder / FINAL_DATA, case.folder / SPLIT)
+        if isinstance(observations, Exception):
+            raise observations
+        return function(case, observations, tools)
     except Absent as reason:
-        return reason
-    inspected = Case(case.folder, case.root)
-    seen = read_case(inspected)
-    return seen if seen is not None else _Refused(inspected.found[-1].message)
-
-
-def _guarded(case: Released, check: int, seen: Observations | Absent | _Refused, tools: _Tools) -> list[Finding]:
-    """The findings of one check; one skipped or failed finding where it cannot be carried out."""
-
-    def ended(outcome: Outcome, reason: Exception) -> list[Finding]:
-        return [Finding(check=check, scenario=case.name, quantity=CHECKS[check], outcome=outcome, note=str(reason))]
-
-    try:
-        if isinstance(seen, Exception):
-            raise seen
-        return _check(check)(case, seen, tools)
-    except Absent as reason:
-        return ended("skipped", reason)
-    except (_Refused, InputError, NumericalFailure) as error:
-        return ended("failed", error)
-
-
-def _check(number: int) -> Callable[[Released, Observations, _Tools], list[Finding]]:
-    return {
-        2: lambda case, seen, tools: physics.topology(case, seen),
-        3: lambda case, seen, tools: physics.evaluator(case, seen, tools.published),
-        4: lambda case, seen, tools: images.deprojection(case, seen),
-        5: lambda case, seen, tools: images.renderer(case, seen, tools.lpips, tools.device, tools.published),
-        6: lambda case, seen, tools: physics.simulator(case, seen, tools.device),
-    }[number]
+        return [replace(blank, outcome="skipped", note=str(reason), file=reason.file)]
+    except (InputError, NumericalFailure) as error:
+        return [replace(blank, outcome="failed", note=str(error))]
 
 
 def _write(report: Report, output: Path) -> None:

@@ -8,8 +8,7 @@ from neuspring.data.synthetic.implicit import sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
 from neuspring.data.synthetic.sensor import measured, quantised
-
-K = np.array([[100.0, 0, 59.5], [0, 100.0, 33.5], [0, 0, 1]])
+from tests.support.captures import K
 
 
 @pytest.fixture(scope="module")
@@ -74,14 +73,14 @@ def test_texture_sticks_to_the_material():
 
 def test_the_sensor_is_unbiased_noisier_far_away_and_repeatable():
     slope = np.ones((120, 160))
-    found = {}
+    deviations = {}
     for depth in (0.5, 1.3):
         values = measured(np.full(slope.shape, depth), slope, 0.001, np.random.default_rng(0)) * 0.001
         inside = values[values > 0]
         assert inside.mean() == pytest.approx(depth, abs=2e-4)
-        found[depth] = inside.std()
-    assert found[0.5] == pytest.approx(0.0008, rel=0.2)
-    assert found[1.3] == pytest.approx(0.0008 + 0.0019 * 0.9**2, rel=0.2)
+        deviations[depth] = inside.std()
+    assert deviations[0.5] == pytest.approx(0.0008, rel=0.2)
+    assert deviations[1.3] == pytest.approx(0.0008 + 0.0019 * 0.9**2, rel=0.2)
     again = [measured(np.full(slope.shape, 0.5), slope, 0.001, np.random.default_rng(3)) for _ in range(2)]
     np.testing.assert_array_equal(*again)
 

@@ -13,16 +13,16 @@ SCENES = [f"{shape}/{motion}/{field}" for shape in toy.SHAPES for motion in toy.
 
 @pytest.mark.parametrize("path", SCENES)
 def test_every_scene_is_a_valid_capture_with_its_truth(path):
-    made = small.scene(path, frames=5)
-    nodes = made.observations.nodes
-    assert nodes.shape == made.truth.topology.nodes.shape
+    scene = small.scene(path, frames=5)
+    nodes = scene.observations.nodes
+    assert nodes.shape == scene.truth.topology.nodes.shape
     # Without noise the observed rest state is the true one.
-    np.testing.assert_array_equal(nodes, made.truth.topology.nodes)
-    log_stiffness = np.log2(made.truth.material.stiffness)
+    np.testing.assert_array_equal(nodes, scene.truth.topology.nodes)
+    log_stiffness = np.log2(scene.truth.material.stiffness)
     assert np.ptp(log_stiffness) == pytest.approx(2.0, abs=0.02)
     # Every node hangs on a spring, and the hands hold the body.
-    assert set(range(len(nodes))) <= set(made.truth.topology.springs.ravel().tolist())
-    assert made.truth.topology.object_spring_count < len(made.truth.topology.springs)
+    assert set(range(len(nodes))) <= set(scene.truth.topology.springs.ravel().tolist())
+    assert scene.truth.topology.object_spring_count < len(scene.truth.topology.springs)
 
 
 def test_the_same_seed_gives_the_same_capture_and_another_seed_does_not():
@@ -34,15 +34,15 @@ def test_the_same_seed_gives_the_same_capture_and_another_seed_does_not():
 
 
 def test_noise_and_occlusion_are_as_configured():
-    made = small.scene(noise=0.002, occlusion=0.3, frames=20)
-    seen = made.observations.object_visibility
-    assert seen[0].all()
-    assert 0.3 <= 1 - seen.mean() < 0.6  # runs of 3 to 7 frames overshoot the fraction, never undershoot
-    assert (made.observations.object_points[~seen] == 0).all()
-    error = (made.observations.object_points - made.motion[:, : seen.shape[1]])[seen]
+    scene = small.scene(noise=0.002, occlusion=0.3, frames=20)
+    visible = scene.observations.object_visibility
+    assert visible[0].all()
+    assert 0.3 <= 1 - visible.mean() < 0.6  # runs of 3 to 7 frames overshoot the fraction, never undershoot
+    assert (scene.observations.object_points[~visible] == 0).all()
+    error = (scene.observations.object_points - scene.motion[:, : visible.shape[1]])[visible]
     assert error.std() == pytest.approx(0.002, rel=0.1)
-    valid = made.observations.object_motion_valid
-    np.testing.assert_array_equal(valid[:-1], seen[:-1] & seen[1:])
+    valid = scene.observations.object_motion_valid
+    np.testing.assert_array_equal(valid[:-1], visible[:-1] & visible[1:])
     assert not valid[-1].any()
 
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Jobs of Snakemake as Jobs of Kubernetes, through kubectl: `pods.py submit SCRIPT`, `pods.py status NAME`, `pods.py NAME...`.
 
-Snakemake's cluster-generic executor calls these to submit a job, to ask for its state, and (names alone) to cancel jobs. The part that
-all jobs share is in job.yaml.
+Snakemake's cluster-generic executor calls these to submit a job, to ask for its state, and (names alone) to cancel jobs. The
+part that all jobs share is in job.yaml.
 """
 
 import json

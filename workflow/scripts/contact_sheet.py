@@ -1,11 +1,10 @@
 """First, middle and last frame of every capture in a results folder, and what each took: time, disk, numerics.
 
-python -m tests.benchmarks.contact_sheet results/synthetic results/published/synthetic
+python workflow/scripts/contact_sheet.py results/synthetic results/published/synthetic
 """
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from neuspring.core.job_records import FOLDER, JobRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.synthetic.truth import Truth, truth_path
 
@@ -22,7 +22,7 @@ COLUMNS = 2
 
 
 def strip(capture: Capture) -> np.ndarray:
-    """Three frames of the first camera beside each other under the scene's name."""
+    """Three frames of the first camera side by side, under the scene's name."""
     camera = next(iter(capture.cameras))
     frames = [0, capture.frame_count // 2, capture.frame_count - 1]
     images = [cv2.resize(capture.colour(camera, frame), SIZE, interpolation=cv2.INTER_AREA) for frame in frames]
@@ -33,11 +33,10 @@ def strip(capture: Capture) -> np.ndarray:
 
 
 def facts(capture: Capture, results: Path) -> dict[str, object]:
-    """What a capture took, from its files and the workflow's own timing."""
+    """What a capture took, from its files and the record of its job."""
     folder = capture.folder.parent
     truth = Truth.load(truth_path(capture.folder))
-    with (results / "benchmarks" / "capture" / f"{folder.name}.tsv").open() as file:
-        seconds = float(next(csv.DictReader(file, delimiter="\t"))["s"])
+    record = JobRecord.load(results / FOLDER / "capture" / f"{folder.name}.json")
     size = sum(path.stat().st_size for path in capture.folder.rglob("*") if path.is_file())
     return {
         "scenario": folder.name,
@@ -48,12 +47,13 @@ def facts(capture: Capture, results: Path) -> dict[str, object]:
         "certificate_mm": round(1e3 * truth.certificate, 4),
         "sensitivity_mm": round(1e3 * truth.sensitivity, 4),
         "least_jacobian": round(float(truth.least_jacobian.min()), 3),
-        "seconds": round(seconds, 1),
+        "seconds": round(record.last.seconds, 1),
         "megabytes": round(size / 1e6, 1),
     }
 
 
 def main(results: Path, output: Path) -> None:
+    """Write contact_sheet.jpg and captures.csv to `output`."""
     captures = [Capture.load(path.parent) for path in sorted(results.glob(f"*/capture/{CAPTURE}"))]
     strips = [strip(capture) for capture in captures]
     blank = np.full_like(strips[0], 255)
