@@ -56,7 +56,7 @@ def verify_released_options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring verify-released`."""
     parser.add_argument("data_root", type=Path, help="folder that holds data, experiments and the other released folders")
     parser.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
-    checks = "1 table points, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
+    checks = "1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
     parser.add_argument("--checks", nargs="+", type=int, help=checks)
     shared.add_settings(parser)
     shared.add_device(parser)
