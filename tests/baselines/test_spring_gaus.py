@@ -229,11 +229,11 @@ def test_damping_that_is_clamped_can_come_back():
 
     settings = replace(SMALL, iterations=1, damping_rate=0.01)
     training = Training(Problem(start, hands.astype(np.float32), objective, settings))
-    training.iteration(0)
+    training.epoch(0)
     first = training.values["theta"].item()
     sign[0] = -sign[0]
     for number in range(1, 12):
-        training.iteration(number)
+        training.epoch(number)
     found = [first, training.values["theta"].item()]
     assert min(found) >= 1.0 and max(found) > 1.0
 

@@ -16,17 +16,17 @@ from neuspring.core.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamicsModel(Artifact):
-    """Knows no object: it moves whatever structure points it is given."""
+    """Knows no object: it moves the structure points of any scenario."""
 
     kind: ClassVar[str] = "gs_dynamics"
-    weights: np.ndarray = array("W", np.float32, "1", "matrices and biases of the network, in the order of network.layers")
+    weights: np.ndarray = array("W", np.float32, "1", "parameters of network.Dynamics in their order")
     rules: Rules
 
     def check(self) -> None:
-        wanted = weight_count(self.rules)
-        if len(self.weights) != wanted:
-            raise InputError("gs_dynamics.weights", f"{wanted} weights are required", len(self.weights))
+        count = weight_count(self.rules)
+        if len(self.weights) != count:
+            raise InputError("gs_dynamics.weights", f"{count} weights are required", len(self.weights))
 
     def dynamics(self, device: str) -> Dynamics:
         """The network on a device."""
-        return Dynamics(self.rules, torch.tensor(self.weights, device=device))
+        return Dynamics.of(self.rules, torch.tensor(self.weights, device=device))
