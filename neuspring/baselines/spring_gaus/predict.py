@@ -16,7 +16,7 @@ from neuspring.core.artifacts import Observations, Trajectory
 @torch.no_grad()
 def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tuple[torch.Tensor, str]:
     """Anchors [F, N, 3], m, under controllers [T, C, 3], m, from frame 0; and why F < T: empty where it is not."""
-    solver = AnchorSolver(model.graph, model.physics, model.substeps, device)
+    solver = AnchorSolver(model, model, model.substeps, device)
     parameters = model.parameters(model.tensors(device))
     start, hands = torch.tensor(model.velocity, device=device), torch.tensor(controllers, dtype=torch.float32, device=device)
     x = torch.tensor(model.anchors, device=device)

@@ -69,7 +69,7 @@ def problem(
     cloud = seen.splats.means if seen and chosen.supervision == "masks" else observations.nodes
     anchors = choose_anchors(cloud, chosen.anchors, CELLS, np.random.default_rng(seed))
     hands = observations.controller_points[: scenario.train_end]
-    graph = AnchorGraph.of(anchors, hands[0], chosen.neighbours, chosen.link_reach, chosen.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], chosen.neighbours, chosen.link_reach, chosen.link_count)
     up = 1.0 if scenario.up == "+z" else -1.0
     start = SpringGausModel.start(
         graph,

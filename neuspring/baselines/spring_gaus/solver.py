@@ -17,9 +17,9 @@ PACKED = ("stiffness", "soft", "scalars")
 ADJOINTS = ("adj_x", "adj_v", *(f"adj_{name}" for name in PACKED))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AnchorPhysics:
-    """What does not change while a model is trained."""
+    """Constants of the motion: they are not trained."""
 
     frame_time: float
     """s."""
@@ -65,11 +65,11 @@ class AnchorSolver:
         vec3 = wp.types.vector(3, self._real)
         self.count, ranks = graph.neighbours.shape
         controllers = int(graph.links.max(initial=-1)) + 1
-        self._graph = {
-            name: wp.array(values, dtype=wp.int32 if values.dtype.kind == "i" else self._real, device=device)
-            for name, values in vars(graph).items()
-            if name != "anchors"
-        }
+        self._graph: dict[str, Any] = {}
+        for name in ("neighbours", "lengths", "link_starts", "links", "link_lengths"):
+            values = getattr(graph, name)
+            kind = wp.int32 if values.dtype.kind == "i" else self._real
+            self._graph[name] = wp.array(values, dtype=kind, device=device)
         self._buffers: dict[str, torch.Tensor] = {}
         self._views: dict[str, Any] = {}
         for name in ("x", "v", "adj_x", "adj_v"):

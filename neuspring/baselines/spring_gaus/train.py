@@ -52,7 +52,7 @@ class Training:
         self.problem, settings = problem, problem.settings
         model, device = problem.start, problem.device
         self.values = {name: tensor.requires_grad_() for name, tensor in model.tensors(device).items()}
-        self.solver = AnchorSolver(model.graph, model.physics, settings.substeps, device)
+        self.solver = AnchorSolver(model, model, settings.substeps, device)
         rates = {
             "kappa": settings.stiffness_rate,
             "soft": settings.soft_rate,
@@ -109,7 +109,7 @@ class Training:
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
         model = self.problem.start
-        self.solver = AnchorSolver(model.graph, model.physics, count, self.problem.device)
+        self.solver = AnchorSolver(model, model, count, self.problem.device)
 
     @property
     def substeps(self) -> int:
