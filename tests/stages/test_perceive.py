@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config import Config, ScenarioRow
-from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling, Segmentation
+from neuspring.config import ScenarioRow
+from neuspring.config.perception import Lift, Segmentation
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
@@ -17,30 +17,8 @@ from neuspring.data.capture import Capture
 from neuspring.stages import perceive, stages
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
 from tests.support.phystwin_case import dump, write_json
-
-ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
-SETTINGS = Config(
-    scenarios=("film",),
-    perception=Perception(
-        track=PointTracking(opencv=OpenCvTracking(points=400)),
-        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
-        sample=Sampling(voxel=0.015),
-    ),
-)
-
-
-def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
-    """All steps through their records, as the workflow calls them."""
-    masks, tracks = [], []
-    for camera in capture.cameras:
-        masks.append(folder / camera / "masks.json")
-        tracks.append(folder / camera / "tracks.json")
-        masks[-1].parent.mkdir(parents=True)
-        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
-        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
-    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
-    return Observations.load(folder / "observations.npz")
+from tests.support.pictured import FILMED as SETTINGS
+from tests.support.pictured import ROW, perceived
 
 
 @pytest.fixture(scope="module")

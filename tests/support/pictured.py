@@ -1,0 +1,84 @@
+"""A filmed scene with its perception, and the steps of appearance on it, for tests that need pictures."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+
+from neuspring.config import Config, ScenarioRow
+from neuspring.config.images import Appearance, Images
+from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling
+from neuspring.core.artifacts import Observations, Trajectory
+from neuspring.core.records import StageRecord, Stopwatch
+from neuspring.data.capture import Capture
+from neuspring.stages import appearance, perceive, stages
+from tests.support.filmed import FRAMES
+
+ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
+FILMED = Config(
+    scenarios=("film",),
+    perception=Perception(
+        track=PointTracking(opencv=OpenCvTracking(points=400)),
+        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
+        sample=Sampling(voxel=0.015),
+    ),
+)
+
+
+def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config = FILMED) -> Observations:
+    """All steps through their records, as the workflow calls them."""
+    masks, tracks = [], []
+    for camera in capture.cameras:
+        masks.append(folder / camera / "masks.json")
+        tracks.append(folder / camera / "tracks.json")
+        masks[-1].parent.mkdir(parents=True)
+        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
+        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
+    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
+    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
+    return Observations.load(folder / "observations.npz")
+
+
+IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
+
+
+def pictured(**changes: object) -> Config:
+    return dataclasses.replace(FILMED, images=dataclasses.replace(IMAGES, **changes))
+
+
+class Scene:
+    """A filmed scene with its perception, and what the steps of appearance make of it."""
+
+    def __init__(self, capture: Capture, folder) -> None:
+        self.capture, self.folder = capture, folder
+        self.observations = perceived(capture, folder)
+        self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
+        self.appearance = folder / "appearance" / "appearance.json"
+
+    def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
+        self.appearance.parent.mkdir(exist_ok=True)
+        lifted = self.folder / "lifted.json"
+        appearance.learn(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
+        return StageRecord.load(self.appearance)
+
+    def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
+        """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
+        path = self.folder / name / "rollout.json"
+        path.parent.mkdir(exist_ok=True)
+        nodes = self.observations.nodes
+        positions = nodes + np.arange(frames)[:, None, None] * step
+        ended = {} if frames == FRAMES else {"diverged_frame": frames, "reason": "test"}
+        Trajectory(positions=positions, frame_count=FRAMES, **ended).save(path.with_name("trajectory.npz"))
+        status = "ok" if frames == FRAMES else "failed"
+        record = Stopwatch().stage(
+            "rollout", status, {"trajectory": path.with_name("trajectory.npz")}, reason="" if status == "ok" else "rollout: test"
+        )
+        record.save(path)
+        return path
+
+    def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
+        output = rollout.with_name("render.json")
+        paths = (self.masks, self.folder / "observations.npz", self.appearance, rollout)
+        appearance.render(self.capture.folder, *paths, chosen, "cpu", output)
+        record = StageRecord.load(output)
+        return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None
