@@ -14,7 +14,7 @@ from neuspring.config.gs_dynamics import GsDynamics
 
 
 def moved(tools: np.ndarray, before: int, after: int) -> float:
-    """The largest distance, m, of any of tools [T, C, 3] between two frames."""
+    """The largest motion, m, of any of the tools [T, C, 3] between two frames."""
     return float(np.linalg.norm(tools[after] - tools[before], axis=1).max())
 
 
