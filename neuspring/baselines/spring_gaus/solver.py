@@ -9,12 +9,11 @@ import torch
 import warp as wp
 
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
-from neuspring.baselines.spring_gaus.kernels import substep_kernels
+from neuspring.baselines.spring_gaus.kernels import kernels
 from neuspring.core.device import load, start_warp
 
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them, see `AnchorParameters.tensors`."""
-ADJOINTS = ("adj_x", "adj_v", *(f"adj_{name}" for name in PACKED))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,31 +60,35 @@ class AnchorSolver:
     ) -> None:
         start_warp()
         self.physics, self.substeps, self.device, self.dtype = physics, substeps, device, dtype
-        self._real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
-        vec3 = wp.types.vector(3, self._real)
+        self._real = real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
+        self._kernels = kernels(real)
+        vec3 = wp.types.vector(3, real)
         self.count, ranks = graph.neighbours.shape
         controllers = int(graph.links.max(initial=-1)) + 1
-        self._graph: dict[str, Any] = {}
+        self._buffers: dict[str, torch.Tensor] = {}
+        self._state, self._adjoint, self._model = self._kernels.State(), self._kernels.State(), self._kernels.Model()
+        for struct, prefix in ((self._state, ""), (self._adjoint, "adj_")):
+            for name in ("x", "v"):
+                setattr(struct, name, self._allocate(prefix + name, (substeps + 1, self.count, 3), vec3))
+            for name, size in zip(PACKED, (self.count, ranks, 2), strict=True):
+                setattr(struct, name, self._allocate(prefix + name, (size,), real))
+        for name in ("begin", "end"):
+            setattr(self._model, name, self._allocate(name, (controllers, 3), vec3))
         for name in ("neighbours", "lengths", "link_starts", "links", "link_lengths"):
             values = getattr(graph, name)
-            kind = wp.int32 if values.dtype.kind == "i" else self._real
-            self._graph[name] = wp.array(values, dtype=kind, device=device)
-        self._buffers: dict[str, torch.Tensor] = {}
-        self._views: dict[str, Any] = {}
-        for name in ("x", "v", "adj_x", "adj_v"):
-            self._allocate(name, (substeps + 1, self.count, 3), vec3)
-        for name in ("begin", "end"):
-            self._allocate(name, (controllers, 3), vec3)
-        for name, size in zip(PACKED, (self.count, ranks, 2), strict=True):
-            self._allocate(name, (size,), self._real)
-            self._allocate(f"adj_{name}", (size,), self._real)
+            kind = wp.int32 if values.dtype.kind == "i" else real
+            setattr(self._model, name, wp.array(values, dtype=kind, device=device))
+        self._model.exponent, self._model.link_stiffness = physics.exponent, physics.link_stiffness
+        self._model.substep = physics.frame_time / substeps
+        self._model.gravity, self._model.up = -physics.up_sign * physics.gravity, physics.up_sign
+        self._model.ground = int(physics.ground)
         self._captured: dict[bool, Any] = {}
         self.frame_token = 0
         """Number of the frame whose substeps are in the buffers."""
 
-    def _allocate(self, name: str, shape: tuple[int, ...], kind: Any) -> None:
+    def _allocate(self, name: str, shape: tuple[int, ...], kind: Any) -> Any:
         self._buffers[name] = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        self._views[name] = wp.from_torch(self._buffers[name], dtype=kind)
+        return wp.from_torch(self._buffers[name], dtype=kind)
 
     def frame(
         self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
@@ -112,39 +115,24 @@ class AnchorSolver:
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> list[torch.Tensor]:
         """Adjoints of the last forward frame: dL/d(x, v, stiffness, soft, scalars)."""
         b = self._buffers
-        for name in ADJOINTS:
-            b[name].zero_()
+        for name in ("x", "v", *PACKED):
+            b[f"adj_{name}"].zero_()
         b["adj_x"][-1], b["adj_v"][-1] = adj_x, adj_v
         self._launch(backward=True)
         return [b["adj_x"][0].clone(), b["adj_v"][0].clone(), *(b[f"adj_{name}"].clone() for name in PACKED)]
 
     def _launch(self, *, backward: bool) -> None:
         if backward not in self._captured:
-            kernel = load(substep_kernels(self._real)[backward], self.device)
+            kernel = load(self._kernels.adjoint if backward else self._kernels.substep, self.device)
+            structs = (self._state, self._model, self._adjoint) if backward else (self._state, self._model)
             with wp.ScopedCapture(device=self.device) as capture:
                 for substep in reversed(range(self.substeps)) if backward else range(self.substeps):
-                    wp.launch(kernel, self.count, self._arguments(substep, backward), device=self.device)
+                    fraction = self._real((substep + 1) / self.substeps)
+                    wp.launch(kernel, self.count, [substep, fraction, *structs], device=self.device)
             self._captured[backward] = capture.graph
         # Torch orders its own work on its current stream, so the graph must run there too.
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device != "cpu" else None
         wp.capture_launch(self._captured[backward], stream=stream)
-
-    def _arguments(self, substep: int, backward: bool) -> list[Any]:
-        views, graph, real, physics = self._views, self._graph, self._real, self.physics
-        return [
-            *(views["x"], views["v"], substep),
-            *(views["begin"], views["end"], real((substep + 1) / self.substeps)),
-            *(graph["neighbours"], graph["lengths"]),
-            *(views[name] for name in PACKED),
-            real(physics.exponent),
-            *(graph["link_starts"], graph["links"], graph["link_lengths"]),
-            real(physics.link_stiffness),
-            real(physics.frame_time / self.substeps),
-            real(-physics.up_sign * physics.gravity),
-            real(physics.up_sign),
-            int(physics.ground),
-            *(views[name] for name in ADJOINTS if backward),
-        ]
 
 
 class _Frame(torch.autograd.Function):
