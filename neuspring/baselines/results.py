@@ -54,26 +54,17 @@ class TrainingStopped(ArithmeticError):
 
 
 class Training(Protocol[TrainedModel]):
-    """What `run_epochs` asks of a training."""
+    """What `run_epochs` asks of a training. `epoch` returns metrics; `facts` is given the number of complete epochs."""
 
-    def epoch(self, number: int) -> dict[str, float]:
-        """Run one epoch; returns its metrics. Raises TrainingStopped."""
-
-    def model(self) -> TrainedModel:
-        """The model at the end, also after TrainingStopped."""
-
-    def facts(self, epochs: int) -> dict[str, Any]:
-        """Facts for the record after so many epochs."""
-
-    def checkpoint(self) -> Checkpoint:
-        """Everything that a continued training needs."""
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint."""
+    def epoch(self, number: int) -> dict[str, float]: ...
+    def model(self) -> TrainedModel: ...
+    def facts(self, epochs: int) -> dict[str, Any]: ...
+    def checkpoint(self) -> Checkpoint: ...
+    def restore(self, checkpoint: Checkpoint) -> None: ...
 
 
 def run_epochs(training: Training[Model], loop: TrainingLoop, metrics: Sequence[str], failure: str = "") -> Trained[Model]:
-    """Train for the epochs of the loop, or until TrainingStopped, which becomes the failure."""
+    """Train for the epochs of the loop, or until `epoch` raises TrainingStopped, whose text becomes the failure."""
     if loop.restored:
         training.restore(loop.restored)
     for number in loop:

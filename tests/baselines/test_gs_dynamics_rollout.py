@@ -178,6 +178,20 @@ def test_a_model_survives_its_file(tmp_path):
         GsDynamicsModel(weights=np.zeros(7), rules=RULES)
 
 
+def test_a_model_of_an_earlier_version_is_read(tmp_path, monkeypatch):
+    """Rules held the gap between hands then."""
+    plain = GsDynamicsModel._flatten
+
+    def flatten(self, arrays, prefix):
+        fields = plain(self, arrays, prefix)
+        return fields | {"rules": fields["rules"] | {"hand_gap": 0.08}}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GsDynamicsModel, "_flatten", flatten)
+        pushes(0.005).save(tmp_path / "model.npz")
+    assert GsDynamicsModel.load(tmp_path / "model.npz").rules == RULES
+
+
 def test_points_wait_while_the_tools_move_less_than_a_step():
     # 4 mm per frame: steps in frames 3, 6 and 9.
     tools = cloud(3, 1)[None] + 0.004 * np.arange(12)[:, None, None] * np.array([0, 1.0, 0])

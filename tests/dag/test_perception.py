@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from neuspring.core.artifacts import Observations
+from tests.stages.test_perceive import perceived
 from tests.support.filmed import film, write_raw
 from tests.support.phystwin_case import dump
-from tests.support.pictured import perceived
 from tests.support.project import copy_finished, copy_workflow, jobs, run
 
 PACKAGE = "synthetic_weird_package"

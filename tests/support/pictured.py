@@ -5,45 +5,20 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
-from neuspring.config import Config, ScenarioRow
+from neuspring.config import Config
 from neuspring.config.images import Appearance, Images
-from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling
-from neuspring.core.artifacts import Observations, Trajectory
+from neuspring.core.artifacts import Trajectory
 from neuspring.core.records import StageRecord, Stopwatch
 from neuspring.data.capture import Capture
-from neuspring.stages import appearance, perceive, stages
+from neuspring.stages import appearance
 from tests.support.filmed import FRAMES
-
-ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
-FILMED = Config(
-    scenarios=("film",),
-    perception=Perception(
-        track=PointTracking(opencv=OpenCvTracking(points=400)),
-        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
-        sample=Sampling(voxel=0.015),
-    ),
-)
-
-
-def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config = FILMED) -> Observations:
-    """All steps through their records, as the workflow calls them."""
-    masks, tracks = [], []
-    for camera in capture.cameras:
-        masks.append(folder / camera / "masks.json")
-        tracks.append(folder / camera / "tracks.json")
-        masks[-1].parent.mkdir(parents=True)
-        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
-        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
-    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
-    return Observations.load(folder / "observations.npz")
-
+from tests.support.perceived import SETTINGS, perceived
 
 IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
 
 
 def pictured(**changes: object) -> Config:
-    return dataclasses.replace(FILMED, images=dataclasses.replace(IMAGES, **changes))
+    return dataclasses.replace(SETTINGS, images=dataclasses.replace(IMAGES, **changes))
 
 
 class Scene:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -26,6 +26,12 @@ class GsDynamicsModel(Artifact):
         count = weight_count(self.rules)
         if len(self.weights) != count:
             raise InputError("gs_dynamics.weights", f"{count} weights are required", len(self.weights))
+
+    @classmethod
+    def _build(cls, arrays: dict[str, np.ndarray], plain: dict[str, Any], prefix: str) -> Self:
+        # Files of earlier versions hold this as well; it is a constant now.
+        plain["rules"].pop("hand_gap", None)
+        return super()._build(arrays, plain, prefix)
 
     def dynamics(self, device: str) -> Dynamics:
         """The network on a device."""

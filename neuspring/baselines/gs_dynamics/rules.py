@@ -52,7 +52,6 @@ class Rules:
     connect_all: bool
     node_input: NodeInput
     tools: Tools
-    hand_gap: float
     width: int
     rounds: int
     history: int

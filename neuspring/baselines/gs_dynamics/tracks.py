@@ -14,6 +14,8 @@ from neuspring.core.points import farthest
 
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
 """Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
+HAND_GAP = 0.08
+"""Controllers that a chain of gaps no longer than this joins in frame 0 are one hand, m."""
 
 
 def upright(points: np.ndarray, up: Up) -> np.ndarray:
@@ -49,11 +51,11 @@ class Tracks:
 def tools_of(controllers: np.ndarray, rules: Rules) -> np.ndarray:
     """Tool nodes [T, C', 3], m: the controllers [T, C, 3], or the mean of each hand.
 
-    Captures do not say which controllers belong to one hand. Controllers that gaps of at most `hand_gap` link in frame 0 do here.
+    Captures do not say which controllers belong to one hand, so gaps decide: see HAND_GAP.
     """
     if rules.tools == "points" or controllers.shape[1] == 1:
         return controllers
-    hand = fcluster(linkage(controllers[0], "single"), rules.hand_gap, "distance")
+    hand = fcluster(linkage(controllers[0], "single"), HAND_GAP, "distance")
     return np.stack([controllers[:, hand == k].mean(axis=1) for k in np.unique(hand)], axis=1)
 
 

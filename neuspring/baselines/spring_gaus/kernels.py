@@ -1,16 +1,16 @@
-"""One substep of the anchors: forces gathered over each anchor's own list, semi-implicit Euler, ground; and its adjoint.
+"""One substep of the anchors and its adjoint: forces gathered over each anchor's own list, semi-implicit Euler, ground.
 
-With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbour j by distance at frame 0, anchor i feels
+With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbor j by distance in frame 0, anchor i feels
 
     spring   (s_i / l) eta_r (d - l) (1 + |e|)^p n       (zero where |d - l| < 1e-6 m)
     damping  (zeta / l) ((v_j - v_i) . n) n
-    control  c (|q - x_i| / L - 1) (q - x_i) / |q - x_i|  from each controller q that it is linked to
+    control  c (|q - x_i| / L - 1) (q - x_i) / |q - x_i|  from each controller q with a link to it
     gravity  at unit mass
 
-and no reaction is applied to j: a gather, not the symmetric spring of `neuspring.physics.springs`. After the step, points at or
-below the ground are put on it, their velocity along z is zero and along the ground times phi.
+Nothing reacts on j: this is a gather, not the symmetric spring of `neuspring.physics.springs`. After the step, anchors at or below
+the ground are put on it. Their velocity along z becomes zero, that along the ground is multiplied by phi.
 """
-# No postponed annotations here: Warp reads the evaluated types of the closures below.
+# No postponed annotations here: Warp needs the evaluated types of the closures below.
 
 import functools
 from typing import Any, NamedTuple

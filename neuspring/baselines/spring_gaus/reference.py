@@ -1,4 +1,4 @@
-"""The anchors' substep in torch, in any precision and differentiable: the specification of the kernel."""
+"""The anchors' substep in torch: the specification of the kernels. Differentiable, in any precision."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ def substep(
     controllers: torch.Tensor,
     step: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(x, v) [N, 3] one substep later, `step` s, under controllers [C, 3] at its end; equations as in `kernels`."""
-
+    """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end. Equations as in `kernels`."""
     neighbours = torch.tensor(graph.neighbours, device=x.device).long()
     rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
     offset = x[neighbours] - x[:, None]
