@@ -102,7 +102,7 @@ def test_what_a_known_network_made_is_fitted_back():
 
 
 def test_one_window_is_learned_by_heart(tmp_path):
-    # Ten times as large as captures: inputs are in metres, and learning is slow where all of them are near 0.
+    # Ten times as large as captures: inputs are in meters, and learning is slow where all of them are near 0.
     points, tools = 10 * cloud(20, 0)[None].repeat(2, axis=0), 10 * hands(2)
     points[1] += 0.1 * np.sin(2.5 * points[0])
     seen, partial = capture(points, tools), tmp_path / "partial.npz"

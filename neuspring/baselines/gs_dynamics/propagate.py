@@ -24,7 +24,7 @@ CLOSE = 1e-4
 """Distances are floored here before a weight is computed from them, m."""
 
 
-def neighbour_table(graph: Graph) -> np.ndarray:
+def neighbor_table(graph: Graph) -> np.ndarray:
     """Neighbors [P, k] int32 of each particle among particles. Empty places hold the particle itself, which adds no offset."""
     among = graph.among_particles
     receivers, senders = (ends[among].cpu().numpy() for ends in (graph.receivers, graph.senders))
@@ -40,7 +40,7 @@ def turns(graph: Graph, before: torch.Tensor, after: torch.Tensor) -> torch.Tens
     """Rotations [P, 3, 3] of particles that moved from `before` to `after` [P, 3], m."""
     start_warp()
     count = graph.particles
-    table: Any = wp.array(neighbour_table(graph), dtype=int, device="cpu")
+    table: Any = wp.array(neighbor_table(graph), dtype=int, device="cpu")
     positions: list[Any] = [
         wp.array(points.cpu().numpy().astype(np.float32), dtype=wp.vec3, device="cpu") for points in (before, after)
     ]

@@ -15,6 +15,9 @@ from neuspring.splats.rasterise import Backend, rasterise
 from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
+Masks = dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
+"""(camera, frame) -> two masks [H, W], bool: the object, and the pixels that count (None: all)."""
+
 
 class Follower:
     """Points that follow anchors by fixed weights, on a device."""
@@ -37,8 +40,7 @@ class Silhouettes:
     splats: Gaussians
     follower: Follower
     views: Mapping[str, View]
-    masks: Mapping[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
-    """(camera, frame) -> two masks [H, W], bool: the object, and the pixels that count (None: all)."""
+    masks: Masks
     loss: SilhouetteLoss
     backend: Backend
     seed: int

@@ -13,7 +13,7 @@ import torch
 from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
 from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.baselines.spring_gaus.objectives import Follower, Points, Silhouettes
+from neuspring.baselines.spring_gaus.objectives import Follower, Masks, Points, Silhouettes
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.baselines.spring_gaus.train import Objective, Problem
 from neuspring.baselines.spring_gaus.vgg16 import Vgg16
@@ -39,8 +39,7 @@ class Seen:
 
     splats: Splats
     views: dict[str, View]
-    masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
-    """(camera, frame) -> two masks [H, W], bool: the object, and the pixels that count (None: all)."""
+    masks: Masks
     backend: Backend
 
     @classmethod
@@ -48,7 +47,7 @@ class Seen:
         """From a capture, the records of its masks and a file of splats. Masks of future frames are not used."""
         capture, images = Capture.load(folder), settings.images
         cameras = masks_of_cameras(capture, records)
-        masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]] = {}
+        masks: Masks = {}
         for name, perceived in cameras.items():
             for frame in (frame for frame in range(capture.train_end) if capture.has(name, frame)):
                 labels = torch.tensor(perceived.labels[frame], device=device)
@@ -71,14 +70,8 @@ def problem(
     hands = observations.controller_points[: scenario.train_end]
     graph = AnchorGraph.between(anchors, hands[0], own.neighbours, own.link_reach, own.link_count)
     up = 1.0 if scenario.up == "+z" else -1.0
-    start = SpringGausModel.start(
-        graph,
-        own,
-        frame_time=1 / scenario.frame_rate,
-        up_sign=up,
-        gravity=settings.simulation.gravity,
-        ground=scenario.ground,
-    )
+    world = {"frame_time": 1 / scenario.frame_rate, "up_sign": up, "gravity": settings.simulation.gravity}
+    start = SpringGausModel.start(graph, own, ground=scenario.ground, **world)
     facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
     objective: Objective
     if seen and own.supervision == "masks":
