@@ -32,6 +32,7 @@ def pairs(graph: Graph) -> set[tuple[int, int]]:
     return set(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
 
 
+@torch.no_grad()
 def moves(points: torch.Tensor, tools: torch.Tensor, rules: Rules = RULES) -> torch.Tensor:
     """Displacements of random weights: two earlier positions, and an action that differs from tool to tool."""
     drift = torch.linspace(0.02, 0, rules.history, dtype=points.dtype)[:, None, None] * torch.tensor([0.5, 0.2, -0.3])
