@@ -1,35 +1,39 @@
-"""What training and prediction of a baseline return."""
+"""What training and prediction of a baseline return, and the training loop that they share."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import pandas as pd
 
 from neuspring.core.artifacts import Artifact, Trajectory
+from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.training import TrainingLoop
 
 LIMIT = 10.0
-"""m from the origin, on the table: what is farther away has exploded, as scenes are a metre or two wide."""
+"""m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""
 Model = TypeVar("Model", bound=Artifact)
+TrainedModel = TypeVar("TrainedModel", bound=Artifact, covariant=True)
 
 
 @dataclass(frozen=True)
 class Trained(Generic[Model]):
-    """A trained model, and how it came to be."""
+    """A trained model, and how it was trained."""
 
     model: Model
     history: pd.DataFrame
-    """One row per epoch or iteration: column `step`, and a column per metric."""
+    """One row per epoch: column `step`, and a column per metric."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     failure: str = ""
-    """Why training ended early; the model is then the last that was usable. Empty: it ended as it should."""
+    """Why training ended early; the model is then the last that was usable. Empty: it did not."""
     attempts: int = 1
     """1, plus one for every time that training continued from a checkpoint."""
     earlier_seconds: float = 0.0
-    """Wall time of the attempts that this one continued, up to their last checkpoint."""
+    """Wall time of the earlier attempts, up to their last checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -41,5 +45,36 @@ class Prediction:
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     centres: np.ndarray | None = None
-    """[F, G, 3] m: the model's own splat centres in every frame, where it draws with splats of its own; else the platform's splats
-    are skinned to the trajectory."""
+    """[F, G, 3] m: centers of the model's own splats in every frame. None: it has none, and the platform's splats are skinned to
+    the trajectory."""
+
+
+class TrainingStopped(ArithmeticError):
+    """Training cannot go on; says why."""
+
+
+class Training(Protocol[TrainedModel]):
+    """What `run_epochs` asks of a training. `epoch` returns metrics; `facts` is given the number of complete epochs."""
+
+    def epoch(self, number: int) -> dict[str, float]: ...
+    def model(self) -> TrainedModel: ...
+    def facts(self, epochs: int) -> dict[str, Any]: ...
+    def checkpoint(self) -> Checkpoint: ...
+    def restore(self, checkpoint: Checkpoint) -> None: ...
+
+
+def run_epochs(training: Training[Model], loop: TrainingLoop, metrics: Sequence[str], failure: str = "") -> Trained[Model]:
+    """Train for the epochs of the loop, or until `epoch` raises TrainingStopped, whose text becomes the failure."""
+    if loop.restored:
+        training.restore(loop.restored)
+    for number in loop:
+        try:
+            row = training.epoch(number)
+        except TrainingStopped as reason:
+            failure = f"training ended early: {reason}"
+            break
+        loop.record({"step": number, **row}, ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+        loop.save(training.checkpoint)
+    history = pd.DataFrame(loop.history, columns=["step", *metrics])
+    facts = training.facts(len(loop.history))
+    return Trained(training.model(), history, facts, failure, loop.attempts, loop.earlier_seconds)

@@ -11,8 +11,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_type_hints
@@ -20,7 +18,7 @@ from typing import Any, ClassVar, Literal, Self, get_type_hints
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_atomically
+from neuspring.core.npz import DamagedFile, read_npz, write_npz
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
@@ -91,13 +89,7 @@ class Artifact:
         plain = self._flatten(arrays, "")
         meta = {"kind": self.kind, "format": FORMAT_VERSION, "fields": plain}
         text = json.dumps(meta, sort_keys=True, allow_nan=False)
-        arrays["meta"] = np.frombuffer(text.encode(), dtype=np.uint8)
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as stream:
-                np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-
-        write_atomically(Path(path), write)
+        write_npz(Path(path), arrays, text, compress=True)
 
     def _flatten(self, arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
         plain: dict[str, Any] = {}
@@ -120,18 +112,10 @@ class Artifact:
         if not path.is_file():
             raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that makes it first.")
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            meta = json.loads(arrays.pop("meta").tobytes().decode())
-            if not isinstance(meta, dict):
-                raise ValueError("`meta` holds no mapping")
-        # zipfile raises RuntimeError for damaged flags, and np.load returns a bare array (TypeError) for an .npy file.
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            arrays, meta = read_npz(path)
+        except DamagedFile as error:
             raise InputError(
-                path,
-                f"this file must be readable, of kind {cls.kind}",
-                f"{type(error).__name__}: {error}",
-                "Delete it and re-run its step.",
+                path, f"this file must be readable, of kind {cls.kind}", str(error), "Delete it and re-run its step."
             ) from error
         if meta.get("kind") != cls.kind:
             raise InputError(path, f"this file must be of kind {cls.kind}", meta.get("kind"))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.core import provenance
-from neuspring.core.files import write_atomically
+from neuspring.core.npz import DamagedFile, read_npz, write_npz
 from neuspring.core.records import canonical
 
 
@@ -24,37 +24,34 @@ from neuspring.core.records import canonical
 class Checkpoint:
     """What a stage needs to go on."""
 
-    arrays: dict[str, np.ndarray]
+    arrays: Mapping[str, Mapping[str, np.ndarray]]
+    """Arrays by group and name. A group's name has no dot. Of a loaded checkpoint, a group without arrays is empty."""
     values: dict[str, Any]
     """Plain JSON values."""
 
     def save(self, path: Path, key: str) -> None:
         """Write `path` (.npz) atomically."""
-        meta = np.frombuffer(json.dumps({"key": key, "values": self.values}).encode(), np.uint8)
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as stream:
-                np.savez(stream, meta=meta, **self.arrays)  # type: ignore[arg-type]
-
-        write_atomically(path, write)
+        arrays = {f"{group}.{name}": array for group, members in self.arrays.items() for name, array in members.items()}
+        write_npz(path, arrays, json.dumps({"key": key, "values": self.values}), compress=False)
 
     @classmethod
     def load(cls, path: Path | None, key: str, what: str) -> Checkpoint | None:
-        """The checkpoint of `what` (in words: `the fit`), or None, saying why, if there is none with this key."""
+        """The checkpoint of `what` (in words: `the fit`). None if there is none with this key, and a line that says why."""
         if path is None or not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            meta = json.loads(arrays.pop("meta").tobytes())
-            found, values = meta["key"], meta["values"]
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            stored, meta = read_npz(path)
+        except DamagedFile as error:
             print(f"{path}: unreadable ({error}); {what} starts afresh")
             return None
-        if found != key:
+        if meta.get("key") != key:
             print(f"{path}: made with other inputs or settings; {what} starts afresh")
             return None
-        return cls(arrays, values)
+        arrays: dict[str, dict[str, np.ndarray]] = defaultdict(dict)
+        for label, array in stored.items():
+            group, _, name = label.partition(".")
+            arrays[group][name] = array
+        return cls(arrays, meta["values"])
 
 
 def checkpoint_key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, module: str) -> str:

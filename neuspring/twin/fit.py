@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from neuspring.config import Kind
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.checkpoint import Checkpoint
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.progress import Progress
+from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame
 from neuspring.physics.solver import FrameSolver, Parameters
@@ -80,13 +79,11 @@ class FitResult:
 
 @dataclass
 class _State:
-    """Everything that a continued fit needs, and nothing else."""
+    """Everything that a continued fit needs besides its history."""
 
-    epoch: int
     values: dict[str, np.ndarray]
     moments: dict[str, np.ndarray]
     rate: float
-    history: list[dict[str, Any]]
     rollbacks: list[str]
     best_epoch: int
     best_loss: float
@@ -94,28 +91,19 @@ class _State:
     best_substeps: int
     substeps: int
     overflow: int = 0
-    attempts: int = 1
-    seconds: float = 0.0
 
-    def save(self, path: Path, key: str, seconds: float) -> None:
-        arrays = {f"values.{k}": v for k, v in self.values.items()} | {f"best.{k}": v for k, v in self.best_values.items()}
-        arrays |= {f"moments.{k}": v for k, v in self.moments.items()}
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("values", "moments", "best_values")}
-        Checkpoint(arrays, plain | {"seconds": seconds}).save(path, key)
+    def checkpoint(self) -> Checkpoint:
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ARRAYS}
+        return Checkpoint({name: getattr(self, name) for name in ARRAYS}, plain)
 
     @classmethod
-    def load(cls, path: Path | None, key: str) -> _State | None:
-        found = Checkpoint.load(path, key, "the fit")
-        if found is None:
-            return None
-        arrays = found.arrays
+    def of(cls, checkpoint: Checkpoint) -> _State:
+        arrays: dict[str, Any] = {name: dict(checkpoint.arrays[name]) for name in ARRAYS}
+        return cls(**arrays, **checkpoint.values)
 
-        def part(prefix: str) -> dict[str, np.ndarray]:
-            return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
-        print(f"continuing the fit after epoch {found.values['epoch']}")
-        plain = found.values | {"attempts": found.values["attempts"] + 1}
-        return cls(values=part("values."), moments=part("moments."), best_values=part("best."), **plain)
+ARRAYS = ("values", "moments", "best_values")
+"""The fields of a state that hold arrays."""
 
 
 class TwinFit:
@@ -279,21 +267,10 @@ class TwinFit:
         self.optimiser.step()
         return float(norm)
 
-    def moments(self) -> dict[str, np.ndarray]:
-        """Adam's state as arrays; empty before the first step."""
-        state = self.optimiser.state_dict()["state"]
-        return {f"{index}.{name}": value.cpu().numpy().copy() for index, slots in state.items() for name, value in slots.items()}
-
     def restore(self, values: dict[str, np.ndarray], moments: dict[str, np.ndarray]) -> None:
         """Set parameters and Adam's state."""
         self.parameters.restore(values)
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for name, value in moments.items():
-            index, _, slot = name.partition(".")
-            state.setdefault(int(index), {})[slot] = torch.from_numpy(value.copy())
-        stored = self.optimiser.state_dict()
-        stored["state"] = state
-        self.optimiser.load_state_dict(stored)
+        restore_adam(self.optimiser, moments)
 
 
 def fit(
@@ -308,37 +285,48 @@ def fit(
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. Raises
     NumericalFailure if no epoch could be completed.
     """
-    clock = time.perf_counter()
+    label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key)
     run = TwinFit(problem)
-    state = _State.load(partial, key)
-    if state is None:
-        initial = run.parameters.copy()
-        substeps = problem.twin.simulation.substeps
-        state = _State(0, initial, {}, 1.0, [], [], -1, math.inf, initial, substeps, substeps)
-        if problem.fit.selection == "tail" and not run.one_step:
-            # A start that cannot be simulated does not win; if no epoch can be completed either, that is said below.
-            with contextlib.suppress(NonFinite):
-                state.best_loss = run.tail_loss()
-    earlier, overflow = state.seconds, state.overflow
+    state = _State.of(loop.restored) if loop.restored else _start(run, problem)
+    overflow = state.overflow
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
-    progress = Progress(f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}", problem.fit.epochs)
-    while state.epoch < problem.fit.epochs and len(state.rollbacks) < MAX_ROLLBACKS:
-        _advance(run, state, problem)
+    for epoch in loop:
+        if len(state.rollbacks) >= MAX_ROLLBACKS:
+            break
+        row = _advance(run, state, problem, epoch)
         state.overflow = overflow + run.collision_overflow
-        last = state.history[-1]
-        progress.update(state.epoch, f"loss {last['loss']:.3e} m^2" if not last["rolled_back"] else "rolled back")
-        on_epoch(state.history)
-        if partial is not None and state.epoch % problem.fit.checkpoint_every == 0:
-            state.save(partial, key, earlier + time.perf_counter() - clock)
+        loop.record(row, f"loss {row['loss']:.3e} m^2" if not row["rolled_back"] else "rolled back")
+        on_epoch(loop.history)
+        loop.save(state.checkpoint)
     if not math.isfinite(state.best_loss):
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
     run.parameters.restore(state.best_values)
     run.parameters.homogeneous = False
     run.use_substeps(state.best_substeps)
     best = run.parameters.as_twin(run.twin)
-    outcome = (state.best_epoch, state.best_loss, state.rollbacks, state.attempts, earlier, state.overflow)
-    return FitResult(best, pd.DataFrame(state.history), *outcome)
+    return FitResult(
+        best,
+        pd.DataFrame(loop.history),
+        state.best_epoch,
+        state.best_loss,
+        state.rollbacks,
+        loop.attempts,
+        loop.earlier_seconds,
+        state.overflow,
+    )
+
+
+def _start(run: TwinFit, problem: FitProblem) -> _State:
+    """The state before the first epoch."""
+    values, substeps = run.parameters.copy(), problem.twin.simulation.substeps
+    state = _State(values, {}, 1.0, [], -1, math.inf, values, substeps, substeps)
+    if problem.fit.selection == "tail" and not run.one_step:
+        # A start that cannot be simulated does not win; if no epoch can be completed either, `fit` says so.
+        with contextlib.suppress(NonFinite):
+            state.best_loss = run.tail_loss()
+    return state
 
 
 def _growth(values: np.ndarray, reference: np.ndarray) -> float:
@@ -347,33 +335,39 @@ def _growth(values: np.ndarray, reference: np.ndarray) -> float:
     return float(ratio.max(initial=0.0))
 
 
-def _advance(run: TwinFit, state: _State, problem: FitProblem) -> None:
-    """One epoch, or its rollback, recorded in `state`. Accepted values can always be integrated with `state.substeps`."""
-    row: dict[str, Any] = {"epoch": state.epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
-    run.start_epoch(state.epoch, state.rate)
+def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> dict[str, Any]:
+    """Run one epoch, or roll it back, and update `state`; returns the epoch's row of the history.
+
+    Accepted values can always be integrated with `state.substeps`.
+    """
+    row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
+    run.start_epoch(epoch, state.rate)
     row["learning_rate"] = run.optimiser.param_groups[0]["lr"]
     try:
         before = (state.values, state.substeps)
-        found = run.epoch()
+        losses = run.epoch()
         run.settled()
         if problem.fit.selection == "tail" and not run.one_step:
-            found["tail_loss"] = run.tail_loss()
-        state.values, state.moments, state.substeps = run.parameters.copy(), run.moments(), run.twin.simulation.substeps
-        row |= found
-        loss = found["tail_loss" if problem.fit.selection == "tail" else "loss"]
-        if _eligible(state.epoch, problem) and loss < state.best_loss:
+            losses["tail_loss"] = run.tail_loss()
+        state.values, state.moments, state.substeps = (
+            run.parameters.copy(),
+            adam_arrays(run.optimiser),
+            run.twin.simulation.substeps,
+        )
+        row |= losses
+        loss = losses["tail_loss" if problem.fit.selection == "tail" else "loss"]
+        if _eligible(epoch, problem) and loss < state.best_loss:
             state.best_loss = loss
-            state.best_epoch = state.epoch - run.one_step
+            state.best_epoch = epoch - run.one_step
             state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
     except NonFinite as failure:
-        state.rollbacks.append(f"epoch {state.epoch}: {failure}")
+        state.rollbacks.append(f"epoch {epoch}: {failure}")
         print(f"rolled back: {state.rollbacks[-1]}; the learning rates are halved")
         state.rate /= 2
         run.use_substeps(state.substeps)
         run.restore(state.values, state.moments)
         row["rolled_back"] = True
-    state.history.append(row)
-    state.epoch += 1
+    return row
 
 
 def _eligible(epoch: int, problem: FitProblem) -> bool:

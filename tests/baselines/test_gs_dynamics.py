@@ -8,7 +8,7 @@ import torch
 
 from neuspring import config
 from neuspring.baselines.gs_dynamics.graph import Graph, connect, sample
-from neuspring.baselines.gs_dynamics.network import Dynamics, edge_inputs, initial_weights, node_inputs, weight_count
+from neuspring.baselines.gs_dynamics.network import Dynamics, edge_inputs, node_inputs, weight_count
 from neuspring.baselines.gs_dynamics.objective import draw, length_loss, pick, position_loss
 from neuspring.baselines.gs_dynamics.rules import PRESETS, Rules, preset_name, resolve
 from neuspring.baselines.gs_dynamics.tracks import Tracks, ordinary, smoothed, tools_of
@@ -32,13 +32,14 @@ def pairs(graph: Graph) -> set[tuple[int, int]]:
     return set(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
 
 
+@torch.no_grad()
 def moves(points: torch.Tensor, tools: torch.Tensor, rules: Rules = RULES) -> torch.Tensor:
     """Displacements of random weights: two earlier positions, and an action that differs from tool to tool."""
     drift = torch.linspace(0.02, 0, rules.history, dtype=points.dtype)[:, None, None] * torch.tensor([0.5, 0.2, -0.3])
     history = torch.cat([points, tools])[None] - drift
     action = 0.01 * (tools - tools.mean(dim=0)) / 0.05
-    weights = initial_weights(rules, 3).to(points.dtype)
-    return Dynamics(rules, weights)(graph_of(points, tools, rules), history, action)
+    network = Dynamics.of(rules, Dynamics.initial(rules, 3).weights.to(points.dtype))
+    return network(graph_of(points, tools, rules), history, action)
 
 
 def test_a_particle_is_the_first_of_its_own_neighbours():
@@ -89,7 +90,29 @@ def test_input_sizes_are_those_of_the_public_code():
     of_node = node_inputs(RULES, graph, history, tools)[12]
     assert of_node.tolist() == pytest.approx([0, 1, *[float(tools[0, 2])] * 3, *[0] * 6, *tools[0].tolist()])
     full = resolve(GsDynamics(), "sloth")[0]
-    assert weight_count(full) == len(initial_weights(full, 0)) == 2_904_579
+    assert weight_count(full) == len(Dynamics.initial(full, 0).weights) == 2_904_579
+
+
+def test_weights_keep_their_order_in_the_vector_and_their_first_draws():
+    """Saved models depend on the order; a run can be repeated only if the draws stay."""
+    network = Dynamics.initial(replace(RULES, width=4), 5)
+    names = [name for name, _ in network.named_parameters()]
+    layers = [
+        *(f"{part}.{i}" for part in ("node", "edge") for i in (0, 2, 4)),
+        "relation",
+        "particle",
+        "head.0",
+        "head.2",
+        "head.4",
+    ]
+    assert names == [f"{layer}.{part}" for layer in layers for part in ("weight", "bias")]
+    first = 4 * (RULES.node_size + 1)
+    draws = torch.rand(first, generator=torch.Generator().manual_seed(5))
+    torch.testing.assert_close(network.weights[:first], (draws * 2 - 1) / RULES.node_size**0.5, rtol=0, atol=0)
+    again = Dynamics.of(network.rules, network.weights)
+    torch.testing.assert_close(again.state_dict(), network.state_dict(), rtol=0, atol=0)
+    last = (again.head[-1].weight.flatten(), again.head[-1].bias)
+    torch.testing.assert_close(torch.cat(last), network.weights[-15:], rtol=0, atol=0)
 
 
 def test_the_order_of_particles_does_not_matter():

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.baselines.gs_dynamics import train
 from neuspring.baselines.gs_dynamics.graph import connect
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
-from neuspring.baselines.gs_dynamics.network import initial_weights, weight_count
+from neuspring.baselines.gs_dynamics.network import Dynamics, weight_count
 from neuspring.baselines.gs_dynamics.predict import predict
 from neuspring.baselines.gs_dynamics.propagate import carry, turns
 from neuspring.baselines.gs_dynamics.rules import Rules, resolve
@@ -71,7 +71,7 @@ def taught(frames: int, count: int = 20) -> tuple[np.ndarray, np.ndarray]:
 
     Its head is set so that the first displacements are 5 mm, and 0 on average.
     """
-    weights, head = 1.7 * initial_weights(RULES, 11), slice(-3 - 3 * RULES.width, -3)
+    weights, head = 1.7 * Dynamics.initial(RULES, 11).weights, slice(-3 - 3 * RULES.width, -3)
     weights[-3:] = 0
     tools, points = hands(frames), np.repeat(cloud(count, 0)[None], frames, axis=0)
     first = one_step(GsDynamicsModel(weights=weights.numpy(), rules=RULES), points, tools, 0)
@@ -101,13 +101,18 @@ def test_what_a_known_network_made_is_fitted_back():
     assert relative_error(trained.model, points, tools) < 0.15
 
 
-def test_one_window_is_learned_by_heart():
-    # Ten times as large as captures: inputs are in metres, and learning is slow where all of them are near 0.
+def test_one_window_is_learned_by_heart(tmp_path):
+    # Ten times as large as captures: inputs are in meters, and learning is slow where all of them are near 0.
     points, tools = 10 * cloud(20, 0)[None].repeat(2, axis=0), 10 * hands(2)
     points[1] += 0.1 * np.sin(2.5 * points[0])
-    trained = train.run(capture(points, tools), replace(PLAIN, radius=0.8, epochs=4, updates_per_epoch=75, batch=1), 0, "cpu")
+    seen, partial = capture(points, tools), tmp_path / "partial.npz"
+    fast = replace(PLAIN, radius=0.8, epochs=12, updates_per_epoch=50, batch=1)
+    trained = train.run(seen, fast, 0, "cpu", partial, "key")
     assert trained.facts["windows"] == 1
-    assert relative_error(trained.model, points, tools) < 0.1
+    # At a constant rate Adam's last updates jump about, differently on each processor: it goes on at a tenth of the rate.
+    settled = train.run(seen, replace(fast, epochs=18, learning_rate=3e-4), 0, "cpu", partial, "key")
+    assert settled.attempts == 2
+    assert relative_error(settled.model, points, tools) < 0.1
 
 
 def test_a_killed_training_continues_to_the_same_model(tmp_path):
@@ -157,7 +162,7 @@ def test_training_that_cannot_go_on_says_so_and_keeps_what_it_had():
     unprepared = train.run(moving, PLAIN, 0, "cpu")
     assert unprepared.failure == "training did not start: no window of a tool that moves 0.01 m in 4 training frames"
     assert np.ptp(predict(unprepared.model, moving, "cpu").trajectory.positions, axis=0).max() < 1e-6
-    start = initial_weights(RULES, 0).numpy()
+    start = Dynamics.initial(RULES, 0).weights.numpy()
     wild = train.run(capture(points, tools), replace(PLAIN, learning_rate=1e30), 0, "cpu")
     assert wild.failure == "training ended early: the loss is not finite (epoch 0, update 1)"
     np.testing.assert_array_equal(wild.model.weights, start)
@@ -171,6 +176,20 @@ def test_a_model_survives_its_file(tmp_path):
     np.testing.assert_array_equal(found.weights, model.weights)
     with pytest.raises(InputError, match=r"gs_dynamics.weights: \d+ weights are required; received 7"):
         GsDynamicsModel(weights=np.zeros(7), rules=RULES)
+
+
+def test_a_model_of_an_earlier_version_is_read(tmp_path, monkeypatch):
+    """Rules held the gap between hands then."""
+    plain = GsDynamicsModel._flatten
+
+    def flatten(self, arrays, prefix):
+        fields = plain(self, arrays, prefix)
+        return fields | {"rules": fields["rules"] | {"hand_gap": 0.08}}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GsDynamicsModel, "_flatten", flatten)
+        pushes(0.005).save(tmp_path / "model.npz")
+    assert GsDynamicsModel.load(tmp_path / "model.npz").rules == RULES
 
 
 def test_points_wait_while_the_tools_move_less_than_a_step():

@@ -28,7 +28,7 @@ def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
 
 
 def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGaus = SMALL, **changed) -> SpringGausModel:
-    graph = AnchorGraph.of(anchors, controllers, settings.neighbours, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, controllers, settings.neighbours, settings.link_reach, settings.link_count)
     world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
     return SpringGausModel.start(graph, settings, **world)
 
@@ -88,9 +88,9 @@ def test_springs_are_directed():
     """An anchor that is nobody's neighbour feels others and does not move them."""
     near = bar()[:24]
     lone = near.mean(axis=0, keepdims=True) + np.array([0, 0, 1.0])
-    graph = AnchorGraph.of(np.concatenate([near, lone]), np.full((1, 3), 9.0), 4, 0.04, 50)
+    graph = AnchorGraph.between(np.concatenate([near, lone]), np.full((1, 3), 9.0), 4, 0.04, 50)
     assert (graph.neighbours != 24).all()
-    physics = AnchorPhysics(FRAME, gravity=0.0, ground=False)
+    physics = AnchorPhysics(frame_time=FRAME, gravity=0.0, ground=False)
     x = torch.tensor(graph.anchors, dtype=torch.float64)
     x[24, 2] += 0.01
     hand = torch.full((1, 3), 9.0, dtype=torch.float64)
@@ -109,8 +109,8 @@ def parameters(anchors: int, ranks: int, dtype: torch.dtype = torch.float64) -> 
 def test_a_frame_and_its_gradient_are_those_of_the_reference(dtype, close):
     anchors = bar(height=0.0)
     controllers = anchors[:3] + 0.01
-    graph = AnchorGraph.of(anchors, controllers, 8, 0.04, 5)
-    physics = AnchorPhysics(FRAME, link_stiffness=300.0)
+    graph = AnchorGraph.between(anchors, controllers, 8, 0.04, 5)
+    physics = AnchorPhysics(frame_time=FRAME, link_stiffness=300.0)
     solver, draw = AnchorSolver(graph, physics, 20, dtype=dtype), torch.Generator().manual_seed(0)
     noise = torch.randn(2, len(anchors), 3, generator=draw, dtype=torch.float64).to(dtype)
     x, v = torch.tensor(graph.anchors, dtype=dtype) + 0.002 * noise[0], 0.1 * noise[1]
@@ -140,7 +140,7 @@ def test_a_frame_and_its_gradient_are_those_of_the_reference(dtype, close):
 def test_a_gradient_after_another_frame_is_still_its_own():
     anchors = bar()
     model = model_of(anchors, anchors[:3] + 0.005, replace(SMALL, link_stiffness=300.0))
-    solver = AnchorSolver(model.graph, model.physics, 30, dtype=torch.float64)
+    solver = AnchorSolver(model, model, 30, dtype=torch.float64)
     x = torch.tensor(model.anchors, dtype=torch.float64, requires_grad=True)
     hand, found = torch.tensor(anchors[:3] + 0.005), parameters(72, 12)
 
@@ -175,7 +175,7 @@ def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
 
 def test_too_few_anchors_are_refused():
     with pytest.raises(NumericalFailure, match=r"more anchors than neighbours \(20\) are required, and there are 3"):
-        AnchorGraph.of(bar()[:3], np.zeros((1, 3)), 20, 0.04, 50)
+        AnchorGraph.between(bar()[:3], np.zeros((1, 3)), 20, 0.04, 50)
 
 
 def swing(frames: int) -> np.ndarray:
@@ -229,11 +229,11 @@ def test_damping_that_is_clamped_can_come_back():
 
     settings = replace(SMALL, iterations=1, damping_rate=0.01)
     training = Training(Problem(start, hands.astype(np.float32), objective, settings))
-    training.iteration(0)
+    training.epoch(0)
     first = training.values["theta"].item()
     sign[0] = -sign[0]
     for number in range(1, 12):
-        training.iteration(number)
+        training.epoch(number)
     found = [first, training.values["theta"].item()]
     assert min(found) >= 1.0 and max(found) > 1.0
 

@@ -44,7 +44,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
     anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
     hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
     settings = SpringGaus()
-    graph = AnchorGraph.of(anchors, hands[0], settings.neighbours, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], settings.neighbours, settings.link_reach, settings.link_count)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     return model, hands
 
@@ -56,7 +56,7 @@ class ByKernels:
         self.model, self.hands = model, torch.tensor(hands, device=device)
         self.x = torch.tensor(model.anchors, device=device)
         self.values = {name: tensor.requires_grad_() for name, tensor in model.tensors(device).items()}
-        self.solver = AnchorSolver(model.graph, model.physics, SUBSTEPS, device)
+        self.solver = AnchorSolver(model, model, SUBSTEPS, device)
 
     def run(self) -> list[torch.Tensor]:
         """Positions after a frame, and gradients of their sum of squares."""
@@ -80,7 +80,7 @@ class InTorch(ByKernels):
         parameters = model.parameters(self.values)
         for k in range(SUBSTEPS):
             at = self.hands[0] + (k + 1) / SUBSTEPS * (self.hands[1] - self.hands[0])
-            x, v = reference.substep(model.graph, model.physics, parameters, x, v, at, model.frame_time / SUBSTEPS)
+            x, v = reference.substep(model, model, parameters, x, v, at, model.frame_time / SUBSTEPS)
         return x
 
 

@@ -22,10 +22,9 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
 from neuspring.stages import predict, score, train, transfer
-from tests.stages.test_appearance import Scene
-from tests.stages.test_appearance import settings as pictured_settings
 from tests.support import small
 from tests.support.filmed import FRAMES, film
+from tests.support.pictured import Scene, pictured
 
 POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbours=8, full_neighbours=6, bound_anchors=6)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
@@ -151,9 +150,7 @@ def filmed(tmp_path_factory):
     """A film whose motion is known, with splats of Spring-Gaus' kind."""
     folder = tmp_path_factory.mktemp("filmed")
     scene = Scene(film(folder / "capture"), folder)
-    scene.learn(
-        pictured_settings(appearance=Appearance(iterations=60, degree=0, start="shape_prior", fixed_radius=0.004, spacing=2.0))
-    )
+    scene.learn(pictured(appearance=Appearance(iterations=60, degree=0, start="shape_prior", fixed_radius=0.004, spacing=2.0)))
     return scene
 
 
@@ -174,7 +171,7 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     np.testing.assert_allclose(trajectory.positions[0], Observations.load(seen).nodes, atol=1e-6)
     assert record.facts["frame0_shift"] > 0
     assert record.facts["centres_chamfer_reconstruction"] > 0
-    drawn, _ = filmed.render(out / "rollout.json", pictured_settings())
+    drawn, _ = filmed.render(out / "rollout.json", pictured())
     assert drawn.status == "ok" and drawn.facts["splats"] == centres.shape[1]
     run = out / "run.json"
     records = {"train": out / "train.json", "rollout": out / "rollout.json", "render": out / "render.json"}

@@ -1,4 +1,4 @@
-"""Which points become particles, and who feels whom. Batched: windows of a batch are parts of one graph without edges between."""
+"""Which points become particles, and which nodes have edges. A batch of windows is one graph without edges between windows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neuspring.baselines.gs_dynamics.rules import Rules
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Edges among nodes 0..N-1, of which the first are particles, the others tools."""
+    """Directed edges among nodes 0..N-1. The first nodes are particles, the others tools."""
 
     receivers: torch.Tensor
     """[E] int64."""
@@ -26,44 +26,44 @@ class Graph:
 
 
 def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules: Rules) -> Graph:
-    """Of B windows: points [B, K, 3] m, of which those with used [B, K] are particles, and tools [B, C, 3] m.
+    """The graph of B windows with points [B, K, 3] and tools [B, C, 3], m. Points with used [B, K] are particles.
 
-    A particle receives from those of its k nearest particles, itself included, that are within the radius. Particle and tool feel
-    each other within the radius, or always with `connect_all`. Tools do not feel tools. Nodes: the used points of window 0, of
-    window 1, ..., then the tools of window 0, of window 1, ...
+    A particle receives from its k nearest particles, itself included, as far as they are within the radius. Between a particle and
+    a tool within the radius, or any tool with `connect_all`, there are edges both ways. There are none between tools. The nodes are
+    the particles of window 0, of window 1, ..., then the tools of window 0, of window 1, ...
     """
     count = int(used.sum())
     number = (used.flatten().cumsum(0) - 1).view(used.shape)
     # Not by products of matrices: a particle's distance from itself must be 0.
-    apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
-    apart = apart.masked_fill(~used[:, None, :], torch.inf)
-    distance, near = apart.topk(min(rules.neighbours, points.shape[1]), dim=2, largest=False)
+    distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = distances.masked_fill(~used[:, None, :], torch.inf)
+    distance, near = distances.topk(min(rules.neighbours, points.shape[1]), dim=2, largest=False)
     window, receiver, slot = ((distance < rules.radius) & used[:, :, None]).nonzero(as_tuple=True)
     receivers, senders = number[window, receiver], number[window, near[window, receiver, slot]]
-    reach = torch.cdist(points, tools, compute_mode="donot_use_mm_for_euclid_dist")
-    touching = (torch.ones_like(reach, dtype=torch.bool) if rules.connect_all else reach < rules.radius) & used[:, :, None]
-    window, receiver, tool = touching.nonzero(as_tuple=True)
-    felt, feeling = number[window, receiver], count + window * tools.shape[1] + tool
-    return Graph(torch.cat([receivers, felt, feeling]), torch.cat([senders, feeling, felt]), count)
+    tool_distances = torch.cdist(points, tools, compute_mode="donot_use_mm_for_euclid_dist")
+    near_tools = torch.ones_like(tool_distances, dtype=torch.bool) if rules.connect_all else tool_distances < rules.radius
+    window, point, tool = (near_tools & used[:, :, None]).nonzero(as_tuple=True)
+    particle_ends, tool_ends = number[window, point], count + window * tools.shape[1] + tool
+    return Graph(torch.cat([receivers, particle_ends, tool_ends]), torch.cat([senders, tool_ends, particle_ends]), count)
 
 
 def sample(
     points: torch.Tensor, usable: torch.Tensor, most: int, coverage: float, first: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Farthest points of B clouds at once: indices [B, K] into points [B, M, 3], and which entries are used [B, K].
+    """Farthest-point samples of B clouds at once: indices [B, K] into points [B, M, 3], and which entries are used [B, K].
 
-    Starts at point first [B], adds the usable [B, M] point that is farthest from those chosen, up to `most`, and stops when all lie
-    within `coverage`, m. The same as the public code's two passes: to `most` points, then among these until they are covered.
+    A sample starts at point first [B] and adds the usable [B, M] point that is farthest from it, up to `most` points or until all
+    points lie within `coverage`, m. The public code's two passes give the same: `most` points, then as many of these as cover.
     """
     rows = torch.arange(len(points), device=points.device)
     distance = torch.where(usable, torch.inf, -torch.inf).to(points.dtype)
-    chosen, used = [first], [torch.ones_like(first, dtype=torch.bool)]
-    while len(chosen) < most:
-        distance = torch.minimum(distance, (points - points[rows, chosen[-1]][:, None]).norm(dim=2))
+    indices, used = [first], [torch.ones_like(first, dtype=torch.bool)]
+    while len(indices) < most:
+        distance = torch.minimum(distance, (points - points[rows, indices[-1]][:, None]).norm(dim=2))
         farthest, index = distance.max(dim=1)
-        open_ = used[-1] & (farthest > coverage)
-        if not bool(open_.any()):
+        uncovered = used[-1] & (farthest > coverage)
+        if not bool(uncovered.any()):
             break
-        chosen.append(index)
-        used.append(open_)
-    return torch.stack(chosen, dim=1), torch.stack(used, dim=1)
+        indices.append(index)
+        used.append(uncovered)
+    return torch.stack(indices, dim=1), torch.stack(used, dim=1)

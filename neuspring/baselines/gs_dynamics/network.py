@@ -1,86 +1,93 @@
-"""The graph network: what it sees, its layers, and its weights as one vector.
+"""The graph network: what it sees, and its layers.
 
 With receiver r and sender s of edge e, h the state of a node, c codes, R = ReLU:
 
     m_e = R(W_r [c_e, h_r, h_s]),    h' = R(W_p [c_n, sum_e m_e] + h),
 
-a number of rounds with the same weights, from h = c_n. A head turns h of particles into displacements, m. Products with blocks of
-W_r are taken of nodes and then gathered: the same sums, for fewer operations than products of what was gathered.
+a number of rounds with the same weights, from h = c_n. A head turns h of particles into displacements, m. Each block of W_r is
+multiplied with nodes, and the products are gathered at edges: the same sums as products of gathered states, in fewer operations.
 """
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch.nn.functional import linear, relu
+from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
 from neuspring.baselines.gs_dynamics.graph import Graph
 from neuspring.baselines.gs_dynamics.rules import Rules
 
 UP_AXIS = 2
 """Positions here have +z up."""
+# Without weights: they are drawn by `initial` or set by `of`.
+Linear = partial(skip_init, torch.nn.Linear)
 
 
-def layers(rules: Rules) -> dict[str, tuple[int, int]]:
-    """(outputs, inputs) of each linear layer, in the order in which weights are stored: matrix, then bias."""
-    width = rules.width
-    found: dict[str, tuple[int, int]] = {}
-    for name, size in (("node", rules.node_size), ("edge", rules.edge_size)):
-        found |= {f"{name}.{i}": (width, width if i else size) for i in range(3)}
-    found |= {"relation": (width, 3 * width), "particle": (width, 2 * width)}
-    return found | {f"head.{i}": (3 if i == 2 else width, width) for i in range(3)}
+class Dynamics(torch.nn.Module):
+    """The network. A model file holds its weights as one vector [W]: the parameters in their order, matrix before bias."""
 
+    def __init__(self, rules: Rules) -> None:
+        super().__init__()
+        self.rules, width = rules, rules.width
+        self.node, self.edge = _encoder(rules.node_size, width), _encoder(rules.edge_size, width)
+        self.relation, self.particle = Linear(3 * width, width), Linear(2 * width, width)
+        relu_layer = torch.nn.ReLU()
+        self.head = torch.nn.Sequential(Linear(width, width), relu_layer, Linear(width, width), relu_layer, Linear(width, 3))
 
-def weight_count(rules: Rules) -> int:
-    """Length of the vector of weights."""
-    return sum(outputs * (inputs + 1) for outputs, inputs in layers(rules).values())
+    @classmethod
+    def of(cls, rules: Rules, weights: torch.Tensor) -> Dynamics:
+        """The network with weights [W], on their device and of their dtype; it shares their memory."""
+        network = cls(rules).to(weights)
+        vector_to_parameters(weights, network.parameters())
+        return network
 
+    @classmethod
+    def initial(cls, rules: Rules, seed: int, device: str = "cpu") -> Dynamics:
+        """The network with weights as torch starts linear layers: uniform in +- 1 / sqrt(inputs)."""
+        generator = torch.Generator().manual_seed(seed)
+        layers = [layer for layer in cls(rules).modules() if isinstance(layer, torch.nn.Linear)]
+        draws = [
+            (torch.rand(layer.out_features * (layer.in_features + 1), generator=generator) * 2 - 1) / layer.in_features**0.5
+            for layer in layers
+        ]
+        return cls.of(rules, torch.cat(draws).to(device))
 
-def initial_weights(rules: Rules, seed: int) -> torch.Tensor:
-    """Weights [W] as torch starts linear layers: uniform in +- 1 / sqrt(inputs)."""
-    draw = torch.Generator().manual_seed(seed)
-    parts = []
-    for outputs, inputs in layers(rules).values():
-        parts.append((torch.rand(outputs * (inputs + 1), generator=draw) * 2 - 1) / inputs**0.5)
-    return torch.cat(parts)
+    @property
+    def weights(self) -> torch.Tensor:
+        """A copy of the weights [W], without gradient."""
+        return parameters_to_vector(self.parameters()).detach()
 
-
-class Dynamics:
-    """A network with given weights [W]; gradients flow to them."""
-
-    def __init__(self, rules: Rules, weights: torch.Tensor) -> None:
-        self.rules, named = rules, layers(rules)
-        sizes = [size for outputs, inputs in named.values() for size in (outputs * inputs, outputs)]
-        parts = iter(weights.split(sizes))
-        self._layers = {name: (next(parts).view(shape), next(parts)) for name, shape in named.items()}
-
-    def __call__(self, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def forward(self, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Displacements [P, 3] of particles, m, in the next step.
 
         history [H, N, 3], m, oldest first: positions of the nodes. action [N - P, 3], m: the tools' next displacements.
         """
-        nodes = self._encode("node", node_inputs(self.rules, graph, history, action))
-        edges = self._encode("edge", edge_inputs(graph, history))
-        (by_edge, by_receiver, by_sender), bias = self._blocks("relation", 3)
-        (by_code, by_sum), particle_bias = self._blocks("particle", 2)
-        of_edges, of_codes, state = linear(edges, by_edge, bias), linear(nodes, by_code, particle_bias), nodes
+        nodes = self.node(node_inputs(self.rules, graph, history, action))
+        edges = self.edge(edge_inputs(graph, history))
+        by_edge, by_receiver, by_sender = self.relation.weight.chunk(3, dim=1)
+        by_code, by_sum = self.particle.weight.chunk(2, dim=1)
+        edge_part, code_part = linear(edges, by_edge, self.relation.bias), linear(nodes, by_code, self.particle.bias)
+        state = nodes
         for _ in range(self.rules.rounds):
             received = linear(state, by_receiver).index_select(0, graph.receivers)
-            messages = relu(of_edges + received + linear(state, by_sender).index_select(0, graph.senders))
+            messages = relu(edge_part + received + linear(state, by_sender).index_select(0, graph.senders))
             total = torch.zeros_like(state).index_add(0, graph.receivers, messages)
-            state = relu(of_codes + linear(total, by_sum) + state)
-        hidden = state[: graph.particles]
-        for name in ("head.0", "head.1"):
-            hidden = relu(linear(hidden, *self._layers[name]))
-        return linear(hidden, *self._layers["head.2"])
+            state = relu(code_part + linear(total, by_sum) + state)
+        displacements: torch.Tensor = self.head(state[: graph.particles])
+        return displacements
 
-    def _encode(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        for i in range(3):
-            values = relu(linear(values, *self._layers[f"{name}.{i}"]))
-        return values
 
-    def _blocks(self, name: str, count: int) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
-        matrix, bias = self._layers[name]
-        return matrix.chunk(count, dim=1), bias
+def _encoder(inputs: int, width: int) -> torch.nn.Sequential:
+    relu_layer = torch.nn.ReLU()
+    layers = (Linear(inputs, width), Linear(width, width), Linear(width, width))
+    return torch.nn.Sequential(*(module for layer in layers for module in (layer, relu_layer)))
+
+
+def weight_count(rules: Rules) -> int:
+    """Length of the vector of weights."""
+    return sum(parameter.numel() for parameter in Dynamics(rules).parameters())
 
 
 def node_inputs(rules: Rules, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

@@ -15,7 +15,7 @@ from neuspring.baselines.gs_dynamics.windows import Windows
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Windows with P particles and C tools in all, N = P + C nodes."""
+    """A batch of windows. All together have P particles and C tools, N = P + C nodes."""
 
     graph: Graph
     history: torch.Tensor
@@ -25,45 +25,52 @@ class Batch:
     targets: torch.Tensor
     """[F, P, 3] m."""
     known: torch.Tensor
-    """[F, P] bool: targets that were seen."""
+    """[F, P] bool: whether the target was seen."""
     slots: int
-    """Particles that there would be if every window had the most."""
+    """The batch size times the most particles of a window, for `padded_mean`."""
 
 
 def draw(windows: Windows, rules: Rules, recipe: Recipe, generator: torch.Generator) -> Batch:
-    """Windows at random, each seen at its own particles, turned and with noise. The generator is the CPU's."""
+    """Draw random windows, each with its own particles, a random yaw and noise. The generator is on the CPU."""
     device, history = windows.frames.device, windows.history
     numbers = torch.randint(len(windows), (recipe.batch,), generator=generator)
     chances = torch.rand(recipe.batch, 2, generator=generator)
     frames, usable = windows.frames[numbers.to(device)], windows.usable[numbers.to(device)]
     now = windows.points[frames[:, history - 1]]
-    chosen, used = sample(now, usable, rules.particles, rules.coverage, pick(usable, chances[:, 0].to(device)))
+    indices, used = sample(now, usable, rules.particles, rules.coverage, pick(usable, chances[:, 0].to(device)))
     window, slot = used.nonzero(as_tuple=True)
-    particle = chosen[window, slot]
-    seen = windows.points[frames[window].T, particle]
-    held = windows.tools[frames].transpose(0, 1)
+    particle = indices[window, slot]
+    points = windows.points[frames[window].T, particle]
+    tools = windows.tools[frames].transpose(0, 1)
     turn = rotations(chances[:, 1] if recipe.yaw else torch.zeros(recipe.batch)).to(device)
-    seen = torch.einsum("nij,tnj->tni", turn[window], seen)
-    held = torch.einsum("bij,tbcj->tbci", turn, held)
-    seen[:history] += noise(seen[:history].shape, recipe.noise, generator).to(device)
-    past = held[:history] + noise(held[:history].shape, recipe.noise, generator).to(device)
+    points = torch.einsum("nij,tnj->tni", turn[window], points)
+    tools = torch.einsum("bij,tbcj->tbci", turn, tools)
+    points[:history] += noise(points[:history].shape, recipe.noise, generator).to(device)
+    past = tools[:history] + noise(tools[:history].shape, recipe.noise, generator).to(device)
     latest = torch.zeros_like(now[:, : used.shape[1]])
-    latest[window, slot] = seen[history - 1]
+    latest[window, slot] = points[history - 1]
     graph = connect(latest, used, past[-1], rules)
-    nodes = torch.cat([seen[:history], past.flatten(1, 2)], dim=1)
-    known = windows.visible[frames[window].T, particle]
-    return Batch(graph, nodes, held[history:].flatten(1, 2), seen[history:], known[history:], slots=recipe.batch * rules.particles)
+    nodes = torch.cat([points[:history], past.flatten(1, 2)], dim=1)
+    visible = windows.visible[frames[window].T, particle]
+    return Batch(
+        graph=graph,
+        history=nodes,
+        tools=tools[history:].flatten(1, 2),
+        targets=points[history:],
+        known=visible[history:],
+        slots=recipe.batch * rules.particles,
+    )
 
 
 def pick(usable: torch.Tensor, chance: torch.Tensor) -> torch.Tensor:
-    """Index [B] of one usable [B, M] entry of each row, by chance [B] in [0, 1)."""
+    """Index [B] of one of the usable [B, M] entries of each row, for a uniform draw `chance` [B] in [0, 1)."""
     counts = usable.sum(dim=1)
     rank = torch.minimum((chance * counts).long(), counts - 1)
     return (usable.cumsum(dim=1) > rank[:, None]).to(torch.uint8).argmax(dim=1)
 
 
 def rotations(chance: torch.Tensor) -> torch.Tensor:
-    """[B, 3, 3]: turns about z by chance [B] of a whole turn."""
+    """Rotations [B, 3, 3] about z by the fraction `chance` [B] of a whole turn."""
     angle = chance * 2 * math.pi
     turn = torch.zeros(len(chance), 3, 3)
     turn[:, 0, 0] = turn[:, 1, 1] = angle.cos()
@@ -74,14 +81,14 @@ def rotations(chance: torch.Tensor) -> torch.Tensor:
 
 
 def noise(shape: torch.Size, size: float, generator: torch.Generator) -> torch.Tensor:
-    """Uniform in +- size, m."""
+    """Noise, uniform in +- size, m."""
     return (torch.rand(shape, generator=generator) * 2 - 1) * size
 
 
 def unroll(dynamics: Dynamics, batch: Batch, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Position loss and length loss, m^2, each summed over the steps of the future; lengths are not weighted yet.
+    """Position loss and length loss, m^2, each summed over the predicted steps. The length loss has no weight yet.
 
-    Edges stay those of the first graph; tools go where they were recorded.
+    The edges of the first graph stay. Tools move as recorded.
     """
     particles = batch.graph.particles
     state, tools = batch.history[:, :particles], batch.history[:, particles:]
@@ -98,17 +105,17 @@ def unroll(dynamics: Dynamics, batch: Batch, recipe: Recipe) -> tuple[torch.Tens
 
 
 def position_loss(after: torch.Tensor, target: torch.Tensor, known: torch.Tensor, slots: int | None) -> torch.Tensor:
-    """Mean over coordinates of the squared error of what is known [P], m^2; with `slots`, over so many particles instead."""
+    """Mean squared error, m^2, over coordinates of known [P] targets; with `slots`, the sum is divided by so many particles."""
     squares = torch.where(known[:, None], (after - target).square(), 0.0)
-    counted = known.sum().clamp(min=1) if slots is None else slots
-    return squares.sum() / (3 * counted)
+    count = known.sum().clamp(min=1) if slots is None else slots
+    return squares.sum() / (3 * count)
 
 
 def length_loss(graph: Graph, after: torch.Tensor, before: torch.Tensor, faithful: bool) -> torch.Tensor:
     """Mean squared change of the lengths of edges from particles `before` to `after` [P, 3], m^2.
 
-    Edges of a particle to itself count, with no change. Edges to tools are left out; faithful: they count as if the tool were at
-    the origin, as its column is missing from the incidence matrices of the public code.
+    An edge of a particle to itself counts, with no change. Edges to tools are left out. With `faithful` they count as if the tool
+    were at the origin: its column is missing from the incidence matrices of the public code.
     """
     receivers, senders = graph.receivers, graph.senders
     if not faithful:
@@ -119,7 +126,7 @@ def length_loss(graph: Graph, after: torch.Tensor, before: torch.Tensor, faithfu
 
 
 def edge_lengths(points: torch.Tensor, receivers: torch.Tensor, senders: torch.Tensor) -> torch.Tensor:
-    """[E] m; nodes that are no particle are at the origin."""
+    """Lengths [E] m. Nodes that are no particle count as at the origin."""
     ends, origin = torch.cat([points, points.new_zeros(1, 3)]), len(points)
     lengths: torch.Tensor = (ends[receivers.clamp(max=origin)] - ends[senders.clamp(max=origin)]).norm(dim=1)
     return lengths

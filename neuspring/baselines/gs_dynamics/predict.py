@@ -1,4 +1,4 @@
-"""Open-loop rollout of a GS-Dynamics model: structure points move a step whenever the tools have moved one."""
+"""Open-loop rollout of a GS-Dynamics model: structure points make a step whenever the tools have moved by one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neuspring.core.artifacts import Observations, Trajectory
 
 @dataclass
 class Steps:
-    """The steps of a rollout: where structure points are when the tools have moved a step."""
+    """The steps of a rollout: structure points in the frames in which the tools have moved by a step."""
 
     frames: list[int]
     positions: list[torch.Tensor]
@@ -28,22 +28,21 @@ class Steps:
     touched: list[int] = field(default_factory=list)
     """Edges between particles and tools."""
     reason: str = ""
-    """Why the rollout ended early, ..."""
+    """Why the rollout ended early; empty: it did not."""
     diverged_frame: int | None = None
-    """... and where."""
 
 
 def step(dynamics: Dynamics, history: torch.Tensor, tools: torch.Tensor, steps: Steps) -> torch.Tensor:
-    """Structure points [N, 3], m, after one step; history [H, N, 3], m, and tools [H + 1, C, 3], m, the last of which is next."""
+    """Structure points [N, 3], m, after one step, from history [H, N, 3] and tools [H + 1, C, 3], m, of which the last is ahead."""
     rules, now = dynamics.rules, history[-1]
     first = torch.zeros(1, dtype=torch.long, device=now.device)
     usable = torch.ones(1, len(now), dtype=torch.bool, device=now.device)
-    chosen = sample(now[None], usable, rules.particles, rules.coverage, first)[0][0]
-    particles = history[:, chosen]
-    used = torch.ones(1, len(chosen), dtype=torch.bool, device=now.device)
+    indices = sample(now[None], usable, rules.particles, rules.coverage, first)[0][0]
+    particles = history[:, indices]
+    used = torch.ones(1, len(indices), dtype=torch.bool, device=now.device)
     graph = connect(particles[-1:], used, tools[-2:-1], rules)
     moves = dynamics(graph, torch.cat([particles, tools[:-1]], dim=1), tools[-1] - tools[-2])
-    steps.particles.append(len(chosen))
+    steps.particles.append(len(indices))
     steps.touched.append(int((~graph.among_particles).sum()) // 2)
     if not bool(torch.isfinite(moves).all()):
         return torch.full_like(now, torch.nan)
@@ -53,7 +52,7 @@ def step(dynamics: Dynamics, history: torch.Tensor, tools: torch.Tensor, steps: 
 
 @torch.no_grad()
 def roll_out(model: GsDynamicsModel, nodes: np.ndarray, tools: np.ndarray, device: str) -> Steps:
-    """Nodes [N, 3] m of frame 0 under tools [T, C, 3] m, +z up, without any other look at the object."""
+    """Roll out nodes [N, 3] m of frame 0 under tools [T, C, 3] m, with +z up."""
     rules, dynamics = model.rules, model.dynamics(device)
     start, hands = torch.tensor(nodes, device=device), torch.tensor(tools, device=device)
     steps = Steps([0], [start])
@@ -73,32 +72,34 @@ def roll_out(model: GsDynamicsModel, nodes: np.ndarray, tools: np.ndarray, devic
 
 
 def in_every_frame(steps: list[int], positions: np.ndarray, frames: int, interpolate: bool) -> np.ndarray:
-    """[frames, N, 3] m of positions [S, N, 3] in frames `steps`: on straight lines between them, or held; held after the last."""
-    known, frame = np.array(steps), np.arange(frames)
-    before = np.searchsorted(known, frame, side="right") - 1
+    """Positions [frames, N, 3], m, of which those [S, N, 3] in the frames `steps` are given.
+
+    Between two steps points move on straight lines, or wait for the next; after the last they stay.
+    """
+    given_frames, frame = np.array(steps), np.arange(frames)
+    before = np.searchsorted(given_frames, frame, side="right") - 1
     if not interpolate:
         return np.asarray(positions[before])
-    after = np.minimum(before + 1, len(known) - 1)
-    span = np.maximum(known[after] - known[before], 1)
-    part = ((frame - known[before]) / span).astype(positions.dtype)[:, None, None]
+    after = np.minimum(before + 1, len(given_frames) - 1)
+    span = np.maximum(given_frames[after] - given_frames[before], 1)
+    part = ((frame - given_frames[before]) / span).astype(positions.dtype)[:, None, None]
     # Exact where the two are the same.
     return np.asarray(positions[before] + part * (positions[after] - positions[before]))
 
 
 def predict(model: GsDynamicsModel, observations: Observations, device: str) -> Prediction:
-    """Structure points over all frames, from those of frame 0 and the controllers; the object is not looked at later.
+    """Structure points in all frames, from those of frame 0 and the controllers; nothing else of the object is read.
 
-    For a transfer, observations are the target's: its structure points and controllers, with the weights of the source. The
-    published transfers started from the source's points, registered to the target.
+    For a transfer, the observations are the target's and the model is the source's. The published transfers started from the
+    source's points, registered to the target.
     """
     up = observations.scenario.up
     tools = tools_of(upright(observations.controller_points, up), model.rules)
     steps = roll_out(model, upright(observations.nodes, up), tools, device)
-    asked = len(tools)
-    kept = asked if steps.diverged_frame is None else steps.diverged_frame
-    places = torch.stack(steps.positions).cpu().numpy()
-    positions = upright(in_every_frame(steps.frames, places, kept, model.rules.interpolate), up)
-    trajectory = Trajectory(positions=positions, frame_count=asked, diverged_frame=steps.diverged_frame, reason=steps.reason)
+    end = len(tools) if steps.diverged_frame is None else steps.diverged_frame
+    step_positions = torch.stack(steps.positions).cpu().numpy()
+    positions = upright(in_every_frame(steps.frames, step_positions, end, model.rules.interpolate), up)
+    trajectory = Trajectory(positions=positions, frame_count=len(tools), diverged_frame=steps.diverged_frame, reason=steps.reason)
     facts = {
         "executed_steps": len(steps.frames) - 1,
         "tools": tools.shape[1],

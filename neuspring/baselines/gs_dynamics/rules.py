@@ -1,19 +1,18 @@
-"""The public configurations, and the plain values that a network and its rollout need of them."""
+"""The public configurations per kind of object, and the plain values that networks, rollouts and training take from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, TypeVar
+from dataclasses import dataclass, fields
+from typing import Literal
 
 from neuspring.config.gs_dynamics import GsDynamics, NodeInput, Propagation, Tools
 
 PresetName = Literal["rope", "animals", "cloth"]
-Values = TypeVar("Values")
 
 
 @dataclass(frozen=True)
 class Preset:
-    """What differs between kinds of objects; meanings as in GsDynamics."""
+    """Settings that differ between kinds of objects. Meanings as in GsDynamics."""
 
     radius: float
     neighbours: int
@@ -44,7 +43,7 @@ def preset_name(settings: GsDynamics, category: str) -> PresetName:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """How graphs are made and what the network sees; with its weights, all that a rollout needs. Meanings as in GsDynamics."""
+    """How graphs are made and what the network sees. A rollout needs these and the weights. Meanings as in GsDynamics."""
 
     radius: float
     neighbours: int
@@ -85,19 +84,8 @@ class Recipe:
 
 
 def resolve(settings: GsDynamics, category: str) -> tuple[Rules, Recipe]:
-    """Settings with every null replaced by the value of the preset."""
-    preset = PRESETS[preset_name(settings, category)]
-
-    def own(name: str) -> dict[str, object]:
-        chosen = getattr(settings, name)
-        return {name: getattr(preset, name) if chosen is None else chosen}
-
-    connect_all = settings.tools == "centroids" if settings.connect_all is None else settings.connect_all
-    rules = own("radius") | own("neighbours") | own("particles") | own("node_input") | {"connect_all": connect_all}
-    recipe = own("noise") | own("length_weight") | own("batch")
-    return _filled(Rules, settings, rules), _filled(Recipe, settings, recipe)
-
-
-def _filled(kind: type[Values], settings: GsDynamics, chosen: dict[str, object]) -> Values:
-    others = {name: getattr(settings, name) for name in kind.__annotations__ if name not in chosen}
-    return kind(**chosen | others)
+    """The settings of a model and of its training, with every null replaced by the value of the preset."""
+    values = vars(PRESETS[preset_name(settings, category)]) | {"connect_all": settings.tools == "centroids"}
+    values |= {name: value for name, value in vars(settings).items() if value is not None}
+    rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))
+    return Rules(**rules), Recipe(**recipe)

@@ -1,4 +1,4 @@
-"""What training sees of a capture: tracks and tools in the training frames, with +z up, outliers dropped, smoothed."""
+"""What training sees of a capture: smoothed tracks without outliers, and tools, in the training frames, with +z up."""
 
 from __future__ import annotations
 
@@ -13,45 +13,45 @@ from neuspring.core.artifacts import Observations, Up
 from neuspring.core.points import farthest
 
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
-"""About the x axis: takes a world with -z up to one with +z up, and back, without making a mirror image of it."""
+"""Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
 HAND_GAP = 0.08
 """Controllers that a chain of gaps no longer than this joins in frame 0 are one hand, m."""
 
 
 def upright(points: np.ndarray, up: Up) -> np.ndarray:
-    """Points [..., 3] with +z up, m; applied again, as they were."""
+    """Points [..., 3], m, of a world with this `up` in one with +z up. Applied twice, it changes nothing."""
     return points.astype(np.float32) if up == "+z" else points.astype(np.float32) * HALF_TURN
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Of T training frames."""
+    """Tracks and tools in T training frames."""
 
     points: np.ndarray
-    """[T, M, 3] m; anything where not visible."""
+    """[T, M, 3] m; without meaning where not visible."""
     visible: np.ndarray
     """[T, M] bool."""
     tools: np.ndarray
     """[T, C, 3] m."""
     dropped: int
-    """Tracks that were outliers."""
+    """How many tracks were outliers."""
 
     @classmethod
     def of(cls, observations: Observations, settings: GsDynamics, rules: Rules) -> Tracks:
-        """Of the training frames of a capture, and nothing else of it."""
+        """From the training frames of a capture; nothing else of it is read."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
-        kept = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
-        chosen = kept[farthest(points[0, kept], settings.dense_points)]
-        smooth = smoothed(points[:, chosen], visible[:, chosen], settings.smoothing_passes)
+        inliers = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
+        indices = inliers[farthest(points[0, inliers], settings.dense_points)]
+        smooth = smoothed(points[:, indices], visible[:, indices], settings.smoothing_passes)
         tools = tools_of(upright(observations.controller_points[train], up), rules)
-        return cls(smooth, visible[:, chosen], tools, points.shape[1] - len(kept))
+        return cls(smooth, visible[:, indices], tools, points.shape[1] - len(inliers))
 
 
 def tools_of(controllers: np.ndarray, rules: Rules) -> np.ndarray:
     """Tool nodes [T, C', 3], m: the controllers [T, C, 3], or the mean of each hand.
 
-    Nothing tells which controllers are of one hand: those that are linked in frame 0 by gaps of at most `HAND_GAP`.
+    Captures do not say which controllers belong to one hand, so gaps decide: see HAND_GAP.
     """
     if rules.tools == "points" or controllers.shape[1] == 1:
         return controllers
@@ -60,7 +60,10 @@ def tools_of(controllers: np.ndarray, rules: Rules) -> np.ndarray:
 
 
 def path_lengths(points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """[M] m: the mean motion between successive frames that both see a point, times their number; NaN where there are none."""
+    """Path lengths [M], m: a point's mean motion over pairs of successive frames that see it, times the number of all pairs.
+
+    NaN where no pair sees the point.
+    """
     both = visible[1:] & visible[:-1]
     steps = np.where(both, np.linalg.norm(np.diff(points, axis=0), axis=2), 0.0)
     pairs = both.sum(axis=0)
@@ -68,21 +71,21 @@ def path_lengths(points: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def ordinary(points: np.ndarray, visible: np.ndarray, deviations: float) -> np.ndarray:
-    """[M] bool: tracks whose path length is not `deviations` or more median absolute deviations from the median (0: all tracks).
+    """[M] bool: tracks whose path length is less than `deviations` median absolute deviations from the median.
 
-    Where the deviation is 0, as when all move as one, there are no outliers. Points without a path are no use.
+    All tracks with `deviations` 0. All tracks with a path where the deviation is 0, as when all move as one.
     """
     lengths = path_lengths(points, visible)
-    found = np.isfinite(lengths)
-    if not deviations or not found.any():
-        return np.ones_like(found)
-    away = np.abs(lengths - np.median(lengths[found]))
-    spread = np.median(away[found])
-    return np.asarray(found & (away < deviations * spread)) if spread > 0 else found
+    finite = np.isfinite(lengths)
+    if not deviations or not finite.any():
+        return np.ones_like(finite)
+    distance = np.abs(lengths - np.median(lengths[finite]))
+    spread = np.median(distance[finite])
+    return np.asarray(finite & (distance < deviations * spread)) if spread > 0 else finite
 
 
 def smoothed(points: np.ndarray, visible: np.ndarray, passes: int) -> np.ndarray:
-    """Points [T, M, 3] after moving averages over three frames, of what is visible [T, M] of them; others stay."""
+    """Points [T, M, 3] after moving averages over three frames of the visible [T, M] ones. Invisible points stay."""
     weights = visible[..., None].astype(np.float32)
     result = np.where(visible[..., None], points, 0).astype(np.float32)
     count = _three(weights)

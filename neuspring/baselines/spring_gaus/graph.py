@@ -1,40 +1,46 @@
-"""Anchors, their directed neighbours, the controllers' links, and how points are bound to anchors; all of frame 0."""
+"""Anchors in frame 0: their directed neighbors, the controllers' links to them, and how points are bound to them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.core.errors import NumericalFailure
+from neuspring.core.artifacts import Artifact, array
+from neuspring.core.errors import InputError, NumericalFailure
 
 SHORTEST_LINK = 1e-4
 """Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
 NEAREST = 1e-12
-"""Distances to anchors are floored here where a weight is made of them, m."""
+"""Distances to anchors are floored here before a weight is computed from them, m."""
 
 
-@dataclass(frozen=True)
-class AnchorGraph:
-    """Who pulls whom. Springs are directed: row i is what anchor i feels."""
+@dataclass(frozen=True, kw_only=True)
+class AnchorGraph(Artifact):
+    """Which anchors and controllers each anchor feels. Springs are directed: row i is what anchor i feels."""
 
-    anchors: np.ndarray
-    """[N, 3] m, at frame 0."""
-    neighbours: np.ndarray
-    """[N, K] int32: the K nearest other anchors, nearest first."""
-    lengths: np.ndarray
-    """[N, K] m: their distances at frame 0, the rest lengths."""
-    link_starts: np.ndarray
-    """[N + 1] int32: links of anchor i are `link_starts[i]:link_starts[i + 1]`."""
-    links: np.ndarray
-    """[M] int32: a controller for each link."""
-    link_lengths: np.ndarray
-    """[M] m: rest lengths of the links."""
+    kind: ClassVar[str] = "anchor_graph"
+    anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
+    neighbours: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
+    lengths: np.ndarray = array("N,K", np.float32, "m", "their distances in frame 0, the rest lengths")
+    link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
+    links: np.ndarray = array("M", np.int32, "1", "controller of each link")
+    link_lengths: np.ndarray = array("M", np.float32, "m", "rest lengths of links")
+
+    def check(self) -> None:
+        anchors = len(self.anchors)
+        if len(self.link_starts) != anchors + 1:
+            raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
+        if self.neighbours.size and not 0 <= self.neighbours.min() <= self.neighbours.max() < anchors:
+            raise InputError("spring_gaus.neighbours", f"indices must lie in [0, {anchors})", int(self.neighbours.max()))
+        if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
+            raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
 
     @classmethod
-    def of(cls, anchors: np.ndarray, controllers: np.ndarray, neighbours: int, reach: float, link_count: int) -> AnchorGraph:
-        """Of anchors [N, 3] and controllers [C, 3] at frame 0, m.
+    def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbours: int, reach: float, link_count: int) -> AnchorGraph:
+        """The graph of anchors [N, 3] and controllers [C, 3] of frame 0, m.
 
         Each controller is linked to its at most `link_count` nearest anchors within `reach`, m. Raises NumericalFailure if there
         are too few anchors, or two at one place.
@@ -45,21 +51,19 @@ class AnchorGraph:
         distance, index = tree.query(anchors, k=neighbours + 1)
         if distance[:, 1].min() <= 0:
             raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
-        # The nearest is the anchor itself: distances of others are positive.
-        distance, index = distance[:, 1:], index[:, 1:]
-        away, near = tree.query(controllers, k=min(link_count, len(anchors)), distance_upper_bound=reach)
-        away, near = away.reshape(len(controllers), -1), near.reshape(len(controllers), -1)
-        controller, slot = np.nonzero(np.isfinite(away))
-        anchor, length = near[controller, slot], np.maximum(away[controller, slot], SHORTEST_LINK)
+        link_distance, near = tree.query(controllers, k=min(link_count, len(anchors)), distance_upper_bound=reach)
+        link_distance, near = link_distance.reshape(len(controllers), -1), near.reshape(len(controllers), -1)
+        controller, slot = np.nonzero(np.isfinite(link_distance))
+        anchor, length = near[controller, slot], np.maximum(link_distance[controller, slot], SHORTEST_LINK)
         order = np.lexsort((controller, anchor))
-        starts = np.searchsorted(anchor[order], np.arange(len(anchors) + 1))
-        return cls(
-            anchors.astype(np.float32),
-            index.astype(np.int32),
-            distance.astype(np.float32),
-            starts.astype(np.int32),
-            controller[order].astype(np.int32),
-            length[order].astype(np.float32),
+        return AnchorGraph(
+            anchors=anchors,
+            # The nearest is the anchor itself: distances of others are positive.
+            neighbours=index[:, 1:],
+            lengths=distance[:, 1:],
+            link_starts=np.searchsorted(anchor[order], np.arange(len(anchors) + 1)),
+            links=controller[order],
+            link_lengths=length[order],
         )
 
     @property
@@ -69,15 +73,15 @@ class AnchorGraph:
 
 
 def choose_anchors(points: np.ndarray, count: int, cells: tuple[float, ...], draw: np.random.Generator) -> np.ndarray:
-    """`count` centres [N, 3] of occupied cells of a grid, at random; of the first of the cell sizes, m, that has so many.
+    """`count` random centers [N, 3] of occupied cells of a grid, m.
 
-    All centres of the finest grid if none has.
+    The grid has the first of the sizes `cells`, m, with so many occupied cells. If none has, all centers of the last are returned.
     """
     for size in cells:
-        centres = (np.unique(np.floor(points / size).astype(np.int64), axis=0) + 0.5) * size
-        if len(centres) >= count:
-            return centres[np.sort(draw.choice(len(centres), count, replace=False))]
-    return centres
+        centers = (np.unique(np.floor(points / size).astype(np.int64), axis=0) + 0.5) * size
+        if len(centers) >= count:
+            return centers[np.sort(draw.choice(len(centers), count, replace=False))]
+    return centers
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A trained Spring-Gaus model: anchors, whom they feel, and what was learned about them."""
+"""A trained Spring-Gaus model: the graph of its anchors, and the parameters that were learned."""
 
 from __future__ import annotations
 
@@ -12,21 +12,14 @@ import torch
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.solver import AnchorParameters, AnchorPhysics
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.core.artifacts import Artifact, array
-from neuspring.core.errors import InputError
+from neuspring.core.artifacts import array
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringGausModel(Artifact):
+class SpringGausModel(AnchorGraph, AnchorPhysics):
     """Anchors of frame 0 and the parameters of their motion, at 1 kg per anchor."""
 
     kind: ClassVar[str] = "spring_gaus"
-    anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
-    neighbours: np.ndarray = array("N,K", np.int32, "1", "nearest other anchors, nearest first")
-    lengths: np.ndarray = array("N,K", np.float32, "m", "rest lengths")
-    link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
-    links: np.ndarray = array("M", np.int32, "1", "controller of each link")
-    link_lengths: np.ndarray = array("M", np.float32, "m", "rest lengths of links")
     kappa: np.ndarray = array("N", np.float32, "log10 N", "stiffness of what anchor i feels")
     soft: np.ndarray = array("1", np.float32, "1", "s of the soft vector")
     theta: np.ndarray = array("1", np.float32, "1", "exp(zeta), zeta in N s")
@@ -34,26 +27,9 @@ class SpringGausModel(Artifact):
     velocity: np.ndarray = array("3", np.float32, "m/s", "of all anchors in frame 0")
     substeps: int
     """Per frame."""
-    frame_time: float
-    """s."""
-    up_sign: float
-    gravity: float
-    """m/s^2."""
-    ground: bool
-    exponent: float
-    link_stiffness: float
     full_neighbours: int
     bound_anchors: int
     negative_damping: bool
-
-    def check(self) -> None:
-        anchors = len(self.anchors)
-        if len(self.link_starts) != anchors + 1:
-            raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
-        if self.neighbours.size and not 0 <= self.neighbours.min() <= self.neighbours.max() < anchors:
-            raise InputError("spring_gaus.neighbours", f"indices must lie in [0, {anchors})", int(self.neighbours.max()))
-        if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
-            raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
 
     @classmethod
     def start(
@@ -79,22 +55,12 @@ class SpringGausModel(Artifact):
             negative_damping=settings.negative_damping,
         )
 
-    @property
-    def graph(self) -> AnchorGraph:
-        """Who pulls whom."""
-        return AnchorGraph(self.anchors, self.neighbours, self.lengths, self.link_starts, self.links, self.link_lengths)
-
-    @property
-    def physics(self) -> AnchorPhysics:
-        """What was not trained."""
-        return AnchorPhysics(self.frame_time, self.exponent, self.link_stiffness, self.gravity, self.up_sign, self.ground)
-
     def tensors(self, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
-        """What is trained: kappa [N], soft [1], theta [1], rho [1], velocity [3]."""
+        """The parameters that are trained: kappa [N], soft [1], theta [1], rho [1], velocity [3]."""
         return {name: torch.tensor(getattr(self, name), device=device, dtype=dtype) for name in TRAINED}
 
     def parameters(self, tensors: Mapping[str, torch.Tensor]) -> AnchorParameters:
-        """The tensors of `tensors` as forces take them, differentiably."""
+        """Values named as in `tensors`, in the form that the forces use; differentiable."""
         theta = tensors["theta"]
         return AnchorParameters(
             stiffness=10 ** tensors["kappa"],

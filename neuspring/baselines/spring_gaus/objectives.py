@@ -1,4 +1,4 @@
-"""What the anchors of a frame are compared with: silhouettes of the splats that follow them, or points."""
+"""Losses of the anchors of a frame: on silhouettes of the splats that follow them, or on points that do."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from neuspring.splats.rasterise import Backend, rasterise
 from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
+Masks = dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
+"""(camera, frame) -> two masks [H, W], bool: the object, and the pixels that count (None: all)."""
+
 
 class Follower:
     """Points that follow anchors by fixed weights, on a device."""
@@ -25,37 +28,36 @@ class Follower:
 
     def __call__(self, anchors: torch.Tensor) -> torch.Tensor:
         """Weighted means [P, 3] of anchors [N, 3]."""
-        # A bag of rows: its gradient needs no [P, k, 3] in memory.
+        # The gradient of a bag of rows needs no [P, k, 3] in memory.
         weights = self.weights.to(anchors.dtype)
         return torch.nn.functional.embedding_bag(self.indices, anchors, per_sample_weights=weights, mode="sum")
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """Silhouettes of the splats, all white on black, against the object's mask; one camera at random per frame and iteration."""
+    """Compares the splats, white on black, with the object's mask in one random camera per frame and epoch."""
 
     splats: Gaussians
     follower: Follower
     views: Mapping[str, View]
-    masks: Mapping[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
-    """(camera, frame) -> bool [H, W]: the object, and what counts (None: everything)."""
+    masks: Masks
     loss: SilhouetteLoss
     backend: Backend
     seed: int
 
-    def __call__(self, iteration: int, frame: int, anchors: torch.Tensor) -> torch.Tensor | None:
+    def __call__(self, epoch: int, frame: int, anchors: torch.Tensor) -> torch.Tensor | None:
         """Loss of anchors [N, 3], m; None where no camera has the frame."""
         cameras = [name for name in self.views if (name, frame) in self.masks]
         if not cameras:
             return None
         # Stateless, so that a continued training draws the same cameras.
-        name = cameras[int(np.random.default_rng([self.seed, iteration, frame]).integers(len(cameras)))]
+        name = cameras[int(np.random.default_rng([self.seed, epoch, frame]).integers(len(cameras)))]
         mask, counts = self.masks[name, frame]
-        drawn, wanted = self.cover(anchors, self.views[name]), mask.float()
-        return self.loss(drawn, wanted) if counts is None else self.loss(drawn * counts, wanted * counts)
+        drawn, target = self.cover(anchors, self.views[name]), mask.float()
+        return self.loss(drawn, target) if counts is None else self.loss(drawn * counts, target * counts)
 
     def cover(self, anchors: torch.Tensor, view: View) -> torch.Tensor:
-        """Coverage [H, W] of the splats in a view: what they show in white on black."""
+        """Coverage [H, W] of the splats in a view: their picture in white on black."""
         splats, means = self.splats, self.follower(anchors)
         white = torch.ones_like(means)
         return rasterise(means, splats.quaternions, splats.scales, splats.opacities, white, view, backend=self.backend).alpha
@@ -72,7 +74,7 @@ class Points:
     follower: Follower
     loss: FrameLoss
 
-    def __call__(self, iteration: int, frame: int, anchors: torch.Tensor) -> torch.Tensor:
+    def __call__(self, epoch: int, frame: int, anchors: torch.Tensor) -> torch.Tensor:
         """Loss of anchors [N, 3], m."""
         return self.loss(frame, self.moved(anchors))
 

@@ -1,4 +1,4 @@
-"""Open-loop rollout of a Spring-Gaus model, and both of its outputs: structure points, and the centres of its splats."""
+"""Open-loop rollout of a Spring-Gaus model, and its two outputs: structure points, and the centers of its splats."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from neuspring.core.artifacts import Observations, Trajectory
 
 @torch.no_grad()
 def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tuple[torch.Tensor, str]:
-    """Anchors [F, N, 3], m, under controllers [T, C, 3], m, from frame 0; and why F < T: empty where it is not."""
-    solver = AnchorSolver(model.graph, model.physics, model.substeps, device)
+    """Anchors [F, N, 3], m, under controllers [T, C, 3], m, from frame 0, and why F < T (empty where F = T)."""
+    solver = AnchorSolver(model, model, model.substeps, device)
     parameters = model.parameters(model.tensors(device))
     start, hands = torch.tensor(model.velocity, device=device), torch.tensor(controllers, dtype=torch.float32, device=device)
     x = torch.tensor(model.anchors, device=device)
-    v, kept = torch.zeros_like(x), [x]
+    v, states = torch.zeros_like(x), [x]
     for frame in range(1, len(hands)):
-        # As in training: v0 is added on entering a frame and taken away on leaving it.
+        # As in training: v0 is added on entering a frame and removed on leaving it.
         x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
         v = v - start
         near = (x.abs() < LIMIT).all(dim=1)
         if not bool(near.all()):
-            return torch.stack(kept), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
-        kept.append(x)
-    return torch.stack(kept), ""
+            return torch.stack(states), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
+        states.append(x)
+    return torch.stack(states), ""
 
 
 def predict(model: SpringGausModel, observations: Observations, centres: np.ndarray | None, device: str) -> Prediction:
-    """Both outputs over all frames; `centres` [G, 3], m, of the splats in frame 0 (None: the model has no splats)."""
+    """Both outputs in all frames. `centres` [G, 3], m, are those of the splats in frame 0 (None: the model has no splats)."""
     anchors, reason = roll_out(model, observations.controller_points, device)
     nodes = torch.tensor(observations.nodes, device=device)
     follow = Follower(Binding.of(observations.nodes, model.anchors, model.bound_anchors), device)
@@ -45,15 +45,15 @@ def predict(model: SpringGausModel, observations: Observations, centres: np.ndar
     if centres is None:
         return Prediction(trajectory, facts)
     follow = Follower(Binding.of(centres, model.anchors, model.bound_anchors), device)
-    # Frame by frame: hundreds of thousands of splats in hundreds of frames need not be on the device together.
+    # Frame by frame, because all frames of hundreds of thousands of splats may not fit on the device.
     moved = np.stack([follow(frame).cpu().numpy() for frame in anchors])
     return Prediction(trajectory, facts | contraction(centres, moved[0]), moved)
 
 
 def contraction(centres: np.ndarray, bound: np.ndarray) -> dict[str, float]:
-    """What binding by absolute positions does to centres [G, 3], m, already in frame 0: mean shift, m, and ratio of sizes.
+    """How binding by absolute positions changes centers [G, 3], m, in frame 0: mean shift, m, and ratio of sizes.
 
-    Size: root mean square distance from the mean.
+    The size is the root mean square distance from the mean.
     """
     before, after = (float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) for points in (centres, bound))
     shift = float(np.linalg.norm(bound - centres, axis=1).mean())

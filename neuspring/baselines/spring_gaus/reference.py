@@ -1,4 +1,4 @@
-"""The anchors' substep in torch, in any precision and differentiable: the specification of the kernel."""
+"""The anchors' substep in torch: the specification of the kernels. Differentiable, in any precision."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ def substep(
     controllers: torch.Tensor,
     step: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(x, v) [N, 3] one substep later, `step` s, under controllers [C, 3] at its end; equations as in `kernels`."""
-
-    neighbours = torch.as_tensor(graph.neighbours, device=x.device).long()
-    rest = torch.as_tensor(graph.lengths, dtype=x.dtype, device=x.device)
+    """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end. Equations as in `kernels`."""
+    neighbours = torch.tensor(graph.neighbours, device=x.device).long()
+    rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
     offset = x[neighbours] - x[:, None]
     length = offset.norm(dim=2)
     n = offset / length.clamp(min=MIN_LENGTH)[..., None]
@@ -30,10 +29,10 @@ def substep(
     pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
     closing = ((v[neighbours] - v[:, None]) * n).sum(dim=2)
     force = ((pull + parameters.damping / rest * closing)[..., None] * n).sum(dim=1)
-    anchor = torch.as_tensor(graph.link_anchors, device=x.device).long()
-    reach = controllers[torch.as_tensor(graph.links, device=x.device).long()] - x[anchor]
+    anchor = torch.tensor(graph.link_anchors, device=x.device).long()
+    reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]
     distance = reach.norm(dim=1, keepdim=True)
-    strain = distance / torch.as_tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
+    strain = distance / torch.tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
     force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_LENGTH) * strain * physics.link_stiffness)
     force = force + x.new_tensor([0.0, 0.0, -physics.up_sign * physics.gravity])
     v = v + step * force

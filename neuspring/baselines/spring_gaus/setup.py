@@ -1,4 +1,4 @@
-"""What Spring-Gaus is trained on: anchors drawn from splats or structure points, and the objective over the training frames."""
+"""The training problem of Spring-Gaus: anchors drawn from splats or structure points, and the objective."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from neuspring.baselines.spring_gaus import vgg16_weights
 from neuspring.baselines.spring_gaus.graph import AnchorGraph, Binding, choose_anchors
 from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.baselines.spring_gaus.objectives import Follower, Points, Silhouettes
+from neuspring.baselines.spring_gaus.objectives import Follower, Masks, Points, Silhouettes
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.baselines.spring_gaus.train import Objective, Problem
 from neuspring.baselines.spring_gaus.vgg16 import Vgg16
@@ -30,28 +30,27 @@ from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
 CELLS = (0.01, 0.001)
-"""m, of the grids that anchors are drawn from."""
+"""Cell sizes of the grids that anchors are drawn from, m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Masks of the training frames, and the splats that are to cover them."""
+    """Masks of the training frames, and the splats that should cover them."""
 
     splats: Splats
     views: dict[str, View]
-    masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]]
-    """(camera, frame) -> bool [H, W]: the object, and what counts (None: everything)."""
+    masks: Masks
     backend: Backend
 
     @classmethod
     def of(cls, folder: Path, records: Sequence[Path], splats: Path, settings: Config, device: str) -> Seen:
-        """From a capture, the records of its masks and a file of splats. Frames of the future are not read."""
+        """From a capture, the records of its masks and a file of splats. Masks of future frames are not used."""
         capture, images = Capture.load(folder), settings.images
-        perceived = masks_of_cameras(capture, records)
-        masks: dict[tuple[str, int], tuple[torch.Tensor, torch.Tensor | None]] = {}
-        for name, found in perceived.items():
+        cameras = masks_of_cameras(capture, records)
+        masks: Masks = {}
+        for name, perceived in cameras.items():
             for frame in (frame for frame in range(capture.train_end) if capture.has(name, frame)):
-                labels = torch.tensor(found.labels[frame], device=device)
+                labels = torch.tensor(perceived.labels[frame], device=device)
                 counts = labels != HANDS if settings.baselines.spring_gaus.ignore_hands else None
                 masks[name, frame] = labels == OBJECT, counts
         views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
@@ -61,32 +60,26 @@ class Seen:
 def problem(
     observations: Observations, seen: Seen | None, settings: Config, seed: int, device: str
 ) -> tuple[Problem, dict[str, Any]]:
-    """The problem of a training, and facts for its record. Raises InputError if silhouettes are asked for without pictures."""
-    chosen, scenario = settings.baselines.spring_gaus, observations.scenario
-    if chosen.supervision == "masks" and seen is None:
+    """The training problem, and facts for the record. Raises InputError for `supervision: masks` without `seen`."""
+    own, scenario = settings.baselines.spring_gaus, observations.scenario
+    if own.supervision == "masks" and seen is None:
         rule = "supervision: masks needs --capture, --masks and --appearance"
         raise InputError("baselines.spring_gaus.supervision", rule, "none", "Use supervision: points for captures without images.")
-    cloud = seen.splats.means if seen and chosen.supervision == "masks" else observations.nodes
-    anchors = choose_anchors(cloud, chosen.anchors, CELLS, np.random.default_rng(seed))
+    cloud = seen.splats.means if seen and own.supervision == "masks" else observations.nodes
+    anchors = choose_anchors(cloud, own.anchors, CELLS, np.random.default_rng(seed))
     hands = observations.controller_points[: scenario.train_end]
-    graph = AnchorGraph.of(anchors, hands[0], chosen.neighbours, chosen.link_reach, chosen.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], own.neighbours, own.link_reach, own.link_count)
     up = 1.0 if scenario.up == "+z" else -1.0
-    start = SpringGausModel.start(
-        graph,
-        chosen,
-        frame_time=1 / scenario.frame_rate,
-        up_sign=up,
-        gravity=settings.simulation.gravity,
-        ground=scenario.ground,
-    )
+    world = {"frame_time": 1 / scenario.frame_rate, "up_sign": up, "gravity": settings.simulation.gravity}
+    start = SpringGausModel.start(graph, own, ground=scenario.ground, **world)
     facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
     objective: Objective
-    if seen and chosen.supervision == "masks":
-        objective, found = _silhouettes(seen, start, chosen, seed, device)
-        facts |= found
+    if seen and own.supervision == "masks":
+        objective, more = _silhouettes(seen, start, own, seed, device)
+        facts |= more
     else:
         objective = _points(observations, start, settings, device)
-    return Problem(start, hands, objective, chosen, device), facts
+    return Problem(start, hands, objective, own, device), facts
 
 
 def _silhouettes(

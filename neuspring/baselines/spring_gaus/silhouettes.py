@@ -1,8 +1,8 @@
-"""What Spring-Gaus is trained by: white splats on black against the object's mask, one camera at a time.
+"""The loss of Spring-Gaus: white splats on black against the object's mask, one camera at a time.
 
     L = l1 |A - M| + dssim (1 - SSIM(A, M)) + centroid |c(A) - c(M)| / W + features MSE(VGG16(A), VGG16(M)) + total_variation TV(A)
 
-A the drawn coverage, M the mask, c the centroid in pixels, W the picture's width, TV the mean squared difference of neighbours.
+A the drawn coverage, M the mask, c the centroid in pixels, W the picture's width, TV the mean squared difference of neighbors.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def centroid(silhouette: torch.Tensor) -> torch.Tensor:
 
 
 def total_variation(picture: torch.Tensor) -> torch.Tensor:
-    """Mean squared difference of vertical neighbours plus that of horizontal ones, [H, W]."""
+    """Mean squared difference of vertical neighbors plus that of horizontal ones, of a picture [H, W]."""
     return (picture[1:] - picture[:-1]).square().mean() + (picture[:, 1:] - picture[:, :-1]).square().mean()
 
 
@@ -52,6 +52,6 @@ class SilhouetteLoss:
             total = total + settings.centroid * (centroid(drawn) - centroid(mask)).norm() / drawn.shape[1]
         if settings.features and self.features is not None:
             with torch.no_grad():
-                wanted = self.features(mask.expand(1, 3, -1, -1))
-            total = total + settings.features * (self.features(drawn.expand(1, 3, -1, -1)) - wanted).square().mean()
+                target = self.features(mask.expand(1, 3, -1, -1))
+            total = total + settings.features * (self.features(drawn.expand(1, 3, -1, -1)) - target).square().mean()
         return total + settings.total_variation * total_variation(drawn)

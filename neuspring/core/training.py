@@ -1,0 +1,79 @@
+"""What every resumable training shares: its epochs with a history and checkpoints, and Adam's state as arrays."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.progress import Progress
+
+if TYPE_CHECKING:
+    import torch
+
+
+class TrainingLoop:
+    """The epochs that are left of a training which may have been killed before.
+
+    The user restores `restored`, iterates over the loop, and calls `record` and then `save` in each epoch. A continued training
+    equals an uninterrupted one if its checkpoints hold all that an epoch depends on.
+    """
+
+    def __init__(self, what: str, label: str, epochs: int, every: int, partial: Path | None, key: str) -> None:
+        """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
+        `every` epochs; one that lies there is continued from if it has the same `key`."""
+        self._begun = time.monotonic()
+        self._epochs, self._every, self._partial, self._key = epochs, every, partial, key
+        self._progress = Progress(label, epochs)
+        self.history: list[dict[str, Any]] = []
+        """A row per epoch."""
+        self.attempts = 1
+        """1, plus one for every time that the training continued from a checkpoint."""
+        self.earlier_seconds = 0.0
+        """Wall time of earlier attempts, up to their last checkpoint."""
+        self.restored = Checkpoint.load(partial, key, what)
+        """The checkpoint to continue from."""
+        if self.restored:
+            run = self.restored.values.pop("run")
+            self.history, self.attempts, self.earlier_seconds = run["history"], run["attempts"] + 1, run["seconds"]
+            print(f"continuing {what} after epoch {len(self.history) - 1}")
+
+    def __iter__(self) -> Iterator[int]:
+        """Numbers of the epochs that are left."""
+        while len(self.history) < self._epochs:
+            yield len(self.history)
+
+    def record(self, row: dict[str, Any], note: str) -> None:
+        """Add the row of a finished epoch to the history, and show progress."""
+        self.history.append(row)
+        self._progress.update(len(self.history), note)
+
+    def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
+        """Save the training's own state, with the history, if a checkpoint is due."""
+        if self._partial is None or len(self.history) % self._every:
+            return
+        state = checkpoint()
+        seconds = self.earlier_seconds + time.monotonic() - self._begun
+        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds}
+        Checkpoint(state.arrays, {**state.values, "run": run}).save(self._partial, self._key)
+
+
+def adam_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
+    """Adam's state as copied arrays named `<index of the parameter>.<moment>`; none before the first step."""
+    state = optimizer.state_dict()["state"]
+    return {f"{index}.{moment}": value.cpu().numpy().copy() for index, slots in state.items() for moment, value in slots.items()}
+
+
+def restore_adam(optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]) -> None:
+    """Set Adam's state to that of `adam_arrays`; learning rates and other options stay."""
+    import torch
+
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, array in arrays.items():
+        index, _, moment = name.partition(".")
+        state.setdefault(int(index), {})[moment] = torch.from_numpy(array.copy())
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
