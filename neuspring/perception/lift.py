@@ -33,6 +33,13 @@ class Seen:
     colours: np.ndarray
     """[n, 3] RGB in frame 0, 0 to 1."""
 
+    @classmethod
+    def of_all(cls, cameras: list[Seen]) -> Seen:
+        """What several cameras saw."""
+        points = np.concatenate([camera.points for camera in cameras], axis=1)
+        visible = np.concatenate([camera.visible for camera in cameras], axis=1)
+        return cls(points, visible, np.concatenate([camera.colours for camera in cameras]))
+
 
 def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTracks], settings: Lift) -> LiftedTracks:
     """All tracks as points in the world, with the controllers chosen among those of the hands.
@@ -41,7 +48,10 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     """
     cameras = lifting_cameras(capture, settings)
     labels, cloud, colors = clean_masks(capture, cameras, masks, settings)
-    objects, hands = (_of_all_cameras(capture, cameras, tracks, labels, label, settings) for label in (OBJECT, HANDS))
+    objects, hands = (
+        Seen.of_all([_lifted(capture, camera, tracks[name], labels[name] == label, settings) for name, camera in cameras.items()])
+        for label in (OBJECT, HANDS)
+    )
     where = f"{capture.folder}, perception"
     if not objects.points.shape[1]:
         shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
@@ -148,22 +158,6 @@ def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.nd
         alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < settings.agreement
         valid[i] = len(neighbors) >= settings.least_neighbours and alike.sum() >= 0.5 * len(neighbors)
     return valid
-
-
-def _of_all_cameras(
-    capture: Capture,
-    cameras: Mapping[str, Camera],
-    tracks: Mapping[str, PixelTracks],
-    labels: Mapping[str, np.ndarray],
-    label: int,
-    settings: Lift,
-) -> Seen:
-    parts = [_lifted(capture, camera, tracks[name], labels[name] == label, settings) for name, camera in cameras.items()]
-    return Seen(
-        np.concatenate([part.points for part in parts], axis=1),
-        np.concatenate([part.visible for part in parts], axis=1),
-        np.concatenate([part.colours for part in parts]),
-    )
 
 
 def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray, settings: Lift) -> Seen:

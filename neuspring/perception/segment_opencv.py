@@ -47,7 +47,7 @@ SPECK = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class Palette:
-    """Log ratios of the probabilities of colors, tables over BINS."""
+    """Log ratios of the probabilities of colors, per bin."""
 
     rise: np.ndarray
     """What rises, to the table."""
@@ -77,38 +77,35 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
     Raises InputError where nothing rises above the table. Without the color of hands all that rises is the object.
     """
     frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    table, above = np.zeros(BINS), np.zeros(BINS)
+    table, above = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
     views = []
     for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
-        image = capture.colour(camera, frames[index])
-        lab, height = _lab(image), _heights(capture, camera, frames[index])
+        image, height = capture.colour(camera, frames[index]), _heights(capture, camera, frames[index])
         risen = height > settings.height
-        views.append((lab, risen))
-        above += _count(lab[risen])
-        edge = _border(risen.shape) & ~risen & ~(height > settings.height / 2)
+        views.append((image, risen))
+        above += _count(_bins(image)[risen])
+        edge = _border(risen.shape) & ~(height > settings.height / 2)
         for shade in SHADES:
-            table += _count(_lab((shade * image).astype(np.uint8))[edge])
+            table += _count(_bins((shade * image).astype(np.uint8))[edge])
     where = f"{capture.folder}, camera {camera}"
     if not above.sum():
         raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
-    hands, body = _divide([(lab, risen, _skin(lab, settings)) for lab, risen in views], settings)
+    hands, body = _divide([(image, risen, _skin(image, settings)) for image, risen in views], settings)
     if not hands.sum():
         skin = f"hue in {list(settings.hand_hue)} degrees, chroma in {list(settings.hand_chroma)} (Lab)"
         print(f"{where}: nothing above the table has the color of hands ({skin}); all of it is the object", flush=True)
     first = Palette.of(table, above, hands, body)
-    hands, body = _divide([(lab, risen, _look_up(first.hand, lab) > 0) for lab, risen in views], settings)
+    hands, body = _divide([(image, risen, first.hand[_bins(image)] > 0) for image, risen in views], settings)
     return Palette.of(table, above, hands, body)
 
 
-def _divide(
-    views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: OpenCvSegmentation
-) -> tuple[np.ndarray, np.ndarray]:
-    """Histograms of hands and of the object in views of (Lab image, what has risen, what has a hand's color)."""
-    hands, body = np.zeros(BINS), np.zeros(BINS)
-    for lab, risen, like_hand in views:
+def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
+    """Histograms of hands and of the object in views of (image, what has risen, what has a hand's color)."""
+    hands, body = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
+    for image, risen, like_hand in views:
         labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8), settings)
-        hands += _count(lab[labels == HANDS])
-        body += _count(lab[labels == OBJECT])
+        hands += _count(_bins(image)[labels == HANDS])
+        body += _count(_bins(image)[labels == OBJECT])
     return hands, body
 
 
@@ -123,15 +120,15 @@ def _heights(capture: Capture, camera: str, frame: int) -> np.ndarray:
 def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings: OpenCvSegmentation) -> np.ndarray:
     """Labels [H, W] of one frame."""
     image = capture.colour(camera, frame)
-    lab, height = _lab(image), _heights(capture, camera, frame)
-    ratio = cv2.GaussianBlur(_look_up(palette.rise, lab), (0, 0), 1.0)
+    bins, height = _bins(image), _heights(capture, camera, frame)
+    ratio = cv2.GaussianBlur(palette.rise[bins], (0, 0), 1.0)
     flat = np.nan_to_num(height, nan=0.0) < settings.height
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
     seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
     foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) if seeds.any() else seeds
     foreground |= _holes(foreground)
-    hand = cv2.GaussianBlur(_look_up(palette.hand, lab), (0, 0), settings.smoothing) > 0
+    hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), settings.smoothing) > 0
     labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
     return _tidy(labels, settings)
 
@@ -185,9 +182,9 @@ def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     return tidy
 
 
-def _skin(lab: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+def _skin(image: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     """Where hue and chroma are those of hands [H, W]."""
-    a, b = lab[..., 1].astype(float) - 128.0, lab[..., 2].astype(float) - 128.0
+    a, b = _lab(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
     hue, chroma = np.degrees(np.arctan2(b, a)), np.hypot(a, b)
     (least_hue, most_hue), (least_chroma, most_chroma) = settings.hand_hue, settings.hand_chroma
     return np.asarray((least_hue < hue) & (hue < most_hue) & (least_chroma < chroma) & (chroma < most_chroma))
@@ -197,24 +194,19 @@ def _lab(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
 
 
-def _indices(lab: np.ndarray) -> tuple[np.ndarray, ...]:
-    return tuple(lab[..., k].astype(int) * BINS[k] // 256 for k in range(3))
+def _bins(image: np.ndarray) -> np.ndarray:
+    """The bin of every pixel's color [H, W]."""
+    indices = _lab(image).astype(int) * BINS // 256
+    return np.asarray(np.ravel_multi_index(tuple(indices.transpose(2, 0, 1)), BINS))
 
 
-def _count(lab: np.ndarray) -> np.ndarray:
-    """Histogram of colors [n, 3]."""
-    flat = np.ravel_multi_index(_indices(lab), BINS)
-    return np.bincount(flat, minlength=int(np.prod(BINS))).reshape(BINS).astype(float)
+def _count(bins: np.ndarray) -> np.ndarray:
+    return np.bincount(bins, minlength=int(np.prod(BINS))).astype(float)
 
 
 def _log_probability(counts: np.ndarray) -> np.ndarray:
-    blurred = gaussian_filter(counts, SMOOTHING)
+    blurred = gaussian_filter(counts.reshape(BINS), SMOOTHING).ravel()
     return np.asarray(np.log(blurred / max(blurred.sum(), 1.0) + FLOOR))
-
-
-def _look_up(table: np.ndarray, lab: np.ndarray) -> np.ndarray:
-    """The table's entries [H, W] for the colors of an image."""
-    return np.asarray(table[_indices(lab)])
 
 
 def _border(shape: tuple[int, ...]) -> np.ndarray:

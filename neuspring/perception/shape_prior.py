@@ -47,7 +47,9 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     """Carve the surroundings of the object's `cloud` [P, 3], m, of frame 0. Raises InputError if nothing remains."""
     sign = 1.0 if capture.description.up == "+z" else -1.0
     low, high = cloud.min(axis=0) - settings.margin, cloud.max(axis=0) + settings.margin
-    grid = _grid(low, high, settings.voxel)
+    counts = np.ceil((high - low) / settings.voxel).astype(int) + 1
+    # Voxel centers [nx, ny, nz, 3].
+    grid = low + settings.voxel * np.moveaxis(np.indices(counts), 0, -1)
     hull = sign * grid[..., 2] > 0
     shown = np.zeros_like(hull)
     for name, camera in capture.cameras.items():
@@ -97,9 +99,3 @@ def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float
     corners = points[faces]
     volume = (np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum()
     return points, faces if volume > 0 else faces[:, ::-1].copy()
-
-
-def _grid(low: np.ndarray, high: np.ndarray, voxel: float) -> np.ndarray:
-    """Voxel centers [nx, ny, nz, 3]."""
-    counts = np.ceil((high - low) / voxel).astype(int) + 1
-    return low + voxel * np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
