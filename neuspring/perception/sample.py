@@ -11,6 +11,7 @@ import warp as wp
 
 from neuspring.config.perception import Sampling
 from neuspring.perception.results import LiftedTracks, ShapePrior
+from neuspring.perception.sample_kernels import winding
 
 
 def structure(
@@ -54,16 +55,8 @@ def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
     mesh = wp.Mesh(wp.array(prior.vertices, dtype=wp.vec3, device="cpu"), indices, support_winding_number=True)
     result = wp.zeros(len(points), dtype=wp.bool, device="cpu")
     reach = float(np.ptp(prior.vertices, axis=0).max()) * 2.0
-    wp.launch(_winding, len(points), [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, result], device="cpu")
+    wp.launch(winding, len(points), [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, result], device="cpu")
     return np.asarray(result.numpy())
-
-
-@wp.kernel(enable_backward=False)
-def _winding(mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, inside: wp.array[bool]):
-    """Whether each point lies inside the closed mesh; `reach` bounds the search, m."""
-    i = wp.tid()
-    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
-    inside[i] = query.result and query.sign < 0.0
 
 
 def _samples(prior: ShapePrior, settings: Sampling, seed: int) -> tuple[np.ndarray, np.ndarray]:

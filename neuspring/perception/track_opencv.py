@@ -8,6 +8,7 @@ Lucas-Kanade from frame 0, accepted if the patch looks alike.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -113,7 +114,7 @@ def _lucas_kanade(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the target [n, 2] near the `guess`, and whether going back returns to the start [n]."""
     size, flags = (settings.window, settings.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-    options = {"winSize": size, "maxLevel": settings.levels, "criteria": STOP, "flags": flags}
+    options: dict[str, Any] = {"winSize": size, "maxLevel": settings.levels, "criteria": STOP, "flags": flags}
     points = np.ascontiguousarray(points, dtype=np.float32)
     # OpenCV writes its result into the guess.
     moved, there, _ = cv2.calcOpticalFlowPyrLK(source, target, points, np.array(guess, dtype=np.float32), **options)

@@ -1,4 +1,4 @@
-"""Drawing a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
+"""Pictures of a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 
 COVERED = 128
-"""Of 255: a pixel that splats cover by half counts as object."""
+"""Coverage, of 255, from which a pixel counts as object: a half."""
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
@@ -56,7 +56,7 @@ def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussia
 
 @torch.no_grad()
 def picture(gaussians: Gaussians, view: View, backend: Backend, background: tuple[float, float, float] = BLACK) -> np.ndarray:
-    """RGBA [H, W, 4] uint8: colour over the background, and coverage."""
+    """RGBA [H, W, 4] uint8: color over the background, and coverage."""
     drawn = gaussians.draw(view, background=background, backend=backend)
     rgba = torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1).clamp(0, 1)
     return np.asarray((255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy())

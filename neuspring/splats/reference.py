@@ -1,4 +1,4 @@
-"""The specification of the rasteriser: every pixel looks at every splat, plain torch, meant for float64. Slow and memory-hungry."""
+"""The specification of the rasterizer: every pixel looks at every splat, plain torch, meant for float64. Slow and memory-hungry."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from neuspring.splats.blend import kernels
 from neuspring.splats.view import Limits, View
 
 TILE_SIDE = {"cpu": 8, "cuda": 16}
-"""Pixels. A thread looks at all ellipses of its tile: small tiles cost lists, large ones wasted looks (see the benchmark)."""
+"""Pixels. A pixel's thread looks at all ellipses of its tile: small tiles make many lists, large tiles many looks in vain."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, adj_total: torch.Tensor, adj_left: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
         *inputs, left, ends = ctx.saved_tensors
         means, conics, strengths, features = inputs
-        adjoints = [
-            torch.zeros_like(means),
-            torch.zeros_like(conics),
-            torch.zeros_like(strengths[:, 0]),
-            torch.zeros_like(features),
-        ]
+        adjoints = [torch.zeros_like(tensor) for tensor in (means, conics, strengths[:, 0], features)]
         limits: Limits = ctx.limits
         arguments = [*_vectors(*inputs), *_lists(ctx.lists), limits.alpha_min, limits.alpha_max, *_scalars(left.detach(), ends)]
         arguments += [*_vectors(adj_total.contiguous()), *_scalars(adj_left.contiguous())]
