@@ -38,14 +38,10 @@ class OpenCvSegmentation:
     """Hue of hands or gloves in Lab, degrees (atan2(b, a)); skin by default."""
     hand_chroma: Range = (9.0, 36.0)
     """Their chroma in Lab."""
-    hand_piece: Annotated[float, Field(ge=0, le=1)] = 0.15
-    """A piece of hand colour smaller than this part of the largest is the object's, which may have such colours too."""
     smoothing: Positive = 1.5
     """Width, pixels, over which the decision between hand and object is averaged."""
     smallest: NonNegative = 0.0004
     """Pieces below this part of the image join what surrounds them."""
-    largest_hole: NonNegative = 0.0015
-    """Holes in the foreground up to this part of the image are filled: print that has the table's colour."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +53,12 @@ class OpenCvTracking:
     """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
     """Most pixels followed per camera, random ones of the masks of frame 0."""
-    local_contrast: NonNegative = 2.0
-    """Width, pixels, over which brightness and contrast are made equal for Lucas-Kanade, so that shading does not pull; 0: not."""
     window: Annotated[int, Field(ge=5)] = 9
     """Side of the Lucas-Kanade window, pixels. A large one averages over what deforms and over the background."""
     levels: Annotated[int, Field(ge=0)] = 3
     """Of the image pyramid, beside the image itself."""
     forward_backward: Positive = 0.5
     """Pixels by which a point may miss its start when followed there and back."""
-    consensus: Positive = 4.0
-    """Pixels by which a point's motion since frame 0 may differ from the median of its nearest neighbours'."""
     reacquire: bool = True
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
@@ -158,8 +150,6 @@ class ShapePriorSettings:
     """m by which measured depth may lie behind a voxel before it is carved."""
     smoothing: Positive = 1.0
     """Width, voxels, by which the hull is smoothed."""
-    symmetry: bool = False
-    """Complete the hull by its mirror image in a vertical plane."""
     mesh: str | None = None
     """File for backend: mesh."""
     bend: bool = True

@@ -1,4 +1,4 @@
-"""From pixels to the world: cleaned masks, agreement of motion, controllers; each against what it says."""
+"""From pixels to the world: cleaned masks, agreement of motion, controllers, and the switches to the released behavior."""
 
 from dataclasses import replace
 
@@ -212,6 +212,48 @@ def test_released_controllers_are_visible_throughout():
     # With gaps filled, everything that is seen in enough frames counts.
     _, facts = choose_controllers(points, visible, valid, Lift(controller_gaps="rigid", controller_share=0.7), "here")
     assert facts["hand_tracks_kept"] == 36
+
+
+def with_subpixel_motion(tracks: dict[str, PixelTracks]) -> dict[str, PixelTracks]:
+    pixels = tracks["0"].pixels + 0.3 * (np.arange(FRAMES) > 0)[:, None, None].astype(np.float32)
+    return {"0": replace(tracks["0"], pixels=pixels)}
+
+
+def test_whole_pixels_as_released_lift_the_pixel_that_a_track_is_in(scene):
+    tracks = with_subpixel_motion(tracks_of(scene))
+    exact, released = (
+        lifting.lift(scene, masks_of(scene), tracks, replace(SETTINGS, whole_pixels=whole)).object_points for whole in (False, True)
+    )
+    rounded = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS).object_points
+    np.testing.assert_array_equal(released, rounded)
+    # 0.3 pixels in x and in y, at 0.8 m and a focal length of 40 pixels.
+    np.testing.assert_allclose(np.abs(exact - released)[1:], np.broadcast_to([0.006, 0.006, 0.0], exact[1:].shape), atol=1e-6)
+
+
+def test_a_mirrored_principal_point_as_before_july_2025_shifts_the_object(tmp_path):
+    camera = entry()
+    off_center = replace(camera, intrinsics=((40.0, 0.0, 13.0), *camera.intrinsics[1:]))
+    writer = Writer(tmp_path, describe(cameras=(off_center,)))
+    labels = np.zeros((24, 32), np.uint8)
+    labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
+    for frame in range(FRAMES):
+        writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
+    capture = writer.finish()
+    right, mirrored = (
+        lifting.clean_masks(capture, lifting.lifting_cameras(capture, settings), masks_of(capture), settings)[1]
+        for settings in (SETTINGS, replace(SETTINGS, mirrored_principal_point=True))
+    )
+    # The principal point moves from 13 to 32 - 13 = 19, six pixels of 0.8 m / 40 each, so points move the other way.
+    np.testing.assert_allclose(mirrored - right, np.tile([-6 * 0.8 / 40, 0, 0], (len(right), 1)), atol=1e-6)
+
+
+def test_coordinate_outliers_as_released_drop_what_shares_one_coordinate():
+    line = np.stack([np.linspace(0, 0.01, 11), np.zeros(11), np.arange(11) * 1e-4], axis=1)
+    stray = np.array([[line[3, 0], 0.5, 0.5]])
+    points, least = np.concatenate([line, stray]), np.full(12, 3.0)
+    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=False)).tolist() == [11]
+    # Point 3 lies in the crowd, but has the x of the outlier.
+    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=True)).tolist() == [3, 11]
 
 
 def test_farthest_points_are_spread():

@@ -1,5 +1,5 @@
-"""The second backend through a stand-in with gsplat's interface (version 1.5), since gsplat itself needs CUDA: what is passed to
-it, what is made of its answer. On a GPU with gsplat the real one is compared with ours."""
+"""The gsplat backend through a stand-in with gsplat's interface (version 1.5), since gsplat itself needs CUDA: how it is called, and
+what becomes of its answer. On a GPU with gsplat the real one is compared with ours."""
 
 import sys
 import types
@@ -15,7 +15,7 @@ from neuspring.splats.project import boxes, project, radii
 from neuspring.splats.rasterise import _gsplat_fault, choose_backend, rasterise
 from neuspring.splats.tiles import blend, tiles
 from neuspring.splats.view import LIMITS, Limits, View
-from tests.splats.test_rasterise import random_splats, small_view
+from tests.support.random_splats import random_splats, small_view
 
 
 def rasterization(

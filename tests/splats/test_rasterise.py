@@ -15,8 +15,9 @@ from neuspring.core.errors import InputError
 from neuspring.splats import reference
 from neuspring.splats.project import project
 from neuspring.splats.rasterise import choose_backend, rasterise
-from neuspring.splats.view import LIMITS, View
+from neuspring.splats.view import LIMITS
 from tests.support.golden_splats import CASES, Golden
+from tests.support.random_splats import random_splats, small_view
 
 CLOSE = "r04_culling"
 SINGLE = {"rgb": 2e-5, "alpha": 2e-5, "depth": 1e-4, "means": 1e-4, "conics": 1e-4, "gradient": 1e-4, "loss": 2e-5}
@@ -79,23 +80,6 @@ def test_the_specification_is_the_golden_data(case):
     pictures = reference.rasterise(*golden.inputs.values(), golden.view, **golden.options)
     for name, picture in zip(("rgb", "alpha", "depth"), pictures, strict=True):
         assert np.abs(picture.detach().numpy() - golden.values[f"exp_{name}"]).max() <= DOUBLE[name]
-
-
-def random_splats(seed: int, count: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    rng = np.random.default_rng(seed)
-    arrays = [
-        rng.uniform([-0.6, -0.5, 0.4], [0.6, 0.5, 2.0], (count, 3)),
-        rng.normal(size=(count, 4)),
-        np.exp(rng.uniform(-5, -1.5, (count, 3))),
-        rng.uniform(0.0, 1.0, count),
-        rng.uniform(0, 1, (count, 3)),
-    ]
-    return [torch.tensor(a, dtype=dtype).requires_grad_() for a in arrays]
-
-
-def small_view(width: int = 37, height: int = 29) -> View:
-    intrinsics = torch.tensor([[30.0, 0, width / 2 + 1.3], [0, 28.0, height / 2 - 0.7], [0, 0, 1]], dtype=torch.float64)
-    return View(torch.eye(4, dtype=torch.float64), intrinsics, width, height)
 
 
 @settings(max_examples=15, deadline=None)
