@@ -1,5 +1,5 @@
-"""The gsplat backend through a stand-in with gsplat's interface (version 1.5), since gsplat itself needs CUDA: how it is called, and
-what becomes of its answer. On a GPU with gsplat the real one is compared with ours."""
+"""The gsplat backend through a stand-in with the interface of gsplat 1.5, since gsplat itself needs CUDA: how it is called, and what
+becomes of its answer. On a GPU with gsplat the real one is compared with ours."""
 
 import sys
 import types
