@@ -38,17 +38,17 @@ class Statistics:
         return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
 
     @torch.no_grad()
-    def add(self, drawn: Rendered, width: int, height: int) -> None:
+    def add(self, rendered: Rendered, width: int, height: int) -> None:
         """Account for a picture after its backward pass."""
-        gradient = drawn.means.grad
+        gradient = rendered.means.grad
         if gradient is None:
             return
-        if drawn.backend == "gsplat":
-            gradient = gradient[0, drawn.index]
+        if rendered.backend == "gsplat":
+            gradient = gradient[0, rendered.index]
         half = gradient.new_tensor([width / 2, height / 2])
-        self.pull.index_add_(0, drawn.index, (gradient * half).norm(dim=1))
-        self.seen.index_add_(0, drawn.index, torch.ones_like(drawn.radii))
-        self.radius[drawn.index] = torch.maximum(self.radius[drawn.index], drawn.radii / width)
+        self.pull.index_add_(0, rendered.index, (gradient * half).norm(dim=1))
+        self.seen.index_add_(0, rendered.index, torch.ones_like(rendered.radii))
+        self.radius[rendered.index] = torch.maximum(self.radius[rendered.index], rendered.radii / width)
 
 
 @torch.no_grad()

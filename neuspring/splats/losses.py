@@ -80,17 +80,17 @@ class Shot:
         return float(measured.median() / self.view.intrinsics[0, 0]) if len(measured) else float("nan")
 
 
-def loss(drawn: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
+def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
     """The training loss of one picture."""
-    color = drawn.rgb * shot.known[..., None]
+    color = rendered.rgb * shot.known[..., None]
     total = settings.l1 * (color - shot.colour).abs().mean()
     if settings.dssim:
         top, bottom, left, right = shot.box
         pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.colour)]
         total = total + settings.dssim * (1 - ssim_map(*pair)).sum() / color.numel()
     if settings.mask:
-        total = total + settings.mask * (drawn.alpha * shot.known - shot.mask).abs().mean()
+        total = total + settings.mask * (rendered.alpha * shot.known - shot.mask).abs().mean()
     if settings.depth:
         measured = shot.depth > 0
-        total = total + settings.depth * ((drawn.depth - shot.depth) * measured).abs().mean()
+        total = total + settings.depth * ((rendered.depth - shot.depth) * measured).abs().mean()
     return total

@@ -49,7 +49,7 @@ def rasterise(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     view: View,
     *,
     degree: int | None = None,
@@ -59,15 +59,15 @@ def rasterise(
 ) -> Rendered:
     """Draw splats with means [N, 3] m, quaternions [N, 4] (w first, any length), standard deviations [N, 3] m, opacities [N].
 
-    colours: RGB [N, 3], or with a `degree` harmonics [N, K, 3], used up to that degree. Differentiable in all five. Raises
+    colors: RGB [N, 3], or with a `degree` harmonics [N, K, 3], used up to that degree. Differentiable in all five. Raises
     InputError for wrong shapes and for entries that are not finite.
     """
     view.require_valid()
-    _require_splats(means, quaternions, scales, opacities, colours, degree)
+    _require_splats(means, quaternions, scales, opacities, colors, degree)
     if backend == "gsplat":
         from neuspring.splats import gsplat_backend
 
-        return gsplat_backend.rasterise(means, quaternions, scales, opacities, colours, view, degree, background, limits)
+        return gsplat_backend.rasterise(means, quaternions, scales, opacities, colors, view, degree, background, limits)
     ellipses = project(means, quaternions, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
     visible = torch.nonzero(touching).squeeze(1)
@@ -75,7 +75,7 @@ def rasterise(
     flat, depths = ellipses.means[visible], ellipses.depths[visible]
     if flat.requires_grad:
         flat.retain_grad()
-    shade = colours[index]
+    shade = colors[index]
     if degree is not None:
         shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
     lists = tiles(depths.detach(), rectangles[visible], view)
@@ -123,19 +123,19 @@ def _require_splats(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     degree: int | None,
 ) -> None:
     count = len(means)
-    coefficients = colours.shape[1] if degree is not None and colours.ndim == 3 else None
-    wanted = {
+    coefficients = colors.shape[1] if degree is not None and colors.ndim == 3 else None
+    expected = {
         "means": (means, [count, 3]),
         "quaternions": (quaternions, [count, 4]),
         "scales": (scales, [count, 3]),
         "opacities": (opacities, [count]),
-        "colours": (colours, [count, 3] if degree is None else [count, coefficients, 3]),
+        "colors": (colors, [count, 3] if degree is None else [count, coefficients, 3]),
     }
-    for name, (tensor, shape) in wanted.items():
+    for name, (tensor, shape) in expected.items():
         if list(tensor.shape) != shape:
             raise InputError(f"splats, {name}", f"the shape must be {shape}", tuple(tensor.shape))
         finite = torch.isfinite(tensor.detach())
@@ -144,5 +144,5 @@ def _require_splats(
             raise InputError(f"splats, {name}", "every entry must be finite", f"{bad} of {count} splats are not")
     if degree is not None and not 0 <= degree <= 3:
         raise InputError("splats, degree", "harmonics of degree 0 to 3 can be drawn", degree)
-    if degree is not None and colours.shape[1] < (degree + 1) ** 2:
-        raise InputError("splats, colours", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colours.shape[1])
+    if degree is not None and colors.shape[1] < (degree + 1) ** 2:
+        raise InputError("splats, colors", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colors.shape[1])

@@ -14,7 +14,7 @@ def rasterise(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     view: View,
     *,
     degree: int | None = None,
@@ -25,7 +25,7 @@ def rasterise(
     ellipses = project(means, quaternions, scales, view, limits)
     order = torch.sort(ellipses.depths.detach(), stable=True).indices
     index, flat, conics, depths = ellipses.index[order], ellipses.means[order], ellipses.conics[order], ellipses.depths[order]
-    shade = colours[index]
+    shade = colors[index]
     if degree is not None:
         shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
     rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")

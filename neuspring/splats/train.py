@@ -45,14 +45,14 @@ class Trained:
     """How many splats there were at the start."""
 
 
-def first_splats(points: np.ndarray, colours: np.ndarray, settings: Appearance, width: float) -> Splats:
+def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, width: float) -> Splats:
     """Splats at points [P, 3], m, with RGB [P, 3]; a pixel is `width` wide at the object, m. Raises InputError for less than 4."""
     if settings.spacing and len(points):
         cells = np.floor((points - points.min(axis=0)) / (settings.spacing * width)).astype(np.int64)
         _, owner, members = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         owner = owner.reshape(-1)
-        sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colours.T)]
-        points, colours = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
+        sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colors.T)]
+        points, colors = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
     if len(points) <= NEAREST:
         raise InputError("appearance, points of frame 0", f"more than {NEAREST} points are needed to begin with", len(points))
     scale = np.maximum(cKDTree(points).query(points, k=NEAREST + 1)[0][:, 1:].mean(axis=1), SMALLEST)
@@ -60,7 +60,7 @@ def first_splats(points: np.ndarray, colours: np.ndarray, settings: Appearance, 
         scale = np.full(len(points), settings.fixed_radius)
     count = len(points)
     shades = np.zeros((count, (settings.degree + 1) ** 2, 3))
-    shades[:, 0] = (colours - 0.5) / harmonics.C0
+    shades[:, 0] = (colors - 0.5) / harmonics.C0
     return Splats(
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
@@ -93,12 +93,12 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
     last_change = min(settings.densify_until, settings.iterations)
     for step, shot in zip(range(1, settings.iterations + 1), _shuffled(shots, generator), strict=False):
         optimizer.schedule(step)
-        drawn = optimizer.gaussians.draw(shot.view, degree=(step - 1) // settings.degree_every, backend=backend)
-        value = loss(drawn, shot, settings)
+        rendered = optimizer.gaussians.draw(shot.view, degree=(step - 1) // settings.degree_every, backend=backend)
+        value = loss(rendered, shot, settings)
         number = float(value.detach())
         value.backward()  # type: ignore[no-untyped-call]
         if step < settings.densify_until:
-            statistics.add(drawn, shot.view.width, shot.view.height)
+            statistics.add(rendered, shot.view.width, shot.view.height)
         optimizer.step()
         optimizer.require_usable(step)
         if step % RECORD_EVERY == 0 or step == settings.iterations:
@@ -161,7 +161,7 @@ class _Optimizer:
         self._adam.zero_grad(set_to_none=True)
 
     def require_usable(self, step: int) -> None:
-        """Raise NumericalFailure for splats that cannot be drawn."""
+        """Raise NumericalFailure for splats that cannot be rendered."""
         if not len(self._values["means"]):
             raise NumericalFailure(f"appearance: step {step} removed the last splat")
         bad = [name for name, tensor in self._values.items() if not torch.isfinite(tensor.detach()).all()]
