@@ -13,8 +13,9 @@ from neuspring.core.errors import InputError
 from neuspring.core.points import farthest
 
 HAND_GAP = 0.04
-"""m; points of one hand lie nearer to some other of it."""
+"""m: a point nearer than this to a point of a hand belongs to that hand."""
 LEAST_FOR_POSE = 3
+"""Points that a rigid motion needs."""
 
 
 def choose_controllers(
@@ -72,8 +73,8 @@ def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[Rotation, np.n
 
 
 def hands_of(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points [n, 3] of each hand: pieces that lie HAND_GAP or more apart. Pieces too small to have a pose belong to
-    the nearest one that has."""
+    """Indices of the points [n, 3] of each hand. Hands lie HAND_GAP or more apart; a piece too small to have a pose belongs to the
+    nearest hand."""
     pairs = cKDTree(points).query_pairs(HAND_GAP, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     count, labels = connected_components(graph, directed=False)

@@ -1,4 +1,4 @@
-"""How well perception did on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
+"""Errors of perception on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from neuspring.perception.track_truth import carried
 
 MM = 1e3
 GRID = 0.003
-"""m, of the points that volumes are compared on."""
+"""m between the points on which volumes are compared."""
 SURFACE_POINTS = 4000
+"""Most vertices of a surface whose distances are averaged."""
 
 
 def judge(

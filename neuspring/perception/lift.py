@@ -19,7 +19,7 @@ from neuspring.perception.controllers import choose_controllers
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
-"""Pixels: the focal length that `outlier_neighbours` is meant for. More focal length shows a surface in more pixels."""
+"""Pixels: the focal length that `outlier_neighbours` is meant for. A longer one shows a surface in more pixels."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def clean_masks(
 
 
 def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
-    """[T, n] bool, row t for the motion from t to t + 1: visible in both, with enough neighbors of which half move alike."""
+    """[T, n] bool, row t for the motion from t to t + 1: the point is visible in both, and half of its neighbors move alike."""
     test = _sequential if settings.sequential_motion_filter else _simultaneous
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):

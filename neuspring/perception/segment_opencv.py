@@ -21,11 +21,11 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 
 BINS = (12, 64, 64)
-"""Of L, a, b."""
+"""Bins of L, a and b."""
 SAMPLED_FRAMES = 24
-"""From which histograms are made."""
+"""How many frames the histograms are made from."""
 BORDER = 0.08
-"""Part of the image at each side that shows the table."""
+"""Part of the image, at each side, that is taken for the table."""
 SMOOTHING = 1.0
 """Width, in bins, by which histograms are blurred: a color seen once stands for its neighbors."""
 FLOOR = 1e-5

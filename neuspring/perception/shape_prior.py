@@ -1,4 +1,4 @@
-"""What the cameras do not see of the object in frame 0: a closed surface by carving voxels, or none.
+"""The shape prior, which completes what the cameras do not see in frame 0: a closed surface by carving voxels, or none.
 
 A voxel belongs to the hull if no camera that has the object in view contradicts it, and at least one shows the object there. A
 camera contradicts a voxel if its mask shows neither the object nor a hand before it, or if it measured depth behind the voxel.

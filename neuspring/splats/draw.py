@@ -45,7 +45,7 @@ def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) ->
 
 
 def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussians]:
-    """The splats, unturned, with given centres [F, G, 3], m, in every frame."""
+    """The splats with the centers [F, G, 3], m, in every frame; their orientations stay."""
     start = Gaussians.of(splats, device)
     if centres.shape[1] != len(splats.means):
         rule = f"one centre for each of {len(splats.means)} splats is required"
@@ -63,7 +63,7 @@ def picture(gaussians: Gaussians, view: View, backend: Backend, background: tupl
 
 
 def turned(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
-    """RGB [H, W, 3] uint8 over white from a camera like `like` that went round the object by `angle` degrees and still faces it."""
+    """RGB [H, W, 3] uint8 over white: the view `like`, turned about the object by `angle` degrees."""
     centre = gaussians.means.median(0).values.double().cpu().numpy()
     turn = Rotation.from_euler("z", angle, degrees=True)
     pose = np.linalg.inv(like.world_to_camera.double().cpu().numpy())

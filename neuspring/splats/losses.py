@@ -26,7 +26,7 @@ WINDOW = 12
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What one camera saw in frame 0, masked, on a device."""
+    """One camera's picture of frame 0, masked, on a device."""
 
     name: str
     view: View

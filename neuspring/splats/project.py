@@ -15,9 +15,9 @@ import torch
 from neuspring.splats.view import Limits, View
 
 MARGIN = 0.3
-"""Of half the picture, by which slopes in the Jacobian may leave it."""
+"""Slopes in the Jacobian may leave the picture by this part of its half width or height."""
 SAFETY = 1e-3
-"""Relative widening of bounding boxes: rounding must not cut off a pixel."""
+"""Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def rasterise(
     alpha = torch.where(raw > limits.alpha_max, torch.full_like(raw, limits.alpha_max), raw)
     alpha = torch.where(alpha < limits.alpha_min, torch.zeros_like(alpha), alpha)
     after = torch.cumprod(1 - alpha, dim=1)
-    # What shines through only falls, so all splats behind the first that would leave too little are left out as well.
+    # Transmittance only falls, so all splats behind the first that would leave too little are left out as well.
     alpha = torch.where(after > limits.transmittance_min, alpha, torch.zeros_like(alpha))
     through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)
     weights = alpha * through[:, :-1]

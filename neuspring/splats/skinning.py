@@ -5,8 +5,8 @@ A splat at x follows its 16 nearest nodes (at their places before) with weights 
 
     x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalize(sum_b w_b q(R_b)) q.
 
-Frame to frame, accumulated, as in the released evaluation. Nearest nodes come from a hash grid: time and memory do not grow
-as nodes times splats.
+Motion accumulates from frame to frame, as in the released evaluation. Nearest nodes come from a hash grid, so time and memory do not
+grow with nodes times splats.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
 
 NEIGHBORS = 16
 MOST_CELLS = 64
-"""Of the hash grid, along each axis."""
+"""Most cells of the hash grid along one axis."""
 SMALLEST_RADIUS = 1e-4
-"""m, of a search for nodes."""
+"""m: least radius of a search for nodes."""
 
 
 class Skin:
@@ -46,10 +46,10 @@ class Skin:
         self._device, self._frozen, self._released = device, frozen, released_degeneracy
         self._bound: Any = None
         self._count = min(NEIGHBORS, len(nodes))
-        # Where this radius holds too few nodes the search doubles it; a larger one would make every search slower.
+        # Where this radius holds too few nodes, the search doubles it. A larger start would make every search slower.
         usual = np.median(cKDTree(nodes).query(nodes, k=[self._count])[0])
         self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
-        # Searches far from all nodes visit every cell, so there should not be many more than nodes.
+        # Searches far from all nodes visit every cell, so cells should not be many more than nodes.
         cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
         wide, deep, high = cells.tolist()
         self._grid = wp.HashGrid(wide, deep, high, device=device)

@@ -1,4 +1,4 @@
-"""Which ellipses each tile of the picture must look at, in order of depth; and blending as a differentiable function of tensors."""
+"""Lists of the ellipses that touch each tile of the picture, in order of depth; and blending as a differentiable function."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def blend(
     opacities: torch.Tensor,
     features: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Blended features [H, W, 4] and what shines through [H, W], differentiable in means [M, 2], conics [M, 3], opacities [M],
+    """Blended features [H, W, 4] and transmittance [H, W], differentiable in means [M, 2], conics [M, 3], opacities [M],
     features [M, 4]."""
     start_warp()
     result: tuple[torch.Tensor, torch.Tensor] = _Blend.apply(lists, view, limits, means, conics, opacities, features)  # type: ignore[no-untyped-call]

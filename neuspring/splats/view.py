@@ -20,11 +20,11 @@ class Limits:
     blur: float = 0.3
     """Added to the variance of every splat in the image, px^2."""
     alpha_min: float = 1 / 255
-    """Less than this is skipped."""
+    """Coverage below this is skipped."""
     alpha_max: float = 0.999
     """No splat covers more than this."""
     transmittance_min: float = 1e-4
-    """A pixel is done before a splat that would leave no more than this."""
+    """A pixel is done before the splat that would leave no more than this transmittance."""
 
 
 LIMITS = Limits()
