@@ -5,8 +5,8 @@ A splat at x follows its 16 nearest nodes (at their places before) with weights 
 
     x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalize(sum_b w_b q(R_b)) q.
 
-Motion accumulates from frame to frame, as in the released evaluation. Nearest nodes come from a hash grid, so time and memory do not
-grow with nodes times splats.
+Motion accumulates from frame to frame, as in the released evaluation. Nearest nodes come from a hash grid, so time and memory do
+not grow with nodes times splats.
 """
 
 from __future__ import annotations
