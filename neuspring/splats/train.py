@@ -105,8 +105,9 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
             for name, entry in {"step": step, "loss": number, "splats": len(optimizer)}.items():
                 history[name].append(float(entry))
         if settings.densify_from < step < last_change and step % settings.densify_every == 0:
-            after_reset, splats = step > settings.reset_every, vars(optimizer.gaussians)
-            optimizer.replace(*densify(splats, statistics, settings, optimizer.extent, after_reset, generator))
+            splats, after_reset = vars(optimizer.gaussians), step > settings.reset_every
+            stay, added = densify(splats, statistics, settings, optimizer.extent, after_reset, generator)
+            optimizer.replace(stay, added)
             optimizer.require_usable(step)
             statistics = Statistics.empty(optimizer.gaussians.means)
         if step % settings.reset_every == 0 and step < last_change:
