@@ -15,8 +15,9 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
+from neuspring.splats.blend import blend
 from neuspring.splats.project import boxes, project, radii
-from neuspring.splats.tiles import blend, tiles
+from neuspring.splats.tiles import tiles
 from neuspring.splats.view import LIMITS, Limits, View
 
 Backend = Literal["warp", "gsplat"]

@@ -59,5 +59,5 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """SSIM, the mean of its map over everything; differentiable. At most 1, for equal pictures."""
+    """SSIM: the mean of its map; differentiable. 1 for equal pictures, less for all others."""
     return ssim_map(a, b).mean()
