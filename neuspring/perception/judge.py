@@ -42,16 +42,11 @@ def judge(
 
 def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, float]:
     """Mean intersection over union with the true masks, over cameras and frames that show the thing."""
+    views = [(camera, frame) for camera in capture.cameras for frame in range(capture.frame_count) if capture.has(camera, frame)]
     facts = {}
     for name, label in (("object", OBJECT), ("hands", HANDS)):
-        overlaps = []
-        for camera in capture.cameras:
-            for frame in range(capture.frame_count):
-                if capture.has(camera, frame):
-                    own, true = masks[camera].labels[frame] == label, capture.mask(camera, frame) == label
-                    if true.any():
-                        overlaps.append(_overlap(own, true))
-        facts[f"mask_iou_{name}"] = float(np.mean(overlaps))
+        pairs = [(masks[camera].labels[frame] == label, capture.mask(camera, frame) == label) for camera, frame in views]
+        facts[f"mask_iou_{name}"] = float(np.mean([_overlap(own, true) for own, true in pairs if true.any()]))
     return facts
 
 
