@@ -45,7 +45,7 @@ def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, floa
     views = [(camera, frame) for camera in capture.cameras for frame in range(capture.frame_count) if capture.has(camera, frame)]
     facts = {}
     for name, label in (("object", OBJECT), ("hands", HANDS)):
-        pairs = [(masks[camera].labels[frame] == label, capture.mask(camera, frame) == label) for camera, frame in views]
+        pairs = ((masks[camera].labels[frame] == label, capture.mask(camera, frame) == label) for camera, frame in views)
         facts[f"mask_iou_{name}"] = float(np.mean([_overlap(own, true) for own, true in pairs if true.any()]))
     return facts
 
