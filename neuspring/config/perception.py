@@ -20,15 +20,10 @@ class OpenCvSegmentation(Section):
     """Hue of hands or gloves in Lab, degrees (atan2(b, a)); the default is skin."""
     hand_chroma: Range = (9.0, 36.0)
     """Chroma of hands or gloves in Lab."""
-    hand_piece: Annotated[float, Field(ge=0, le=1)] = 0.15
-    """Smallest area of a piece of hand color, as part of the largest piece; smaller ones are the object's, which may have such
-    colors too."""
     smoothing: Positive = 1.5
     """Width, pixels, over which the decision between hand and object is averaged."""
     smallest: NonNegative = 0.0004
     """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
-    largest_hole: NonNegative = 0.0015
-    """Largest area of a hole in the foreground that is filled, as part of the image: print may have the table's color."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,17 +34,12 @@ class OpenCvTracking(Section):
     """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
-    local_contrast: NonNegative = 2.0
-    """Width, pixels, over which brightness and contrast are made equal for Lucas-Kanade, so that shading does not pull; 0: they are
-    left as they are."""
     window: Annotated[int, Field(ge=5)] = 9
     """Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
     levels: Annotated[int, Field(ge=0)] = 3
     """Levels of the image pyramid, beside the image itself."""
     forward_backward: Positive = 0.5
     """Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
-    consensus: Positive = 4.0
-    """Largest distance, pixels, by which a point's motion since frame 0 may differ from the median of its nearest neighbors'."""
     reacquire: bool = True
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
@@ -137,8 +127,6 @@ class ShapePriorSettings(Section):
     """Distance, m, by which measured depth may lie behind a voxel before the voxel is carved."""
     smoothing: Positive = 1.0
     """Width, voxels, by which the hull is smoothed."""
-    symmetry: bool = False
-    """Complete the hull by its mirror image in a vertical plane."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
     bend: bool = True

@@ -1,2 +1,13 @@
-"""Raw RGBD video -> observations: segment, track, lift, shape prior, sample. Every step has named backends and writes an
-artefact."""
+"""Raw RGBD video -> observations. README.md here is the page for users.
+
+| step | modules |
+|---|---|
+| segment | `segment_opencv`, `segment_sam2`: which pixels show the object and the hands |
+| track | `track_opencv`, `track_cotracker`, `track_truth`: where the pixels of frame 0 go |
+| lift | `lift`, `controllers`: tracks of all cameras -> points in the world, and which points of the hands move the object |
+| shape prior | `shape_prior` (visual hull, or none), `shape_mesh` (a mesh from elsewhere): what no camera sees |
+| sample | `sample`: the structure points of a twin |
+| look, judge | `figures`: pictures of each step; `judge`: errors against the truth of a synthetic capture |
+
+`results` declares what the steps hand on: `Masks`, `PixelTracks`, `LiftedTracks`, `ShapePrior`.
+"""

@@ -1,4 +1,4 @@
-"""Which points of the hands move the object: seen throughout, moving with their neighbours, spread over the hands."""
+"""Which points of the hands move the object: seen throughout, moving with their neighbors, spread over the hands."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from neuspring.core.errors import InputError
 from neuspring.core.points import farthest
 
 HAND_GAP = 0.04
-"""m; points of one hand lie nearer to some other of it."""
+"""m: a point nearer than this to a point of a hand belongs to that hand."""
 LEAST_FOR_POSE = 3
+"""Points that a rigid motion needs."""
 
 
 def choose_controllers(
@@ -26,22 +27,22 @@ def choose_controllers(
     least `controller_share` of the frames; where one is not seen it goes where the rigid motion of its hand takes it. At most
     `controllers` points, each the farthest from those before. Raises InputError if fewer than `least_controllers` remain.
     """
-    complete = visible.all(axis=0) & valid[:-1].all(axis=0)
-    chosen, filled = complete, 0.0
+    eligible, filled = visible.all(axis=0) & valid[:-1].all(axis=0), 0.0
     if settings.controller_gaps == "rigid":
         trusted = visible & np.concatenate([visible[:1], valid[:-1]])
-        chosen = trusted.mean(axis=0) >= settings.controller_share
-        filled = float(1.0 - trusted[:, chosen].mean()) if chosen.any() else 0.0
-        points = fill_rigidly(points[:, chosen], trusted[:, chosen])
+        eligible = trusted.mean(axis=0) >= settings.controller_share
+        filled = float(1.0 - trusted[:, eligible].mean()) if eligible.any() else 0.0
+        candidates = fill_rigidly(points[:, eligible], trusted[:, eligible])
     else:
-        points = points[:, chosen]
-    count = points.shape[1]
+        candidates = points[:, eligible]
+    count = candidates.shape[1]
     if count < settings.least_controllers:
         rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
         remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
         raise InputError(where, rule, f"{count} of {visible.shape[1]}", remedy)
-    found = points[:, farthest(points[0], settings.controllers)]
-    return found, {"controllers": float(found.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
+    controllers = candidates[:, farthest(candidates[0], settings.controllers)]
+    facts = {"controllers": float(controllers.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
+    return controllers, facts
 
 
 def fill_rigidly(points: np.ndarray, trusted: np.ndarray) -> np.ndarray:
@@ -55,29 +56,30 @@ def fill_rigidly(points: np.ndarray, trusted: np.ndarray) -> np.ndarray:
         start = points[0, hand]
         rotation, shift = Rotation.identity(), np.zeros(3)
         for frame in range(1, len(points)):
-            known = trusted[frame, hand]
-            if known.sum() >= LEAST_FOR_POSE:
-                rotation, shift = rigid_motion(start[known], points[frame, hand][known])
-            missing = hand[~known]
-            result[frame, missing] = rotation.apply(points[0, missing]) + shift if len(missing) else result[frame, missing]
+            anchors = trusted[frame, hand]
+            if anchors.sum() >= LEAST_FOR_POSE:
+                rotation, shift = rigid_motion(start[anchors], points[frame, hand][anchors])
+            missing = hand[~anchors]
+            if len(missing):
+                result[frame, missing] = rotation.apply(points[0, missing]) + shift
     return result
 
 
 def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[Rotation, np.ndarray]:
     """Rotation R and shift t of least squares with target = R source + t (Kabsch)."""
-    centre, goal = source.mean(axis=0), target.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(target - goal, source - centre)
-    return rotation, goal - rotation.apply(centre)
+    center, goal = source.mean(axis=0), target.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(target - goal, source - center)
+    return rotation, goal - rotation.apply(center)
 
 
 def hands_of(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points [n, 3] of each hand: pieces that lie HAND_GAP or more apart. Pieces too small to have a pose belong to
-    the nearest one that has."""
+    """Indices of the points [n, 3] of each hand. Hands lie HAND_GAP or more apart; a piece too small to have a pose belongs to the
+    nearest hand."""
     pairs = cKDTree(points).query_pairs(HAND_GAP, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     count, labels = connected_components(graph, directed=False)
     sizes = np.bincount(labels, minlength=count)
     if sizes.max(initial=0) >= LEAST_FOR_POSE:
-        known = np.flatnonzero(sizes[labels] >= LEAST_FOR_POSE)
-        labels = labels[known][cKDTree(points[known]).query(points)[1]]
+        large = np.flatnonzero(sizes[labels] >= LEAST_FOR_POSE)
+        labels = labels[large][cKDTree(points[large]).query(points)[1]]
     return [np.flatnonzero(labels == k) for k in np.unique(labels)]

@@ -13,16 +13,15 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 FRAMES = 5
-"""Of a film strip."""
+"""How many frames a strip shows."""
 TINTS = {OBJECT: np.array([40, 200, 60]), HANDS: np.array([70, 110, 255])}
 TRAIL = 8
-"""Frames of a track's tail."""
-DRAWN = 400
-"""Tracks drawn."""
+"""How many frames back the tail of a track reaches."""
+MOST_TRACKS = 400
 
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
-    """Frames of the video, object tinted green, hands blue."""
+    """Frames of the video side by side: object tinted green, hands blue."""
     tiles = []
     for frame in _frames(capture, camera):
         image = capture.colour(camera, frame).astype(float)
@@ -34,28 +33,27 @@ def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path
 
 
 def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path) -> Path:
-    """Frames of the video with the visible points and where they came from, coloured by their place in frame 0."""
+    """Frames of the video with the visible points and where they came from, colored by their place in frame 0."""
     count = tracks.pixels.shape[1]
-    drawn = np.random.default_rng(0).permutation(count)[:DRAWN]
-    start = tracks.pixels[0, drawn]
-    hue = start @ [1.0, 0.6]
+    shown = np.random.default_rng(0).permutation(count)[:MOST_TRACKS]
+    hue = tracks.pixels[0, shown] @ [1.0, 0.6]
     shade = (hue - hue.min(initial=0.0)) / max(float(np.ptp(hue)) if count else 0.0, 1e-6)
-    colours = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int)
+    colors = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int).tolist()
     tiles = []
     for frame in _frames(capture, camera):
         image = np.ascontiguousarray(capture.colour(camera, frame))
-        first = max(frame - TRAIL, 0)
-        for point, colour in zip(drawn, colours.tolist(), strict=True):
+        recent = slice(max(frame - TRAIL, 0), frame + 1)
+        for point, color in zip(shown, colors, strict=True):
             if tracks.visible[frame, point]:
-                tail = tracks.pixels[first : frame + 1, point][tracks.visible[first : frame + 1, point]]
-                cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, colour, 1, cv2.LINE_AA)
-                cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, colour, -1, cv2.LINE_AA)
+                tail = tracks.pixels[recent, point][tracks.visible[recent, point]]
+                cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, color, 1, cv2.LINE_AA)
+                cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, color, -1, cv2.LINE_AA)
         tiles.append(image)
     return _save(tiles, path)
 
 
 def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) -> Path:
-    """Frame 0 and the last frame from the side and from above: object points in their colours, controllers red, the prior grey."""
+    """Frame 0 and the last frame from the side and from above: object points in their colors, controllers red, the prior gray."""
     from matplotlib import pyplot as plt
 
     last = len(lifted.object_points) - 1
@@ -79,8 +77,9 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
 
 
 def _frames(capture: Capture, camera: str) -> list[int]:
-    there = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    return [there[k] for k in np.unique(np.linspace(0, len(there) - 1, FRAMES).astype(int))]
+    """Frames that the camera has, spread over the video."""
+    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))]
 
 
 def _save(tiles: list[np.ndarray], path: Path) -> Path:

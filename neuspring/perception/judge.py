@@ -1,4 +1,4 @@
-"""How well perception did on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
+"""Errors of perception on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
@@ -17,11 +16,13 @@ from neuspring.data.synthetic.truth import Truth
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.perception.shape_prior import visual_hull
+from neuspring.perception.track_truth import carried
 
 MM = 1e3
 GRID = 0.003
-"""m, of the points that volumes are compared on."""
+"""m between the points on which volumes are compared."""
 SURFACE_POINTS = 4000
+"""Most vertices of a surface whose distances are averaged."""
 
 
 def judge(
@@ -41,16 +42,11 @@ def judge(
 
 def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, float]:
     """Mean intersection over union with the true masks, over cameras and frames that show the thing."""
+    views = [(camera, frame) for camera in capture.cameras for frame in range(capture.frame_count) if capture.has(camera, frame)]
     facts = {}
     for name, label in (("object", OBJECT), ("hands", HANDS)):
-        found = []
-        for camera in capture.cameras:
-            for frame in range(capture.frame_count):
-                if capture.has(camera, frame):
-                    own, true = masks[camera].labels[frame] == label, capture.mask(camera, frame) == label
-                    if true.any():
-                        found.append(float((own & true).sum() / (own | true).sum()))
-        facts[f"mask_iou_{name}"] = float(np.mean(found))
+        pairs = ((masks[camera].labels[frame] == label, capture.mask(camera, frame) == label) for camera, frame in views)
+        facts[f"mask_iou_{name}"] = float(np.mean([_overlap(own, true) for own, true in pairs if true.any()]))
     return facts
 
 
@@ -58,13 +54,13 @@ def track_quality(capture: Capture, truth: Truth, tracks: Mapping[str, PixelTrac
     """Error in pixels of visible points on the object after frame 0, and the share that is still followed in the last frame."""
     errors, alive = [], []
     for name, camera in capture.cameras.items():
-        start = tracks[name].pixels[0]
-        x, y = np.round(start).astype(int).T
-        material = under_pixels(truth, camera, start)
+        pixels, visible = tracks[name].pixels, tracks[name].visible
+        x, y = np.round(pixels[0]).astype(int).T
+        material = under_pixels(truth, camera, pixels[0])
         own = (material.face >= 0) & (capture.mask(name, 0)[y, x] == OBJECT)
-        off = np.linalg.norm(camera.project(material.places)[0] - tracks[name].pixels, axis=2)
-        errors.append(off[1:][tracks[name].visible[1:] & own])
-        alive.append(tracks[name].visible[-1, own])
+        off = np.linalg.norm(camera.project(material.places)[0] - pixels, axis=2)
+        errors.append(off[1:][visible[1:] & own])
+        alive.append(visible[-1, own])
     facts = _spread("track", np.concatenate(errors), "px")
     return facts | {"track_points": float(sum(map(len, alive))), "track_survival": float(np.concatenate(alive).mean())}
 
@@ -74,23 +70,20 @@ def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
     motion of their hand."""
     places = at_points(truth, lifted.object_points[0]).places
     off = np.linalg.norm(places - lifted.object_points, axis=2)
-    kept = lifted.object_visibility[1:]
-    trusted = lifted.object_motion_valid[:-1] & kept
-    facts = _spread("lifted", MM * off[1:][kept], "mm") | _spread("trusted", MM * off[1:][trusted], "mm")
-    facts |= {"lifted_share": float(kept.mean()), "trusted_share": float(trusted.mean())}
+    visible = lifted.object_visibility[1:]
+    trusted = lifted.object_motion_valid[:-1] & visible
+    facts = _spread("lifted", MM * off[1:][visible], "mm") | _spread("trusted", MM * off[1:][trusted], "mm")
+    facts |= {"lifted_share": float(visible.mean()), "trusted_share": float(trusted.mean())}
     return facts | _spread("controllers", MM * _controller_errors(truth, lifted.controller_points), "mm")
 
 
 def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
-    """[T - 1, C], m; a controller belongs to the hand whose motion it follows best."""
-    off = []
-    for hand in range(truth.hand_poses.shape[1]):
-        poses = truth.hand_poses[:, hand].astype(float)
-        local = Rotation.from_quat(poses[0, 3:]).inv().apply(controllers[0] - poses[0, :3])
-        moved = np.stack([Rotation.from_quat(pose[3:]).apply(local) + pose[:3] for pose in poses])
-        off.append(np.linalg.norm(moved - controllers, axis=2)[1:])
-    best = np.argmin([errors.mean(axis=0) for errors in off], axis=0)
-    return np.stack(off)[best, :, np.arange(controllers.shape[1])]
+    """[C, T - 1], m; a controller belongs to the hand whose motion it follows best."""
+    poses = truth.hand_poses.astype(float)
+    hands = [carried(controllers[0], poses[:, hand]) for hand in range(poses.shape[1])]
+    off = np.stack([np.linalg.norm(places - controllers, axis=2)[1:] for places in hands])
+    best = off.mean(axis=1).argmin(axis=0)
+    return np.asarray(off[best, :, np.arange(controllers.shape[1])])
 
 
 def hull_quality(
@@ -98,30 +91,32 @@ def hull_quality(
 ) -> dict[str, float]:
     """Volume IoU and mean surface distance of the visual hull of all cameras, and of the first one and two."""
     surface = ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     facts = {}
     for count in range(1, len(capture.cameras) + 1):
-        names = list(capture.cameras)[:count]
         seen = Capture(capture.folder, replace(capture.description, cameras=capture.description.cameras[:count]))
         try:
-            hull = visual_hull(seen, {name: masks[name] for name in names}, cloud, settings)
+            hull = visual_hull(seen, masks, cloud, settings)
         except InputError:
             facts[f"hull_iou_{count}"] = 0.0
             continue
-        least, most = (np.minimum, np.maximum)
-        corners = (least(low, hull.vertices.min(axis=0)), most(high, hull.vertices.max(axis=0)))
-        grid = np.stack(np.meshgrid(*[np.arange(a, b, GRID) for a, b in zip(*corners, strict=True)], indexing="ij"), axis=-1)
-        ours, true = (inside(prior, grid.reshape(-1, 3)) for prior in (hull, surface))
-        facts[f"hull_iou_{count}"] = float((ours & true).sum() / (ours | true).sum())
+        vertices = np.concatenate([surface.vertices, hull.vertices])
+        axes = [np.arange(low, high, GRID) for low, high in zip(vertices.min(axis=0), vertices.max(axis=0), strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        facts[f"hull_iou_{count}"] = _overlap(inside(hull, points), inside(surface, points))
         facts[f"hull_distance_{count}_mm"] = MM * _apart(hull.vertices, surface.vertices)
     return facts
+
+
+def _overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Intersection over union of two sets."""
+    return float((first & second).sum() / (first | second).sum())
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Mean of both mean nearest distances between vertices, m."""
     rng = np.random.default_rng(0)
-    a, b = (rng.permutation(points)[:SURFACE_POINTS] for points in (first, second))
-    return float((cKDTree(second).query(a)[0].mean() + cKDTree(first).query(b)[0].mean()) / 2.0)
+    some, others = (rng.permutation(points)[:SURFACE_POINTS] for points in (first, second))
+    return float((cKDTree(second).query(some)[0].mean() + cKDTree(first).query(others)[0].mean()) / 2.0)
 
 
 def _spread(name: str, values: np.ndarray, unit: str) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Tracks of all cameras -> points in the world: cleaned masks, visibility, agreement of motion, controllers.
 
-After sections 2.5 to 2.7 of the processing that PhysTwin released, vectorised. Where its result depends on the order of points, or
-its outlier test on single coordinates, ours does not; the released behaviour is a switch of `perception.lift`.
+After sections 2.5 to 2.7 of the processing that PhysTwin released, vectorized. The released result depends on the order of points,
+and its outlier test looks at single coordinates; ours does neither. Settings of `perception.lift` switch the released behavior on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neuspring.perception.controllers import choose_controllers
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
-"""Pixels: `outlier_neighbours` is meant for images of this focal length; with it the number of pixels on a surface grows."""
+"""Pixels: the focal length that `outlier_neighbours` is meant for. A longer one shows a surface in more pixels."""
 
 
 @dataclass(frozen=True)
@@ -33,34 +33,40 @@ class Seen:
     colours: np.ndarray
     """[n, 3] RGB in frame 0, 0 to 1."""
 
-    def pick(self, chosen: np.ndarray) -> Seen:
-        """Some of the points."""
-        return Seen(self.points[:, chosen], self.visible[:, chosen], self.colours[chosen])
+    @classmethod
+    def of_all(cls, cameras: list[Seen]) -> Seen:
+        """What several cameras saw."""
+        points = np.concatenate([camera.points for camera in cameras], axis=1)
+        visible = np.concatenate([camera.visible for camera in cameras], axis=1)
+        return cls(points, visible, np.concatenate([camera.colours for camera in cameras]))
 
 
 def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTracks], settings: Lift) -> LiftedTracks:
-    """Everything that the cameras saw, in the world.
+    """All tracks as points in the world, with the controllers chosen among those of the hands.
 
     Raises InputError where nothing of the object or too little of the hands remains.
     """
     cameras = lifting_cameras(capture, settings)
-    kept, cloud, colours = clean_masks(capture, cameras, masks, settings)
-    seen = {}
-    for label in (OBJECT, HANDS):
-        each = [_lifted(capture, cameras[name], tracks[name], kept[name] == label, settings) for name in cameras]
-        joined = (np.concatenate(values, axis=axis) for values, axis in zip(zip(*each, strict=True), (1, 1, 0), strict=True))
-        seen[label] = Seen(*joined)
+    labels, cloud, colors = clean_masks(capture, cameras, masks, settings)
+    objects, hands = (
+        Seen.of_all([_lifted(capture, camera, tracks[name], labels[name] == label, settings) for name, camera in cameras.items()])
+        for label in (OBJECT, HANDS)
+    )
     where = f"{capture.folder}, perception"
-    objects, hands = seen[OBJECT], seen[HANDS]
     if not objects.points.shape[1]:
         shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
-        left = sum(int((labels[0] == OBJECT).sum()) for labels in kept.values())
-        found = f"{shown} pixels of the object's masks, {left} of them with depth in range and enough neighbours, no track"
+        usable = sum(int((label[0] == OBJECT).sum()) for label in labels.values())
+        received = f"{shown} pixels of the object's masks, {usable} of them with depth in range and enough neighbors, no track"
         remedy = "Look at masks and tracks; perception.lift has depth_range, neighbourhood and outlier_neighbours."
-        raise InputError(where, "at least one tracked point must lie on the object in frame 0", found, remedy)
+        raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
     valid = agreeing_motion(objects, settings)
-    hand_valid = agreeing_motion(hands, settings)
-    controllers, facts = choose_controllers(hands.points, hands.visible, hand_valid, settings, where)
+    controllers, facts = choose_controllers(hands.points, hands.visible, agreeing_motion(hands, settings), settings, where)
+    facts |= {
+        "object_tracks": float(objects.points.shape[1]),
+        "hand_tracks": float(hands.points.shape[1]),
+        "visible_share": float(objects.visible.mean()),
+        "motion_valid_share": float(valid[:-1].mean()),
+    }
     return LiftedTracks(
         object_points=objects.points,
         object_visibility=objects.visible,
@@ -68,54 +74,63 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_colours=objects.colours,
         controller_points=controllers,
         cloud=cloud,
-        cloud_colours=colours,
+        cloud_colours=colors,
         backend="released" if settings.sequential_motion_filter else "vectorised",
-        facts=facts
-        | {
-            "object_tracks": float(objects.points.shape[1]),
-            "hand_tracks": float(hands.points.shape[1]),
-            "visible_share": float(objects.visible.mean()),
-            "motion_valid_share": float(valid[:-1].mean()),
-        },
+        facts=facts,
     )
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:
-    """The cameras as pixels are lifted with."""
-    return {name: _mirrored(camera) if settings.mirrored_principal_point else camera for name, camera in capture.cameras.items()}
+    """The cameras that pixels are lifted with."""
+    if not settings.mirrored_principal_point:
+        return capture.cameras
+    mirrored = {}
+    for name, camera in capture.cameras.items():
+        intrinsics = camera.intrinsics.copy()
+        intrinsics[0, 2] = camera.width - intrinsics[0, 2]
+        mirrored[name] = replace(camera, intrinsics=intrinsics)
+    return mirrored
 
 
 def clean_masks(
     capture: Capture, cameras: Mapping[str, Camera], masks: Mapping[str, Masks], settings: Lift, frames: int | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Labels [T, H, W] per camera without pixels that have no usable depth or float alone, and the object's cloud of frame 0 [P, 3]
-    with its colours [P, 3]. Only the first `frames` are cleaned, if given."""
-    kept = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
-    cloud, colours = np.zeros((0, 3)), np.zeros((0, 3))
-    # A camera sees a surface with a density of points that goes with the square of its focal length.
-    least = {n: settings.outlier_neighbours * (c.intrinsics[0, 0] / REFERENCE_FOCAL) ** 2 for n, c in cameras.items()}
+    """Labels [T, H, W] per camera, and the object's cloud of frame 0 [P, 3], m, with its colors [P, 3].
+
+    Labels lose the pixels that have no usable depth, and those whose points float alone. Only the first `frames` are cleaned, if
+    given.
+    """
+    labels = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
+    cloud, colors = np.zeros((0, 3)), np.zeros((0, 3))
+    # The density of the points that a camera sees on a surface goes with the square of its focal length.
+    focal = {name: camera.intrinsics[0, 0] for name, camera in cameras.items()}
+    least = {name: settings.outlier_neighbours * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
+    low, high = settings.depth_range
     for frame in range(frames or capture.frame_count):
-        there = [name for name in cameras if capture.has(name, frame)]
-        if not there:
+        names = [name for name in cameras if capture.has(name, frame)]
+        if not names:
             continue
-        depths = {name: capture.depth(name, frame) for name in there}
+        depths = {name: capture.depth(name, frame) for name in names}
         for label in (OBJECT, HANDS):
-            pixels = {name: _usable(masks[name].labels[frame] == label, depths[name], settings) for name in there}
-            points = [_cloud(cameras[name], pixels[name], depths[name]) for name in there]
-            needed = np.concatenate([np.full(len(p), least[name]) for name, p in zip(there, points, strict=True)])
+            pixels, points = {}, []
+            for name in names:
+                depth = depths[name]
+                pixels[name] = np.nonzero((masks[name].labels[frame] == label) & (depth > low) & (depth < high))
+                y, x = pixels[name]
+                points.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
+            needed = np.concatenate([np.full(len(part), least[name]) for name, part in zip(names, points, strict=True)])
             stays = _crowded(np.concatenate(points), settings.neighbourhood, needed, settings.coordinate_outliers)
-            for name, own in zip(there, np.split(stays, np.cumsum([len(p) for p in points])[:-1]), strict=True):
-                y, x = (axis[own] for axis in pixels[name])
-                kept[name][frame, y, x] = label
+            for name, own in zip(names, np.split(stays, np.cumsum([len(part) for part in points])[:-1]), strict=True):
+                y, x = pixels[name]
+                labels[name][frame, y[own], x[own]] = label
             if frame == 0 and label == OBJECT:
                 cloud = np.concatenate(points)[stays]
-                rgb = [capture.colour(name, 0)[pixels[name]] / 255.0 for name in there]
-                colours = np.concatenate(rgb)[stays]
-    return kept, cloud, colours
+                colors = np.concatenate([capture.colour(name, 0)[pixels[name]] / 255.0 for name in names])[stays]
+    return labels, cloud, colors
 
 
 def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
-    """[T, n] bool, row t for the motion from t to t + 1: visible in both, with enough neighbours of which half move alike."""
+    """[T, n] bool, row t for the motion from t to t + 1: the point is visible in both, and half of its neighbors move alike."""
     test = _sequential if settings.sequential_motion_filter else _simultaneous
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):
@@ -127,7 +142,7 @@ def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
 
 
 def _simultaneous(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
-    """All points judged by all: independent of their order."""
+    """Every point judged by all others: independent of their order."""
     pairs = cKDTree(points).query_pairs(settings.neighbourhood, output_type="ndarray")
     alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < settings.agreement
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
@@ -139,35 +154,30 @@ def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.nd
     """As released: points in order, each judged by those not dropped before it."""
     valid = np.ones(len(points), dtype=bool)
     for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighbourhood)):
-        neighbours = np.array([j for j in near if valid[j]], dtype=int)
-        alike = np.linalg.norm(motion[neighbours] - motion[i], axis=1) < settings.agreement
-        valid[i] = len(neighbours) >= settings.least_neighbours and alike.sum() >= 0.5 * len(neighbours)
+        neighbors = np.array([j for j in near if valid[j]], dtype=int)
+        alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < settings.agreement
+        valid[i] = len(neighbors) >= settings.least_neighbours and alike.sum() >= 0.5 * len(neighbors)
     return valid
 
 
-def _lifted(
-    capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray, settings: Lift
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [T, n, 3], visibility [T, n] and colours [n, 3] of the tracks that start inside the mask `inside` [T, H, W]."""
-    frames = capture.frame_count
-    hit = np.zeros((frames, tracks.pixels.shape[1]), dtype=bool)
+def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray, settings: Lift) -> Seen:
+    """The tracks of one camera that start inside the mask `inside` [T, H, W]."""
     rounded = np.round(tracks.pixels).astype(int)
-    for frame in range(frames):
-        seen = tracks.visible[frame] & camera.sees(tracks.pixels[frame])
+    visible = tracks.visible & camera.sees(tracks.pixels)
+    for frame, seen in enumerate(visible):
         x, y = rounded[frame, seen].T
-        hit[frame, seen] = inside[frame, y, x]
-    own = hit[0]
-    visible, pixels = hit[:, own], tracks.pixels[:, own]
+        seen[seen] = inside[frame, y, x]
+    own = visible[0]
+    rounded, visible = rounded[:, own], visible[:, own]
+    places = rounded if settings.whole_pixels else tracks.pixels[:, own]
     points = np.zeros((*visible.shape, 3))
-    for frame in range(frames):
-        if visible[frame].any():
-            seen = visible[frame]
-            x, y = rounded[frame][own][seen].T
+    for frame, seen in enumerate(visible):
+        if seen.any():
+            x, y = rounded[frame, seen].T
             depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y, settings.depth_window)
-            place = rounded[frame][own][seen] if settings.whole_pixels else pixels[frame, seen]
-            points[frame, seen] = camera.lift(place.astype(float), depth)
-    x, y = rounded[0, own].T
-    return points, visible, capture.colour(camera.name, 0)[y, x] / 255.0
+            points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
+    x, y = rounded[0].T
+    return Seen(points, visible, capture.colour(camera.name, 0)[y, x] / 255.0)
 
 
 def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray, window: int) -> np.ndarray:
@@ -179,17 +189,6 @@ def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndar
     return np.asarray(np.nanmedian(values.reshape(len(x), -1), axis=1))
 
 
-def _usable(mask: np.ndarray, depth: np.ndarray, settings: Lift) -> tuple[np.ndarray, np.ndarray]:
-    low, high = settings.depth_range
-    y, x = np.nonzero(mask & (depth > low) & (depth < high))
-    return y, x
-
-
-def _cloud(camera: Camera, pixels: tuple[np.ndarray, np.ndarray], depth: np.ndarray) -> np.ndarray:
-    y, x = pixels
-    return camera.lift(np.stack([x, y], axis=1).astype(float), depth[y, x])
-
-
 def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate: bool) -> np.ndarray:
     """Whether more than `least` [n] points, itself included, lie within `radius` of each [n] bool.
 
@@ -199,13 +198,6 @@ def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate
         return np.zeros(0, dtype=bool)
     stays = cKDTree(points).query_ball_point(points, radius, return_length=True) > least
     if by_coordinate and not stays.all():
-        dropped = points[~stays]
-        stays &= ~np.any([np.isin(points[:, k], dropped[:, k]) for k in range(3)], axis=0)
+        outliers = points[~stays]
+        stays &= ~np.any([np.isin(points[:, k], outliers[:, k]) for k in range(3)], axis=0)
     return np.asarray(stays)
-
-
-def _mirrored(camera: Camera) -> Camera:
-    """As the processing did before July 2025: x measured from W - cx."""
-    k = camera.intrinsics.copy()
-    k[0, 2] = camera.width - k[0, 2]
-    return replace(camera, intrinsics=k)

@@ -1,5 +1,8 @@
-"""Lifted tracks and shape prior -> the structure points of a twin, one per voxel: observed points first, then the prior's surface,
-then its inside (section 2.9 of the released processing, seeded)."""
+"""Lifted tracks and a shape prior -> the structure points of a twin, one per voxel.
+
+Observed points come first, then points on the prior's surface, then points inside it (section 2.9 of the released processing, here
+with a seed).
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,12 @@ def structure(
     """
     start = on_table(lifted.object_points[0], up)
     _, unique = np.unique(start, axis=0, return_index=True)
-    surface, interior = _samples(prior, settings, seed)
-    surface, interior = on_table(surface, up), on_table(interior, up)
+    surface, interior = (on_table(points, up) for points in _samples(prior, settings, seed))
     everything = np.concatenate([start[unique], surface, interior])
     cells = np.floor((everything - everything.min(axis=0)) / settings.voxel).astype(int)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    kept = np.zeros(len(everything), dtype=bool)
-    kept[first] = True
-    ends = np.cumsum([len(unique), len(surface)])
-    own, outer, inner = np.split(kept, ends)
+    first_of_cell = np.zeros(len(everything), dtype=bool)
+    first_of_cell[np.unique(cells, axis=0, return_index=True)[1]] = True
+    own, outer, inner = np.split(first_of_cell, np.cumsum([len(unique), len(surface)]))
     return unique[own], surface[outer], interior[inner]
 
 
@@ -40,27 +40,30 @@ def on_table(points: np.ndarray, up: float) -> np.ndarray:
     return lifted
 
 
-def _samples(prior: ShapePrior, settings: Sampling, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Area-uniform surface points, and those of uniform points of the bounding box that lie inside."""
-    if not len(prior.faces):
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    rng = np.random.default_rng(seed)
-    corners = prior.vertices[prior.faces].astype(float)
+def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points [count, 3] of a mesh, uniform by area."""
+    corners = vertices[faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    face = rng.choice(len(area), settings.surface, p=area / area.sum())
-    weights = rng.dirichlet((1.0, 1.0, 1.0), settings.surface)
-    surface = np.einsum("ns,nsc->nc", weights, corners[face])
-    low, high = prior.vertices.min(axis=0), prior.vertices.max(axis=0)
-    box = rng.uniform(low, high, (settings.interior, 3))
-    return surface, box[inside(prior, box)]
+    face = rng.choice(len(area), count, p=area / area.sum())
+    weights = rng.dirichlet((1.0, 1.0, 1.0), count)
+    return np.asarray(np.einsum("ns,nsc->nc", weights, corners[face]))
 
 
 def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
-    """Whether points [n, 3] lie inside the closed surface, by its winding number."""
+    """Whether points [n, 3] lie inside the closed surface [n], by its winding number."""
     indices: wp.array = wp.array(prior.faces.ravel(), dtype=wp.int32, device="cpu")
     mesh = wp.Mesh(wp.array(prior.vertices, dtype=wp.vec3, device="cpu"), indices, support_winding_number=True)
-    found = wp.zeros(len(points), dtype=wp.bool, device="cpu")
+    result = wp.zeros(len(points), dtype=wp.bool, device="cpu")
     reach = float(np.ptp(prior.vertices, axis=0).max()) * 2.0
-    arguments = [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, found]
-    wp.launch(winding, len(points), arguments, device="cpu")
-    return np.asarray(found.numpy())
+    wp.launch(winding, len(points), [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, result], device="cpu")
+    return np.asarray(result.numpy())
+
+
+def _samples(prior: ShapePrior, settings: Sampling, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the surface, and those of uniform points of its bounding box that lie inside."""
+    if not len(prior.faces):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    rng = np.random.default_rng(seed)
+    surface = on_surface(prior.vertices, prior.faces, settings.surface, rng)
+    box = rng.uniform(prior.vertices.min(axis=0), prior.vertices.max(axis=0), (settings.interior, 3))
+    return surface, box[inside(prior, box)]

@@ -2,7 +2,7 @@
 start masks, masks are carried through the video.
 
 Weights come from the usual Hugging Face cache or from a folder; they are large and only downloaded if `download` allows it. As in
-the released processing: a prompt of object and hand, boxes above a score, every detection that is not a hand is the object.
+the released processing, the prompt names object and hand, boxes need a score, and every detection that is not a hand is the object.
 """
 
 from __future__ import annotations
@@ -40,24 +40,22 @@ class Detection:
 def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, models: Models | None = None) -> np.ndarray:
     """Labels [T, H, W]. Raises InputError where weights are missing or the prompt finds no object or no hand."""
     models = models or load(settings, device)
-    frames = [f for f in range(capture.frame_count) if capture.has(camera, f)]
+    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
     images = [capture.colour(camera, frame) for frame in frames]
     prompt = settings.prompt or capture.description.category
-    found = detect(images[0], prompt, settings, models, device)
-    hands = [d for d in found if settings.hand_prompt.lower() in d.words.replace(".", " ").split()]
-    objects = [d for d in found if d not in hands]
-    where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
-    for what, detections in (("object", objects), ("hand", hands)):
-        if not detections:
-            rule = f"the prompt {prompt!r} and {settings.hand_prompt!r} must find an object and a hand"
-            remedy = "Set perception.segment.grounded_sam2.prompt to words for the object, or lower box_threshold."
-            raise InputError(where, rule, f"no {what} among {[d.words for d in found]}", remedy)
+    detections = detect(images[0], prompt, settings, models, device)
+    is_hand = [settings.hand_prompt.lower() in detection.words.replace(".", " ").split() for detection in detections]
+    if all(is_hand) or not any(is_hand):
+        missing = "hand" if detections and not any(is_hand) else "object"
+        where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
+        rule = f"the prompt {prompt!r} and {settings.hand_prompt!r} must find an object and a hand"
+        remedy = "Set perception.segment.grounded_sam2.prompt to words for the object, or lower box_threshold."
+        raise InputError(where, rule, f"no {missing} among {[detection.words for detection in detections]}", remedy)
     labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
-    of_detection = [HANDS if d in hands else OBJECT for d in found]
-    for frame, masks in zip(frames, propagate(images, found, models, device), strict=True):
-        for label, mask in sorted(zip(of_detection, masks, strict=True), key=lambda pair: pair[0]):
-            # Hands are in front of what they hold.
-            labels[frame][mask] = label
+    for frame, masks in zip(frames, propagate(images, detections, models, device), strict=True):
+        # Hands come last: they are in front of what they hold.
+        labels[frame][masks[np.logical_not(is_hand)].any(axis=0)] = OBJECT
+        labels[frame][masks[is_hand].any(axis=0)] = HANDS
     return labels
 
 
@@ -94,35 +92,32 @@ def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Model
     inputs = models.detector_processor(images=image, text=words.lower(), return_tensors="pt").to(device)
     with torch.inference_mode():
         outputs = models.detector(**inputs)
-    found = models.detector_processor.post_process_grounded_object_detection(
+    result = models.detector_processor.post_process_grounded_object_detection(
         outputs,
         inputs["input_ids"],
         threshold=settings.box_threshold,
         text_threshold=settings.text_threshold,
         target_sizes=[image.shape[:2]],
     )[0]
-    rows = zip(found["boxes"].tolist(), found["text_labels"], found["scores"].tolist(), strict=True)
+    rows = zip(result["boxes"].tolist(), result["text_labels"], result["scores"].tolist(), strict=True)
     detections = [Detection(tuple(box), str(text), float(score)) for box, text, score in rows]
-    return sorted(detections, key=lambda d: -d.score)
+    return sorted(detections, key=lambda detection: -detection.score)
 
 
-def propagate(images: list[np.ndarray], found: list[Detection], models: Models, device: str) -> list[np.ndarray]:
+def propagate(images: list[np.ndarray], detections: list[Detection], models: Models, device: str) -> list[np.ndarray]:
     """Masks [detections, H, W] bool of every image."""
     import torch
 
     size = images[0].shape[:2]
-    masks = [np.zeros((len(found), *size), dtype=bool) for _ in images]
+    masks = [np.zeros((len(detections), *size), dtype=bool) for _ in images]
+    processor = models.video_processor
     with torch.inference_mode():
-        session = models.video_processor.init_video_session(video=images, inference_device=device)
-        models.video_processor.add_inputs_to_inference_session(
-            inference_session=session,
-            frame_idx=0,
-            obj_ids=list(range(len(found))),
-            input_boxes=[[list(d.box) for d in found]],
-        )
+        session = processor.init_video_session(video=images, inference_device=device)
+        boxes = [[list(detection.box) for detection in detections]]
+        processor.add_inputs_to_inference_session(session, frame_idx=0, obj_ids=list(range(len(detections))), input_boxes=boxes)
         models.video(inference_session=session, frame_idx=0)
         for output in models.video.propagate_in_video_iterator(session):
-            scaled = models.video_processor.post_process_masks([output.pred_masks], original_sizes=[list(size)], binarize=True)[0]
+            scaled = processor.post_process_masks([output.pred_masks], original_sizes=[list(size)], binarize=True)[0]
             for place, detection in enumerate(session.obj_ids):
                 masks[output.frame_idx][detection] = scaled[place, 0].cpu().numpy().astype(bool)
     return masks

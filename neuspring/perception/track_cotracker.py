@@ -1,14 +1,16 @@
 """Dense tracking by CoTracker3, online, from torch.hub: windows of the video in turn, points of frame 0 as queries.
 
-Code and weights are Meta's, under their own licence (non-commercial at the time of writing); nothing of them is in this project.
+Code and weights are Meta's, under their own license (non-commercial at the time of writing); nothing of them is in this project.
 They come from the torch.hub cache, or are downloaded if `download` allows it.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from neuspring.config.perception import CoTracker3
 from neuspring.core.errors import InputError
@@ -23,60 +25,51 @@ ADDRESS = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS}"
 def track(
     capture: Capture, camera: str, labels: np.ndarray, settings: CoTracker3, seed: int, device: str, model: Any = None
 ) -> Followed:
-    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W].
+    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands.
 
     `model` is called as CoTracker3's online predictor is: once with is_first_step and the queries [1, Q, 3] (frame, x, y), then
     with the latest 2 * step frames of the video [1, t, 3, H, W], 0 to 255, every `step` frames; it returns tracks [1, t, Q, 2] and
-    visibility [1, t, Q] of all frames so far. Without pixels in frame 0 there are
-    no points. Raises InputError where the model cannot be loaded.
+    visibility [1, t, Q] of all frames so far. Raises InputError where the model cannot be loaded.
     """
-    import torch
-
     start = choose(labels[0], settings.points, seed)
+    result = Followed.starting_at(start, capture.frame_count)
     if not len(start):
-        return Followed(np.zeros((capture.frame_count, 0, 2), np.float32), np.zeros((capture.frame_count, 0), dtype=bool))
+        return result
     model = (load(settings) if model is None else model).to(device)
-    frames = [f for f in range(capture.frame_count) if capture.has(camera, f)]
-    video = torch.from_numpy(np.stack([capture.colour(camera, f) for f in frames])).permute(0, 3, 1, 2)[None]
+    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    video = torch.from_numpy(np.stack([capture.colour(camera, frame) for frame in frames])).permute(0, 3, 1, 2)[None]
     queries = torch.from_numpy(np.concatenate([np.zeros((len(start), 1)), start], axis=1)[None]).float().to(device)
     places, seen = _windows(model, video, queries, device)
-    found = Followed(np.repeat(start[None], capture.frame_count, axis=0), np.zeros((capture.frame_count, len(start)), dtype=bool))
     for k, frame in enumerate(frames):
-        found.pixels[frame:], found.visible[frame] = places[k], seen[k]
-    found.pixels[0], found.visible[0] = start, True
-    return found
+        result.pixels[frame:], result.visible[frame] = places[k], seen[k]
+    result.pixels[0], result.visible[0] = start, True
+    return result
 
 
-def _windows(model: Any, video: Any, queries: Any, device: str) -> tuple[np.ndarray, np.ndarray]:
+def _windows(model: Any, video: torch.Tensor, queries: torch.Tensor, device: str) -> tuple[np.ndarray, np.ndarray]:
     """Tracks [t, Q, 2] and visibility [t, Q] of all frames of the video."""
-    import torch
-
     step, count = int(model.step), video.shape[1]
     # The last window is filled with copies of the last frame, which are cut off again.
-    filled = int(np.ceil(max(count, 2 * step) / step)) * step
-    video = torch.cat([video, video[:, -1:].expand(-1, filled - count, -1, -1, -1)], dim=1) if filled > count else video
+    whole = int(np.ceil(max(count, 2 * step) / step)) * step
+    video = torch.cat([video, video[:, -1:].expand(-1, whole - count, -1, -1, -1)], dim=1) if whole > count else video
     with torch.inference_mode():
         model(video_chunk=video[:, : 2 * step].float().to(device), is_first_step=True, queries=queries)
-        for first in range(0, filled - step, step):
+        for first in range(0, whole - step, step):
             tracks, visible = model(video_chunk=video[:, first : first + 2 * step].float().to(device))
     return tracks[0, :count].cpu().numpy(), visible[0, :count].cpu().numpy().astype(bool)
 
 
 def load(settings: CoTracker3) -> Any:
     """The online predictor of torch.hub. Raises InputError if it is neither cached nor may be downloaded."""
-    from pathlib import Path
-
-    import torch
-
-    cached = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
-    if not (cached and weights.is_file()) and not settings.download:
+    hub = Path(torch.hub.get_dir())
+    copies = sorted(hub.glob("facebookresearch_co-tracker_*"))
+    if not (copies and (hub / "checkpoints" / WEIGHTS).is_file()) and not settings.download:
         rule = f"CoTracker3's code and checkpoints/{WEIGHTS} must be in the torch.hub cache"
-        remedy = "Set perception.track.cotracker3.download: true once (mind its licence), or use the backend opencv."
-        raise InputError("perception.track.cotracker3", rule, f"not both in {torch.hub.get_dir()}", remedy)
+        remedy = "Set perception.track.cotracker3.download: true once (mind its license), or use the backend opencv."
+        raise InputError("perception.track.cotracker3", rule, f"not both in {hub}", remedy)
     # The hub's own code would read the weights as any pickle; here they come as tensors alone.
-    if cached:
-        predictor: Any = torch.hub.load(str(cached[-1]), "cotracker3_online", source="local", pretrained=False)
+    if copies:
+        predictor: Any = torch.hub.load(str(copies[-1]), "cotracker3_online", source="local", pretrained=False)
     else:
         predictor = torch.hub.load("facebookresearch/co-tracker", "cotracker3_online", trust_repo=True, pretrained=False)
     predictor.model.load_state_dict(torch.hub.load_state_dict_from_url(ADDRESS, map_location="cpu", weights_only=True))

@@ -1,1 +1,11 @@
-"""Appearance: Gaussian splats, their rasteriser, training on frame 0, and skinning to the nodes of a twin."""
+"""Appearance: Gaussian splats, trained on frame 0 and carried by the nodes of a twin. README.md here is the page for users.
+
+| what | modules |
+|---|---|
+| the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors) |
+| drawing | `rasterise`: the entry, and the choice of backend; `reference`: its float64 specification |
+| | `view`, `project`, `tiles`, `blend`, `harmonics`: our backend; `gsplat_backend`: the other |
+| training | `train`, `losses`, `ssim`, `densify`; `alpha`: first points inside an alpha shape |
+| motion | `skinning`, `skinning_kernels`: nodes carry splats |
+| pictures of a twin | `draw` |
+"""

@@ -26,12 +26,12 @@ def points_within(cloud: np.ndarray, alpha: float, count: int, seed: int) -> np.
     volumes = np.abs(np.linalg.det(edges)) / 6
     solid = volumes > LEAST_VOLUME
     corners, edges, volumes = corners[solid], edges[solid], volumes[solid]
-    # The centre c of the sphere has e . c = |e|^2 / 2 for the three edges e from one corner.
-    centres = np.linalg.solve(edges, 0.5 * (edges**2).sum(axis=2)[..., None])[..., 0]
-    inside = np.linalg.norm(centres, axis=1) < alpha
+    # The center c of the sphere has e . c = |e|^2 / 2 for the three edges e from one corner.
+    centers = np.linalg.solve(edges, 0.5 * (edges**2).sum(axis=2)[..., None])[..., 0]
+    inside = np.linalg.norm(centers, axis=1) < alpha
     if not inside.any():
         raise failure
-    draw = np.random.default_rng(seed)
-    chosen = draw.choice(int(inside.sum()), count, p=volumes[inside] / volumes[inside].sum())
-    weights = draw.dirichlet(np.ones(4), count)
-    return np.asarray(np.einsum("pc,pcd->pd", weights, corners[inside][chosen]))
+    rng = np.random.default_rng(seed)
+    tetrahedra = rng.choice(int(inside.sum()), count, p=volumes[inside] / volumes[inside].sum())
+    weights = rng.dirichlet(np.ones(4), count)
+    return np.asarray(np.einsum("pc,pcd->pd", weights, corners[inside][tetrahedra]))

@@ -1,4 +1,4 @@
-"""Front-to-back blending of ellipses in tiles, and its adjoint: Warp kernels, the same on CPU and CUDA.
+"""Front-to-back blending of ellipses in tiles, differentiable: Warp kernels, the same on CPU and CUDA, and their launcher.
 
 For a pixel at u and the ellipses i of its tile in order of depth, with conic Q_i, mean m_i, opacity o_i and feature f_i [4],
 
@@ -15,19 +15,95 @@ T <= transmittance_min. The adjoint goes back to front and takes T_i = T_(i+1) /
 import functools
 from typing import Any
 
+import torch
 import warp as wp
+
+from neuspring.core.device import load, start_warp
+from neuspring.splats.tiles import Tiles
+from neuspring.splats.view import Limits, View
+
+
+def blend(
+    lists: Tiles,
+    view: View,
+    limits: Limits,
+    means: torch.Tensor,
+    conics: torch.Tensor,
+    opacities: torch.Tensor,
+    features: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Blended features [H, W, 4] and transmittance [H, W], differentiable in means [M, 2], conics [M, 3], opacities [M],
+    features [M, 4]."""
+    start_warp()
+    result: tuple[torch.Tensor, torch.Tensor] = _Blend.apply(lists, view, limits, means, conics, opacities, features)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, lists: Tiles, view: View, limits: Limits, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        means, conics, opacities, features = tensors
+        # Beyond this exponent an ellipse is below alpha_min; the comparison saves most exponentials.
+        bound = torch.log(opacities / limits.alpha_min) * (1 + 1e-6) + 1e-6
+        strengths = torch.stack([opacities, bound], dim=1)
+        inputs = [t.detach().contiguous() for t in (means, conics, strengths, features)]
+        total = features.new_zeros(view.height, view.width, 4)
+        left = features.new_ones(view.height, view.width)
+        ends = torch.zeros(view.height, view.width, dtype=torch.int32, device=means.device)
+        thresholds = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
+        _launch(0, view, [*_vectors(*inputs), *_lists(lists), *thresholds, *_vectors(total), *_scalars(left, ends)], means)
+        ctx.lists, ctx.view, ctx.limits = lists, view, limits
+        ctx.save_for_backward(*inputs, left, ends)
+        return total, left
+
+    @staticmethod
+    def backward(ctx: Any, adj_total: torch.Tensor, adj_left: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+        *inputs, left, ends = ctx.saved_tensors
+        means, conics, strengths, features = inputs
+        adjoints = [torch.zeros_like(tensor) for tensor in (means, conics, strengths[:, 0], features)]
+        limits: Limits = ctx.limits
+        adj_means, adj_conics, adj_opacities, adj_features = adjoints
+        arguments = [*_vectors(*inputs), *_lists(ctx.lists), limits.alpha_min, limits.alpha_max, *_scalars(left.detach(), ends)]
+        arguments += [*_vectors(adj_total.contiguous()), *_scalars(adj_left.contiguous())]
+        arguments += [*_vectors(adj_means, adj_conics), *_scalars(adj_opacities), *_vectors(adj_features)]
+        _launch(1, ctx.view, arguments, means)
+        return (None, None, None, *adjoints)
+
+
+def _launch(which: int, view: View, arguments: list[Any], like: torch.Tensor) -> None:
+    """Run kernel `which` of `kernels`, a thread per pixel, in the precision and on the device of `like`."""
+    device = wp.device_from_torch(like.device)
+    kernel = load(kernels(wp.dtype_from_torch(like.dtype))[which], device)
+    # Torch orders its own work on its current stream, so the kernel must run there too.
+    stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
+    wp.launch(kernel, (view.height, view.width), arguments, device=device, stream=stream)
+
+
+def _lists(lists: Tiles) -> list[Any]:
+    return [wp.from_torch(lists.starts), wp.from_torch(lists.members), lists.across, lists.side]
+
+
+def _scalars(*tensors: torch.Tensor) -> list[Any]:
+    return [wp.from_torch(tensor) for tensor in tensors]
+
+
+def _vectors(*tensors: torch.Tensor) -> list[Any]:
+    """Warp arrays of the same memory whose entries are vectors: the last axis."""
+    return [wp.from_torch(t, dtype=wp.types.vector(t.shape[-1], wp.dtype_from_torch(t.dtype))) for t in tensors]
 
 
 @functools.cache
 def kernels(real: Any) -> tuple[Any, Any]:
-    """(blend, adjoint) kernels for the scalar type `real`, wp.float32 or wp.float64."""
+    """The kernels (blending, its adjoint) for the scalar type `real`, wp.float32 or wp.float64."""
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     one = wp.constant(real(1.0))
     half = wp.constant(real(0.5))
 
-    def blend(
+    def front_to_back(
         means: wp.array(dtype=vec2),
         conics: wp.array(dtype=vec3),
         strengths: wp.array(dtype=vec2),
@@ -69,7 +145,7 @@ def kernels(real: Any) -> tuple[Any, Any]:
         transmittance[y, x] = left
         ends[y, x] = end
 
-    def blend_adjoint(
+    def back_to_front(
         means: wp.array(dtype=vec2),
         conics: wp.array(dtype=vec3),
         strengths: wp.array(dtype=vec2),
@@ -122,4 +198,4 @@ def kernels(real: Any) -> tuple[Any, Any]:
                         wp.atomic_add(adj_conics, i, vec3(half * d[0] * d[0], d[0] * d[1], half * d[1] * d[1]) * adj_s)
 
     unique = wp.kernel(module="unique", enable_backward=False)
-    return unique(blend), unique(blend_adjoint)
+    return unique(front_to_back), unique(back_to_front)

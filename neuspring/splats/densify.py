@@ -1,4 +1,4 @@
-"""Adaptive density of splats: clone small ones and split large ones where the picture pulls at them, remove faint and huge ones.
+"""Adaptive density of splats: small ones are cloned, large ones split, where the picture pulls at them; faint and huge ones go.
 
 After Kerbl et al. 2023, section 5.2: a splat whose place in the picture has a mean gradient above a threshold is too coarse.
 """
@@ -16,39 +16,39 @@ from neuspring.splats.rasterise import Rendered
 
 CHILDREN = 2
 SHRINK = 1.6
-"""Children of a split are this much smaller."""
+"""A child of a split is smaller than its parent by this factor."""
 REFERENCE_WIDTH = 848
-"""Pixels in the settings are those of an image this wide."""
+"""Lengths in pixels in the settings refer to an image this wide."""
 
 
 @dataclass
 class Statistics:
-    """What was seen of each splat since the last change of their number."""
+    """What pictures showed of each splat since their number last changed."""
 
     pull: torch.Tensor
     """[N] sum of gradients of the place in the picture, per half picture."""
     seen: torch.Tensor
-    """[N] in how many pictures."""
+    """[N] number of pictures that show it."""
     radius: torch.Tensor
     """[N] largest, as a part of the picture's width."""
 
     @classmethod
     def empty(cls, like: torch.Tensor) -> Statistics:
         """For splats with means `like` [N, 3]."""
-        return cls(*(like.new_zeros(len(like)) for _ in range(3)))
+        return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
 
     @torch.no_grad()
-    def add(self, drawn: Rendered, width: int, height: int) -> None:
+    def add(self, rendered: Rendered, width: int, height: int) -> None:
         """Account for a picture after its backward pass."""
-        gradient = drawn.means.grad
+        gradient = rendered.means.grad
         if gradient is None:
             return
-        if drawn.backend == "gsplat":
-            gradient = gradient[0, drawn.index]
+        if rendered.backend == "gsplat":
+            gradient = gradient[0, rendered.index]
         half = gradient.new_tensor([width / 2, height / 2])
-        self.pull.index_add_(0, drawn.index, (gradient * half).norm(dim=1))
-        self.seen.index_add_(0, drawn.index, torch.ones_like(drawn.radii))
-        self.radius[drawn.index] = torch.maximum(self.radius[drawn.index], drawn.radii / width)
+        self.pull.index_add_(0, rendered.index, (gradient * half).norm(dim=1))
+        self.seen.index_add_(0, rendered.index, torch.ones_like(rendered.radii))
+        self.radius[rendered.index] = torch.maximum(self.radius[rendered.index], rendered.radii / width)
 
 
 @torch.no_grad()
@@ -60,25 +60,24 @@ def densify(
     after_reset: bool,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Which splats stay [N] bool, and new ones to be appended, with the keys of `splats` (those of `Gaussians`).
+    """Which splats stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
 
     `extent`, m, is the size of the scene; `after_reset` also removes splats that are huge.
     """
     size = torch.exp(splats["log_scales"]).amax(1)
-    coarse = statistics.pull / statistics.seen.clamp_min(1) > settings.densify_gradient
+    mean_pull = statistics.pull / statistics.seen.clamp_min(1)
+    coarse = mean_pull > settings.densify_gradient
     room = max(settings.most_splats - len(size), 0)
-    # The most coarse ones first where there is no room for all.
+    # The coarsest ones first where there is no room for all.
     if int(coarse.sum()) > room:
-        mean = statistics.pull / statistics.seen.clamp_min(1)
-        coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean, room).indices, True) & coarse
-    # What is split gets smaller, so splats of a fixed radius are cloned.
+        coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean_pull, room).indices, True) & coarse
+    # A split makes smaller splats, so splats of a fixed radius are cloned.
     split = coarse & (size > settings.split_size * extent) & (settings.fixed_radius is None)
-    clone = coarse & ~split
-    added = {name: tensor[clone] for name, tensor in splats.items()}
+    added = {name: tensor[coarse & ~split] for name, tensor in splats.items()}
     if split.any():
         children = {name: tensor[split].repeat_interleave(CHILDREN, 0) for name, tensor in splats.items()}
-        drawn = torch.randn(children["means"].shape, generator=generator).to(children["means"])
-        offsets = drawn * torch.exp(children["log_scales"])
+        noise = torch.randn(children["means"].shape, generator=generator).to(children["means"])
+        offsets = noise * torch.exp(children["log_scales"])
         children["means"] = children["means"] + torch.einsum("nij,nj->ni", rotations(children["quaternions"]), offsets)
         children["log_scales"] = children["log_scales"] - torch.log(size.new_tensor(SHRINK))
         added = {name: torch.cat([added[name], children[name]]) for name in added}

@@ -1,4 +1,4 @@
-"""Drawing a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
+"""Pictures of a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 
 COVERED = 128
-"""Of 255: a pixel that splats cover by half counts as object."""
+"""Coverage, of 255, from which a pixel counts as object: a half."""
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
@@ -45,7 +45,7 @@ def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) ->
 
 
 def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussians]:
-    """The splats, unturned, with given centres [F, G, 3], m, in every frame."""
+    """The splats with the centers [F, G, 3], m, in every frame; their orientations stay."""
     start = Gaussians.of(splats, device)
     if centres.shape[1] != len(splats.means):
         rule = f"one centre for each of {len(splats.means)} splats is required"
@@ -56,14 +56,14 @@ def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussia
 
 @torch.no_grad()
 def picture(gaussians: Gaussians, view: View, backend: Backend, background: tuple[float, float, float] = BLACK) -> np.ndarray:
-    """RGBA [H, W, 4] uint8: colour over the background, and coverage."""
+    """RGBA [H, W, 4] uint8: color over the background, and coverage."""
     drawn = gaussians.draw(view, background=background, backend=backend)
     rgba = torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1).clamp(0, 1)
     return np.asarray((255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy())
 
 
 def turned(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
-    """RGB [H, W, 3] uint8 over white from a camera like `like` that went round the object by `angle` degrees and still faces it."""
+    """RGB [H, W, 3] uint8 over white: the view `like`, turned about the object by `angle` degrees."""
     centre = gaussians.means.median(0).values.double().cpu().numpy()
     turn = Rotation.from_euler("z", angle, degrees=True)
     pose = np.linalg.inv(like.world_to_camera.double().cpu().numpy())

@@ -1,41 +1,38 @@
-"""Drawing with gsplat (Apache-2.0), on CUDA. Its thresholds of coverage are its own and cannot be set: since version 1.5 no splat
-covers more than 0.99, ours 0.999 (`Limits.alpha_max`)."""
+"""Drawing with gsplat (Apache-2.0), on CUDA. Its thresholds of coverage cannot be set: since version 1.5 no splat covers more than
+0.99, ours 0.999 (`Limits.alpha_max`)."""
 
 from __future__ import annotations
 
 import torch
 
 from neuspring.core.errors import InputError
+from neuspring.splats.rasterise import Rendered
 from neuspring.splats.view import LIMITS, Limits, View
 
 
-def draw(
+def rasterise(
     means: torch.Tensor,
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     view: View,
     degree: int | None,
     background: tuple[float, float, float],
     limits: Limits,
-) -> tuple[torch.Tensor, ...]:
-    """rgb [H, W, 3], alpha [H, W], depth [H, W], index [M], means [1, N, 2] px and radii [M] px. Arguments as `rasterise`.
-
-    Raises InputError for thresholds other than the defaults, which gsplat would not keep.
-    """
+) -> Rendered:
+    """As `neuspring.splats.rasterise.rasterise`; raises InputError for thresholds that gsplat would not keep."""
     from gsplat import rasterization
 
     own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
     if own != (LIMITS.alpha_min, LIMITS.alpha_max, LIMITS.transmittance_min):
         raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
-
-    drawn, alpha, facts = rasterization(
+    picture, alpha, facts = rasterization(
         means,
         torch.nn.functional.normalize(quaternions, dim=-1),
         scales,
         opacities,
-        colours,
+        colors,
         view.world_to_camera[None].to(means),
         view.intrinsics[None].to(means),
         view.width,
@@ -55,5 +52,5 @@ def draw(
     radii = radii.amax(-1) if radii.ndim == 2 else radii
     index = torch.nonzero(radii > 0).squeeze(1)
     cover = alpha[0, ..., 0]
-    rgb = drawn[0, ..., :3] + (1 - cover)[..., None] * drawn.new_tensor(background)
-    return rgb, cover, drawn[0, ..., 3], index, flat, radii[index]
+    rgb = picture[0, ..., :3] + (1 - cover)[..., None] * picture.new_tensor(background)
+    return Rendered(rgb, cover, picture[0, ..., 3], index, flat, radii[index], "gsplat")

@@ -1,6 +1,6 @@
-"""Colours that depend on direction: real spherical harmonics up to degree 3, in the order of Gaussian splats (l = 0.., m = -l..l).
+"""Colors that depend on direction: real spherical harmonics up to degree 3, in the order of Gaussian splats (l = 0.., m = -l..l).
 
-colour(d) = max(0, 1/2 + sum_k Y_k(d) c_k), d the unit direction from the camera to the splat in the world, c_k [3] RGB.
+color(d) = max(0, 1/2 + sum_k Y_k(d) c_k), d the unit direction from the camera to the splat in the world, c_k [3] RGB.
 The signs are those of the Condon-Shortley phase (Y_1 = -y, z, -x), as splat files have them.
 """
 

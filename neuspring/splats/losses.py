@@ -1,9 +1,9 @@
-"""What training of splats minimises, on one view of frame 0.
+"""What training of splats minimizes, on one view of frame 0.
 
     L = l1 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
 
-C colour, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
-object. Means are over all pixels. Behind the hands nothing is known: there everything is zero on both sides.
+C color, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
+object. Means are over all pixels. What hands hide is not compared: there everything is zero on both sides.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import torch
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
-from neuspring.scores.images import ssim_map
 from neuspring.splats.rasterise import Rendered
+from neuspring.splats.ssim import ssim_map
 from neuspring.splats.view import View
 
 WINDOW = 12
-"""Pixels around the object's mask in which SSIM is taken, whose window is 11 wide. What strays beyond costs l1 and mask alone."""
+"""Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost l1 and mask alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What one camera saw in frame 0, masked, on a device."""
+    """One camera's picture of frame 0, masked, on a device."""
 
     name: str
     view: View
@@ -58,19 +58,20 @@ class Shot:
         seen = mask & known
         if not seen.any():
             return None
-        rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+        (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
         box = (
-            max(int(rows[0]) - WINDOW, 0),
-            min(int(rows[-1]) + WINDOW + 1, size[0]),
-            max(int(columns[0]) - WINDOW, 0),
-            min(int(columns[-1]) + WINDOW + 1, size[1]),
+            max(top - WINDOW, 0),
+            min(bottom + WINDOW + 1, view.height),
+            max(left - WINDOW, 0),
+            min(right + WINDOW + 1, view.width),
         )
-        device = view.intrinsics.device
+
+        def on_device(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values.astype(np.float32), device=view.intrinsics.device)
+
         on_black = np.where(seen[..., None], colour, 0).astype(np.float32) / 255
-        measured = np.where(seen, depth, 0.0).astype(np.float32)
-        arrays = (on_black, seen.astype(np.float32), known.astype(np.float32), measured)
-        colour_, mask_, known_, depth_ = (torch.tensor(a, device=device) for a in arrays)
-        return cls(name, view, colour_, mask_, known_, depth_, box)
+        measured = np.where(seen, depth, 0.0)
+        return cls(name, view, on_device(on_black), on_device(seen), on_device(known), on_device(measured), box)
 
     @property
     def pixel_width(self) -> float:
@@ -79,18 +80,17 @@ class Shot:
         return float(measured.median() / self.view.intrinsics[0, 0]) if len(measured) else float("nan")
 
 
-def loss(drawn: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
+def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
     """The training loss of one picture."""
-    known = shot.known
-    colour = drawn.rgb * known[..., None]
-    total = settings.l1 * (colour - shot.colour).abs().mean()
+    color = rendered.rgb * shot.known[..., None]
+    total = settings.l1 * (color - shot.colour).abs().mean()
     if settings.dssim:
         top, bottom, left, right = shot.box
-        pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (colour, shot.colour)]
-        total = total + settings.dssim * (1 - ssim_map(*pair)).sum() / colour.numel()
+        pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.colour)]
+        total = total + settings.dssim * (1 - ssim_map(*pair)).sum() / color.numel()
     if settings.mask:
-        total = total + settings.mask * (drawn.alpha * known - shot.mask).abs().mean()
+        total = total + settings.mask * (rendered.alpha * shot.known - shot.mask).abs().mean()
     if settings.depth:
         measured = shot.depth > 0
-        total = total + settings.depth * ((drawn.depth - shot.depth) * measured).abs().mean()
+        total = total + settings.depth * ((rendered.depth - shot.depth) * measured).abs().mean()
     return total

@@ -1,10 +1,12 @@
-"""Gaussian splats as a noun: kept in the PLY layout that splat viewers read, and as tensors that can be drawn and trained."""
+"""Gaussian splats as a noun: stored in the PLY layout that splat viewers read, and as tensors that can be drawn and trained."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -12,24 +14,25 @@ import torch
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.splats.project import degree_of
-from neuspring.splats.rasterise import Backend, Rendered, rasterise
-from neuspring.splats.view import LIMITS, Limits, View
+from neuspring.splats.rasterise import Rendered, rasterise
+from neuspring.splats.view import View
 
 PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
+PLY_FORMAT = "format binary_little_endian 1.0"
 LONGEST_HEADER = 100_000
+NORMALS = ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Splats(Artifact):
-    """Gaussians in the shape of frame 0. Unlike other artefacts they are stored as PLY (binary, little endian)."""
+    """Gaussians in the shape of frame 0. Unlike other artifacts they are stored as PLY (binary, little endian)."""
 
     kind: ClassVar[str] = "splats"
-    means: np.ndarray = array("N,3", np.float32, "m", "centres in the world")
+    means: np.ndarray = array("N,3", np.float32, "m", "centers in the world")
     quaternions: np.ndarray = array("N,4", np.float32, "1", "orientations, w first, of any length but zero")
     log_scales: np.ndarray = array("N,A", np.float32, "log m", "standard deviations: A = 1 isotropic, 3 one per axis")
     opacity_logits: np.ndarray = array("N", np.float32, "1", "opacity = 1 / (1 + exp(-.))")
-    harmonics: np.ndarray = array("N,K,3", np.float32, "1", "colour, see `neuspring.splats.harmonics`; K = 1, 4, 9 or 16")
+    harmonics: np.ndarray = array("N,K,3", np.float32, "1", "color, see `neuspring.splats.harmonics`; K = 1, 4, 9 or 16")
 
     def check(self) -> None:
         if self.log_scales.shape[1] not in (1, 3):
@@ -42,11 +45,11 @@ class Splats(Artifact):
     def save(self, path: Path) -> None:
         """Write `path` (.ply) atomically, with the properties and order of splat files."""
         columns = _columns(self.log_scales.shape[1], self.harmonics.shape[1])
-        rest = self.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(self.means), -1)
-        parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], rest, self.opacity_logits[:, None])
+        bands = self.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(self.means), -1)
+        parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], bands, self.opacity_logits[:, None])
         table = np.concatenate([*parts, self.log_scales, self.quaternions], axis=1).astype("<f4")
-        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-        header = "\n".join([*lines, *(f"property float {name}" for name in columns), "end_header", ""])
+        properties = [f"property float {name}" for name in columns]
+        header = "\n".join(["ply", PLY_FORMAT, f"element vertex {len(table)}", *properties, "end_header", ""])
         write_atomically(Path(path), lambda temporary: temporary.write_bytes(header.encode() + table.tobytes()))
 
     @classmethod
@@ -54,35 +57,37 @@ class Splats(Artifact):
         """Read a splat file, ours or another trainer's. Raises InputError if it is missing, truncated or holds something else."""
         table = _read_ply(Path(path))
         names = table.dtype.names or ()
-        rest = sum(name.startswith("f_rest_") for name in names)
-        scales = sum(name.startswith("scale_") for name in names)
-        if rest % 3:
-            raise InputError(path, "f_rest_...: as many coefficients are required for each of three channels", rest)
-        wanted = _columns(scales, 1 + rest // 3)
-        missing = [name for name in wanted if name not in names and name not in ("nx", "ny", "nz")]
+        bands, scales = (sum(name.startswith(prefix) for name in names) for prefix in ("f_rest_", "scale_"))
+        if bands % 3:
+            raise InputError(path, "f_rest_...: as many coefficients are required for each of three channels", bands)
+        columns = _columns(scales, 1 + bands // 3)
+        missing = [name for name in columns if name not in names and name not in NORMALS]
         if missing:
             raise InputError(path, "must hold the properties of Gaussian splats", f"no {', '.join(missing)}")
+        values = {name: table[name].astype(np.float32) for name in columns if name not in NORMALS}
 
-        def stacked(prefix: str, count: int) -> np.ndarray:
-            values = [table[f"{prefix}{k}"] for k in range(count)]
-            return np.stack(values, axis=1).astype(np.float32) if values else np.zeros((len(table), 0), np.float32)
+        def stacked(prefix: str) -> np.ndarray:
+            group = [column for name, column in values.items() if name.startswith(prefix)]
+            return np.stack(group, axis=1) if group else np.zeros((len(table), 0), np.float32)
 
-        bands = stacked("f_rest_", rest).reshape(len(table), 3, -1).transpose(0, 2, 1)
         try:
             return cls(
-                means=np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float32),
-                quaternions=stacked("rot_", 4),
-                log_scales=stacked("scale_", scales),
-                opacity_logits=table["opacity"].astype(np.float32),
-                harmonics=np.concatenate([stacked("f_dc_", 3)[:, None], bands], axis=1),
+                means=np.stack([values["x"], values["y"], values["z"]], axis=1),
+                quaternions=stacked("rot_"),
+                log_scales=stacked("scale_"),
+                opacity_logits=values["opacity"],
+                harmonics=np.concatenate(
+                    [stacked("f_dc_")[:, None], stacked("f_rest_").reshape(len(table), 3, -1).transpose(0, 2, 1)], axis=1
+                ),
             )
         except InputError as error:
             raise InputError(path, "must hold usable splats", error) from error
 
 
 def _columns(scales: int, coefficients: int) -> list[str]:
+    """The properties of a splat file in their order; harmonics above the first are stored channel by channel."""
     return [
-        *("x", "y", "z", "nx", "ny", "nz"),
+        *("x", "y", "z", *NORMALS),
         *(f"f_dc_{k}" for k in range(3)),
         *(f"f_rest_{k}" for k in range(3 * (coefficients - 1))),
         "opacity",
@@ -98,9 +103,9 @@ def _read_ply(path: Path) -> np.ndarray:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
-    head, found, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
+    head, end, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").splitlines()
-    if not found or lines[:1] != ["ply"] or "format binary_little_endian 1.0" not in lines:
+    if not end or lines[:1] != ["ply"] or PLY_FORMAT not in lines:
         raise InputError(path, rule, repr(content[:40]))
     words = [line.split() for line in lines]
     elements = [word for word in words if word[:1] == ["element"]]
@@ -110,18 +115,18 @@ def _read_ply(path: Path) -> np.ndarray:
     unknown = [word for word in properties if len(word) != 3 or word[1] not in PLY_TYPES]
     if unknown:
         raise InputError(path, f"{rule}, with properties of type {', '.join(PLY_TYPES)}", " ".join(unknown[0]))
-    named = [word[2] for word in properties]
-    if not named or len(set(named)) < len(named):
-        raise InputError(path, f"{rule}, with properties of different names", " ".join(named) or "none")
-    layout = np.dtype([(word[2], PLY_TYPES[word[1]]) for word in properties])
-    count = int(elements[0][2])
-    available = len(content) - len(head) - len(found)
-    if available < count * layout.itemsize:
-        held = f"{available // max(layout.itemsize, 1)} whole ones: the file is truncated"
-        raise InputError(path, f"the header promises {count} splats", held, "Delete it and re-run its step.")
+    names = [word[2] for word in properties]
+    if not names or len(set(names)) < len(names):
+        raise InputError(path, f"{rule}, with properties of different names", " ".join(names) or "none")
+    layout = np.dtype([(name, PLY_TYPES[kind]) for _, kind, name in properties])
+    count, start = int(elements[0][2]), len(head) + len(end)
+    available = (len(content) - start) // layout.itemsize
+    if available < count:
+        received = f"{available} whole ones: the file is truncated"
+        raise InputError(path, f"the header promises {count} splats", received, "Delete it and re-run its step.")
     if not count:
         raise InputError(path, f"{rule}, at least one", "0 vertices")
-    return np.frombuffer(content, layout, count, offset=len(head) + len(found))
+    return np.frombuffer(content, layout, count, offset=start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +142,10 @@ class Gaussians:
     @classmethod
     def of(cls, splats: Splats, device: str = "cpu") -> Gaussians:
         """From stored splats."""
-        names = ("means", "quaternions", "log_scales", "opacity_logits", "harmonics")
-        return cls(**{name: torch.tensor(getattr(splats, name), device=device) for name in names})
+        return cls(**{field.name: torch.tensor(getattr(splats, field.name), device=device) for field in dataclasses.fields(cls)})
 
     def stored(self) -> Splats:
-        """As an artefact."""
+        """As an artifact."""
         return Splats(**{name: tensor.detach().cpu().numpy() for name, tensor in vars(self).items()})
 
     @property
@@ -154,26 +158,8 @@ class Gaussians:
         """Standard deviations [N, 3], m."""
         return torch.exp(self.log_scales).expand(-1, 3)
 
-    def draw(
-        self,
-        view: View,
-        *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        degree: int | None = None,
-        limits: Limits = LIMITS,
-        backend: Backend = "warp",
-    ) -> Rendered:
-        """A picture; `degree` limits the bands that are used."""
-        most = degree_of(self.harmonics.shape[1])
-        return rasterise(
-            self.means,
-            self.quaternions,
-            self.scales,
-            self.opacities,
-            self.harmonics,
-            view,
-            degree=most if degree is None else min(degree, most),
-            background=background,
-            limits=limits,
-            backend=backend,
-        )
+    def draw(self, view: View, *, degree: int = 3, **options: Any) -> Rendered:
+        """A picture; harmonics above `degree` are not used. Options as in `rasterise`: background, limits, backend."""
+        degree = min(degree, math.isqrt(self.harmonics.shape[1]) - 1)
+        tensors = (self.means, self.quaternions, self.scales, self.opacities, self.harmonics)
+        return rasterise(*tensors, view, degree=degree, **options)

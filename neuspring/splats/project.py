@@ -2,13 +2,12 @@
 
 With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
 (fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
-slopes px/pz, py/pz that are limited to a margin around the picture (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
+slopes px/pz, py/pz clamped to a margin around the picture (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
 Plain torch on any device and precision: gradients come by differentiation, through those limits too.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -16,9 +15,9 @@ import torch
 from neuspring.splats.view import Limits, View
 
 MARGIN = 0.3
-"""Of half the picture, by which slopes in the Jacobian may leave it."""
+"""Slopes in the Jacobian may leave the picture by this part of its half width or height."""
 SAFETY = 1e-3
-"""Relative widening of bounding boxes: rounding must not cut off a pixel."""
+"""Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,9 @@ def _determinant(u: torch.Tensor, v: torch.Tensor, blur: float) -> torch.Tensor:
     return (area * area).sum(-1) + blur * ((u * u).sum(-1) + (v * v).sum(-1)) + blur * blur
 
 
-def _limited(slope: torch.Tensor, focal: torch.Tensor, centre: torch.Tensor, size: int) -> torch.Tensor:
+def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, size: int) -> torch.Tensor:
     margin = MARGIN * 0.5 * size / focal
-    return slope.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    return slope.clamp(-center / focal - margin, (size - center) / focal + margin)
 
 
 @torch.no_grad()
@@ -103,8 +102,3 @@ def radii(projected: Projected) -> torch.Tensor:
     xx, xy, yy = projected.covariances.detach().unbind(-1)
     largest = 0.5 * (xx + yy) + torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp_min(0.0))
     return 3 * torch.sqrt(largest)
-
-
-def degree_of(coefficients: int) -> int:
-    """Degree whose bands make this many coefficients."""
-    return math.isqrt(coefficients) - 1

@@ -1,4 +1,4 @@
-"""One function that draws Gaussian splats, differentiably: colour, coverage and expected depth.
+"""One function that draws Gaussian splats, differentiably: color, coverage and expected depth.
 
 Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gsplat` (Apache-2.0, extra `gpu`) on CUDA. `auto`
 takes gsplat where it works. Results name the backend.
@@ -15,8 +15,9 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
+from neuspring.splats.blend import blend
 from neuspring.splats.project import boxes, project, radii
-from neuspring.splats.tiles import blend, tiles
+from neuspring.splats.tiles import tiles
 from neuspring.splats.view import LIMITS, Limits, View
 
 Backend = Literal["warp", "gsplat"]
@@ -37,8 +38,8 @@ class Rendered:
     index: torch.Tensor
     """[M] int64: the splats that touch the picture."""
     means: torch.Tensor
-    """[M, 2] px, where they lie (of gsplat [1, N, 2], all of them); keeps its gradient after a backward pass, which tells where
-    splats are too coarse."""
+    """[M, 2] px, their centers (with gsplat [1, N, 2], of all splats); keeps its gradient after a backward pass, which is large
+    where splats are too coarse."""
     radii: torch.Tensor
     """[M] px, three standard deviations."""
     backend: Backend
@@ -49,7 +50,7 @@ def rasterise(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     view: View,
     *,
     degree: int | None = None,
@@ -59,35 +60,32 @@ def rasterise(
 ) -> Rendered:
     """Draw splats with means [N, 3] m, quaternions [N, 4] (w first, any length), standard deviations [N, 3] m, opacities [N].
 
-    colours: RGB [N, 3] as they are, or with a `degree` harmonics [N, K, 3] of which the bands up to it are used. Differentiable in
-    all five. Raises InputError for wrong shapes and for entries that are not finite.
+    colors: RGB [N, 3], or with a `degree` harmonics [N, K, 3], used up to that degree. Differentiable in all five. Raises
+    InputError for wrong shapes and for entries that are not finite.
     """
     view.require_valid()
-    _require_splats(means, quaternions, scales, opacities, colours, degree)
+    _require_splats(means, quaternions, scales, opacities, colors, degree)
     if backend == "gsplat":
-        from neuspring.splats.gsplat_backend import draw
+        from neuspring.splats import gsplat_backend
 
-        rgb, alpha, depth, index, flat, size = draw(
-            means, quaternions, scales, opacities, colours, view, degree, background, limits
-        )
-        return Rendered(rgb, alpha, depth, index, flat, size, "gsplat")
+        return gsplat_backend.rasterise(means, quaternions, scales, opacities, colors, view, degree, background, limits)
     ellipses = project(means, quaternions, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
-    kept = torch.nonzero(touching).squeeze(1)
-    index = ellipses.index[kept]
-    flat, depths = ellipses.means[kept], ellipses.depths[kept]
+    visible = torch.nonzero(touching).squeeze(1)
+    index = ellipses.index[visible]
+    flat, depths = ellipses.means[visible], ellipses.depths[visible]
     if flat.requires_grad:
         flat.retain_grad()
-    shade = colours[index]
+    shade = colors[index]
     if degree is not None:
         shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
-    lists = tiles(depths.detach(), rectangles[kept], view)
+    lists = tiles(depths.detach(), rectangles[visible], view)
     features = torch.cat([shade, depths[:, None]], dim=1)
-    total, left = blend(lists, view, limits, flat, ellipses.conics[kept], opacities[index], features)
+    total, left = blend(lists, view, limits, flat, ellipses.conics[visible], opacities[index], features)
     alpha = 1 - left
     rgb = total[..., :3] + left[..., None] * total.new_tensor(background)
     depth = total[..., 3] / alpha.clamp_min(LEAST_ALPHA)
-    return Rendered(rgb, alpha, depth, index, flat, radii(ellipses)[kept], "warp")
+    return Rendered(rgb, alpha, depth, index, flat, radii(ellipses)[visible], "warp")
 
 
 def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Backend:
@@ -112,18 +110,13 @@ def _gsplat_fault(device: str) -> str:
     try:
         size = 16
         intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], device=device)
-        drawn = rasterise(
-            torch.tensor([[0.0, 0.0, 1.0]], device=device),
-            torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
-            torch.full((1, 3), 0.1, device=device),
-            torch.full((1,), 0.5, device=device),
-            torch.ones((1, 3), device=device),
-            View(torch.eye(4, device=device), intrinsics, size, size),
-            backend="gsplat",
-        )
+        mean, turn = torch.tensor([[0.0, 0.0, 1.0]], device=device), torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
+        scale, opacity = torch.full((1, 3), 0.1, device=device), torch.full((1,), 0.5, device=device)
+        view = View(torch.eye(4, device=device), intrinsics, size, size)
+        picture = rasterise(mean, turn, scale, opacity, torch.ones_like(mean), view, backend="gsplat")
     except Exception as error:
         return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return "" if float(drawn.alpha.max()) > 0.4 else "it drew nothing"
+    return "" if float(picture.alpha.max()) > 0.4 else "it drew nothing"
 
 
 def _require_splats(
@@ -131,24 +124,26 @@ def _require_splats(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     degree: int | None,
 ) -> None:
     count = len(means)
-    wanted: dict[str, tuple[torch.Tensor, tuple[int | None, ...]]] = {
-        "means": (means, (count, 3)),
-        "quaternions": (quaternions, (count, 4)),
-        "scales": (scales, (count, 3)),
-        "opacities": (opacities, (count,)),
-        "colours": (colours, (count, 3) if degree is None else (count, None, 3)),
+    coefficients = colors.shape[1] if degree is not None and colors.ndim == 3 else None
+    expected = {
+        "means": (means, [count, 3]),
+        "quaternions": (quaternions, [count, 4]),
+        "scales": (scales, [count, 3]),
+        "opacities": (opacities, [count]),
+        "colors": (colors, [count, 3] if degree is None else [count, coefficients, 3]),
     }
-    for name, (tensor, shape) in wanted.items():
-        if tensor.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, tensor.shape, strict=False)):
-            raise InputError(f"splats, {name}", f"the shape must be {list(shape)}", tuple(tensor.shape))
-        if not torch.isfinite(tensor.detach()).all():
-            bad = int((~torch.isfinite(tensor.detach())).reshape(count, -1).any(1).sum())
+    for name, (tensor, shape) in expected.items():
+        if list(tensor.shape) != shape:
+            raise InputError(f"splats, {name}", f"the shape must be {shape}", tuple(tensor.shape))
+        finite = torch.isfinite(tensor.detach())
+        if not finite.all():
+            bad = int((~finite).reshape(count, -1).any(1).sum())
             raise InputError(f"splats, {name}", "every entry must be finite", f"{bad} of {count} splats are not")
     if degree is not None and not 0 <= degree <= 3:
         raise InputError("splats, degree", "harmonics of degree 0 to 3 can be drawn", degree)
-    if degree is not None and colours.shape[1] < (degree + 1) ** 2:
-        raise InputError("splats, colours", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colours.shape[1])
+    if degree is not None and colors.shape[1] < (degree + 1) ** 2:
+        raise InputError("splats, colors", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colors.shape[1])

@@ -1,4 +1,4 @@
-"""The specification of the rasteriser: every pixel looks at every splat, plain torch, meant for float64. Slow and memory-hungry."""
+"""The specification of the rasterizer: every pixel looks at every splat, plain torch, meant for float64. Slow and memory-hungry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def rasterise(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    colours: torch.Tensor,
+    colors: torch.Tensor,
     view: View,
     *,
     degree: int | None = None,
@@ -25,7 +25,7 @@ def rasterise(
     ellipses = project(means, quaternions, scales, view, limits)
     order = torch.sort(ellipses.depths.detach(), stable=True).indices
     index, flat, conics, depths = ellipses.index[order], ellipses.means[order], ellipses.conics[order], ellipses.depths[order]
-    shade = colours[index]
+    shade = colors[index]
     if degree is not None:
         shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
     rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
@@ -37,7 +37,7 @@ def rasterise(
     alpha = torch.where(raw > limits.alpha_max, torch.full_like(raw, limits.alpha_max), raw)
     alpha = torch.where(alpha < limits.alpha_min, torch.zeros_like(alpha), alpha)
     after = torch.cumprod(1 - alpha, dim=1)
-    # What shines through only falls, so all splats behind the first that would leave too little are left out as well.
+    # Transmittance only falls, so all splats behind the first that would leave too little are left out as well.
     alpha = torch.where(after > limits.transmittance_min, alpha, torch.zeros_like(alpha))
     through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)
     weights = alpha * through[:, :-1]

@@ -3,10 +3,10 @@
 Every node b has a rotation R_b between two frames, the one that best maps the offsets to its 16 nearest nodes of frame 0 (Kabsch).
 A splat at x follows its 16 nearest nodes (at their places before) with weights w_b ~ 1 / (|x - p_b| + 1e-6 m):
 
-    x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalise(sum_b w_b q(R_b)) q.
+    x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalize(sum_b w_b q(R_b)) q.
 
-Frame to frame, accumulated, as in the released evaluation. Nearest nodes come from a hash grid: time and memory do not grow
-as nodes times splats.
+Motion accumulates from frame to frame, as in the released evaluation. Nearest nodes come from a hash grid, so time and memory do
+not grow with nodes times splats.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from neuspring.core.device import load, start_warp
 from neuspring.core.errors import InputError
 from neuspring.splats.skinning_kernels import move_splats, nearest, turn_nodes
 
-NEIGHBOURS = 16
+NEIGHBORS = 16
 MOST_CELLS = 64
-"""Of the hash grid, along each axis."""
+"""Most cells of the hash grid along one axis."""
 SMALLEST_RADIUS = 1e-4
-"""m, of a search for nodes."""
+"""m: least radius of a search for nodes."""
 
 
 class Skin:
     """Carries splats by nodes whose frame 0 is `nodes` [N, 3], m.
 
     frozen: keep the nodes that each splat is bound to in its first step (weights follow), for real time.
-    released_degeneracy: as released, one node on a line of neighbours turns all nodes as itself, several turn none.
+    released_degeneracy: as released, one node on a line of neighbors turns all nodes as itself, several turn none.
     """
 
     def __init__(self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False, released_degeneracy: bool = False) -> None:
@@ -45,17 +45,17 @@ class Skin:
             raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
         self._device, self._frozen, self._released = device, frozen, released_degeneracy
         self._bound: Any = None
-        self._count = min(NEIGHBOURS, len(nodes))
-        # Where this radius holds too few nodes the search doubles it; a larger one would make every search slower.
+        self._count = min(NEIGHBORS, len(nodes))
+        # Where this radius holds too few nodes, the search doubles it. A larger start would make every search slower.
         usual = np.median(cKDTree(nodes).query(nodes, k=[self._count])[0])
         self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
-        # Searches far from all nodes visit every cell, so there should not be many more than nodes.
+        # Searches far from all nodes visit every cell, so cells should not be many more than nodes.
         cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
         wide, deep, high = cells.tolist()
         self._grid = wp.HashGrid(wide, deep, high, device=device)
         with _on_torch_stream(device):
             start = self._vectors(nodes)
-            self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBOURS, len(nodes) - 1))
+            self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBORS, len(nodes) - 1))
 
     def step(
         self, before: np.ndarray, after: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
@@ -97,13 +97,13 @@ class Skin:
         return rotations
 
     def _nearest(self, points: Any, queries: Any, *, own: bool, wanted: int) -> Any:
-        found = wp.zeros((len(queries), wanted), dtype=int, device=self._device)
+        neighbors = wp.zeros((len(queries), wanted), dtype=int, device=self._device)
         if wanted:
             distances = wp.zeros((len(queries), wanted), dtype=float, device=self._device)
             self._grid.build(points, self._radius)
-            arguments = [self._grid.id, points, queries, own, wanted, self._radius, found, distances]
+            arguments = [self._grid.id, points, queries, own, wanted, self._radius, neighbors, distances]
             self._launch(nearest, len(queries), arguments)
-        return found
+        return neighbors
 
     def _vectors(self, values: np.ndarray) -> Any:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self._device)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 DEGENERATE = 1e-5
-"""A neighbourhood whose second singular value is below this part of the first is a line: thinner than 0.3 % of its length."""
+"""A neighborhood whose second singular value is below this part of the first is a line: thinner than 0.3 % of its length."""
 TINY = 1e-30
-"""m^2: a neighbourhood smaller than this is a point."""
+"""m^2: a neighborhood smaller than this is a point."""
 CLOSE = 1e-6
 """m, added to distances in weights."""
 DOUBLINGS = 60
@@ -21,7 +21,7 @@ def nearest(
     own: wp.bool,
     wanted: int,
     radius: float,
-    found: wp.array2d[int],
+    neighbors: wp.array2d[int],
     distances: wp.array2d[float],
 ):
     """The `wanted` nearest points of each query, nearest first; with `own`, query i is point i and does not count itself.
@@ -41,10 +41,10 @@ def nearest(
                     slot = wp.min(count, wanted - 1)
                     while slot > 0 and distances[t, slot - 1] > d:
                         distances[t, slot] = distances[t, slot - 1]
-                        found[t, slot] = found[t, slot - 1]
+                        neighbors[t, slot] = neighbors[t, slot - 1]
                         slot -= 1
                     distances[t, slot] = d
-                    found[t, slot] = j
+                    neighbors[t, slot] = j
                     count = wp.min(count + 1, wanted)
         if count >= wanted:
             break
@@ -75,15 +75,15 @@ def shortest_turn(start: wp.vec3d, end: wp.vec3d):
 def turn_nodes(
     before: wp.array[wp.vec3],
     after: wp.array[wp.vec3],
-    neighbours: wp.array2d[int],
+    neighbors: wp.array2d[int],
     rotations: wp.array[wp.mat33],
     ranks: wp.array[int],
 ):
-    """The rotation that best takes each node's offsets to its neighbours from `before` to `after`."""
+    """The rotation that best takes each node's offsets to its neighbors from `before` to `after`."""
     i = wp.tid()
     moment = wp.mat33d()
-    for k in range(neighbours.shape[1]):
-        j = neighbours[i, k]
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
         moment += wp.outer(wp.vec3d(after[j] - after[i]), wp.vec3d(before[j] - before[i]))
     u, s, v = wp.svd3(moment)
     turn = wp.identity(n=3, dtype=wp.float64)

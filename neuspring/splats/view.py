@@ -1,4 +1,4 @@
-"""What a picture is taken of and how: a pinhole view, and the limits that a rasteriser keeps."""
+"""How a picture is taken: a pinhole view, and the thresholds of the rasterizer."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Limits:
     blur: float = 0.3
     """Added to the variance of every splat in the image, px^2."""
     alpha_min: float = 1 / 255
-    """Less than this is skipped."""
+    """Coverage below this is skipped."""
     alpha_max: float = 0.999
     """No splat covers more than this."""
     transmittance_min: float = 1e-4
-    """A pixel is done before a splat that would leave no more than this."""
+    """A pixel is done before the splat that would leave no more than this transmittance."""
 
 
 LIMITS = Limits()
@@ -32,7 +32,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A pinhole camera: OpenCV axes (x right, y down, z forward), the centre of pixel (column j, row i) at (j + 0.5, i + 0.5)."""
+    """A pinhole camera: OpenCV axes (x right, y down, z forward), the center of pixel (column j, row i) at (j + 0.5, i + 0.5)."""
 
     world_to_camera: torch.Tensor
     """[4, 4], m."""
@@ -45,7 +45,7 @@ class View:
     def of(
         cls, camera_to_world: np.ndarray, intrinsics: np.ndarray, width: int, height: int, device: str = "cpu", shift: float = 0.5
     ) -> View:
-        """From a calibrated camera whose pixel centres lie at whole coordinates, `shift` pixels away from those here.
+        """From a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
 
         shift = 0 takes the intrinsics as they are, as the released rendering does: a picture half a pixel off.
         """
@@ -56,7 +56,7 @@ class View:
 
     @property
     def position(self) -> torch.Tensor:
-        """The camera's centre in the world [3], m."""
+        """The camera's center in the world [3], m."""
         pose: torch.Tensor = torch.linalg.inv(self.world_to_camera)
         return pose[:3, 3]
 

@@ -37,14 +37,14 @@ def perfect(tmp_path_factory):
     masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
     tracks = {}
     for camera in capture.cameras:
-        found = track_truth.track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
-        tracks[camera] = PixelTracks(pixels=found.pixels, visible=found.visible, backend="truth")
+        exact = track_truth.track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
+        tracks[camera] = PixelTracks(pixels=exact.pixels, visible=exact.visible, backend="truth")
     lifted = lift(capture, masks, tracks, SETTINGS)
     return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)
 
 
-def verdict(found, **changes) -> dict[str, float]:
-    one = SimpleNamespace(**(vars(found) | changes))
+def verdict(perception, **changes) -> dict[str, float]:
+    one = SimpleNamespace(**(vars(perception) | changes))
     return judge(one.capture, one.truth, one.masks, one.tracks, one.lifted, ShapePriorSettings())
 
 
@@ -73,9 +73,9 @@ def test_spoilt_perception_is_told_from_perfect(perfect):
 
 def test_correspondences_stay_with_the_material(perfect):
     truth = perfect.truth
-    chosen = np.arange(0, len(truth.surface_nodes), 7)
-    followed = at_points(truth, truth.surface(0)[chosen]).places
-    np.testing.assert_allclose(followed[-1], truth.surface(len(truth.nodes) - 1)[chosen], atol=2e-5)
+    some = np.arange(0, len(truth.surface_nodes), 7)
+    places = at_points(truth, truth.surface(0)[some]).places
+    np.testing.assert_allclose(places[-1], truth.surface(len(truth.nodes) - 1)[some], atol=2e-5)
     camera = perfect.capture.cameras["0"]
     y, x = np.nonzero(perfect.capture.mask("0", 0) == OBJECT)
     pixels = np.stack([x, y], axis=1).astype(float)

@@ -1,4 +1,4 @@
-"""From pixels to the world: cleaned masks, agreement of motion, controllers; each against what it says."""
+"""From pixels to the world: cleaned masks, agreement of motion, controllers, and the switches to the released behavior."""
 
 from dataclasses import replace
 
@@ -73,11 +73,11 @@ def test_specks_and_depth_out_of_range_are_cleaned_away(scene):
     masks = masks_of(scene)["0"]
     labels = masks.labels.copy()
     labels[:, 20, 3] = OBJECT
-    kept, cloud, _ = lifting.clean_masks(scene, scene.cameras, {"0": Masks(labels=labels, backend="x")}, SETTINGS)
-    assert not kept["0"][:, 20, 3].any()
-    np.testing.assert_array_equal(kept["0"], masks.labels)
-    kept, cloud, _ = lifting.clean_masks(scene, scene.cameras, masks_of(scene), replace(SETTINGS, depth_range=(0.2, 0.7)))
-    assert not kept["0"].any()
+    clean, cloud, _ = lifting.clean_masks(scene, scene.cameras, {"0": Masks(labels=labels, backend="x")}, SETTINGS)
+    assert not clean["0"][:, 20, 3].any()
+    np.testing.assert_array_equal(clean["0"], masks.labels)
+    clean, cloud, _ = lifting.clean_masks(scene, scene.cameras, masks_of(scene), replace(SETTINGS, depth_range=(0.2, 0.7)))
+    assert not clean["0"].any()
     assert not len(cloud)
 
 
@@ -132,7 +132,7 @@ def test_the_order_of_points_does_not_matter():
     np.testing.assert_array_equal(valid[:, order], lifting.agreeing_motion(second, Lift()))
 
 
-def test_few_neighbours_are_not_enough():
+def test_few_neighbors_are_not_enough():
     points = np.stack([grid(2), grid(2)])
     seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((4, 3)))
     assert not lifting.agreeing_motion(seen, Lift()).any()
@@ -143,17 +143,17 @@ def test_depth_at_an_edge_comes_from_the_same_mask():
     depth, inside = np.full((5, 5), 0.9), np.zeros((5, 5), bool)
     depth[:, :2], inside[:, :2] = 0.5, True
     depth[2, 1] = 0.53
-    found = lifting.local_depth(depth, inside, np.array([1]), np.array([2]), 3)
-    assert found[0] == pytest.approx(0.5)
+    depths = lifting.local_depth(depth, inside, np.array([1]), np.array([2]), 3)
+    assert depths[0] == pytest.approx(0.5)
 
 
 def test_rigid_motions_are_recovered_and_fill_gaps():
     rng = np.random.default_rng(0)
     start = rng.uniform(-0.02, 0.02, (12, 3))
     rotation, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.0, 0.2])
-    found, by = rigid_motion(start, rotation.apply(start) + shift)
-    np.testing.assert_allclose(found.as_matrix(), rotation.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(by, shift, atol=1e-9)
+    recovered, offset = rigid_motion(start, rotation.apply(start) + shift)
+    np.testing.assert_allclose(recovered.as_matrix(), rotation.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(offset, shift, atol=1e-9)
     points = np.stack([start, rotation.apply(start) + shift, start])
     trusted = np.ones((3, 12), bool)
     trusted[1, :5] = False
@@ -182,7 +182,7 @@ def test_two_points_apart_follow_the_nearest_hand():
 
 
 def test_a_small_camera_keeps_what_it_alone_sees(tmp_path):
-    """Beside a camera of many pixels one of few would lose its view, were both held to the same number of neighbours."""
+    """Beside a camera of many pixels one of few would lose its view, were both held to the same number of neighbors."""
     few, many = entry("few", 32, 24), entry("many", 32, 24)
     large = (*(tuple(4 * v for v in row) for row in many.intrinsics[:2]), many.intrinsics[2])
     many = replace(many, width=128, height=96, intrinsics=large)
@@ -196,22 +196,64 @@ def test_a_small_camera_keeps_what_it_alone_sees(tmp_path):
         )
     capture = writer.finish()
     masks = {n: Masks(labels=np.stack([capture.mask(n, f) for f in range(FRAMES)]), backend="given") for n in capture.cameras}
-    kept, _, _ = lifting.clean_masks(capture, capture.cameras, masks, SETTINGS)
-    assert kept["few"][0].sum() == labels.sum()
+    clean, _, _ = lifting.clean_masks(capture, capture.cameras, masks, SETTINGS)
+    assert clean["few"][0].sum() == labels.sum()
 
 
 def test_released_controllers_are_visible_throughout():
     points = np.repeat(grid(6)[None], 4, axis=0)
     visible, valid = np.ones((4, 36), bool), np.ones((4, 36), bool)
     visible[2, :10], valid[1, 10:20] = False, False
-    found, facts = choose_controllers(points, visible, valid, Lift(controllers=30, least_controllers=16), "here")
+    controllers, facts = choose_controllers(points, visible, valid, Lift(controllers=30, least_controllers=16), "here")
     assert facts["hand_tracks_kept"] == 16
-    assert found.shape == (4, 16, 3)
+    assert controllers.shape == (4, 16, 3)
     with pytest.raises(InputError, match=r"here: at least 17 points of the hands.*received 16 of 36"):
         choose_controllers(points, visible, valid, Lift(least_controllers=17), "here")
     # With gaps filled, everything that is seen in enough frames counts.
     _, facts = choose_controllers(points, visible, valid, Lift(controller_gaps="rigid", controller_share=0.7), "here")
     assert facts["hand_tracks_kept"] == 36
+
+
+def with_subpixel_motion(tracks: dict[str, PixelTracks]) -> dict[str, PixelTracks]:
+    pixels = tracks["0"].pixels + 0.3 * (np.arange(FRAMES) > 0)[:, None, None].astype(np.float32)
+    return {"0": replace(tracks["0"], pixels=pixels)}
+
+
+def test_whole_pixels_as_released_lift_the_pixel_that_a_track_is_in(scene):
+    tracks = with_subpixel_motion(tracks_of(scene))
+    exact, released = (
+        lifting.lift(scene, masks_of(scene), tracks, replace(SETTINGS, whole_pixels=whole)).object_points for whole in (False, True)
+    )
+    rounded = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS).object_points
+    np.testing.assert_array_equal(released, rounded)
+    # 0.3 pixels in x and in y, at 0.8 m and a focal length of 40 pixels.
+    np.testing.assert_allclose(np.abs(exact - released)[1:], np.broadcast_to([0.006, 0.006, 0.0], exact[1:].shape), atol=1e-6)
+
+
+def test_a_mirrored_principal_point_as_before_july_2025_shifts_the_object(tmp_path):
+    camera = entry()
+    off_center = replace(camera, intrinsics=((40.0, 0.0, 13.0), *camera.intrinsics[1:]))
+    writer = Writer(tmp_path, describe(cameras=(off_center,)))
+    labels = np.zeros((24, 32), np.uint8)
+    labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
+    for frame in range(FRAMES):
+        writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
+    capture = writer.finish()
+    right, mirrored = (
+        lifting.clean_masks(capture, lifting.lifting_cameras(capture, settings), masks_of(capture), settings)[1]
+        for settings in (SETTINGS, replace(SETTINGS, mirrored_principal_point=True))
+    )
+    # The principal point moves from 13 to 32 - 13 = 19, six pixels of 0.8 m / 40 each, so points move the other way.
+    np.testing.assert_allclose(mirrored - right, np.tile([-6 * 0.8 / 40, 0, 0], (len(right), 1)), atol=1e-6)
+
+
+def test_coordinate_outliers_as_released_drop_what_shares_one_coordinate():
+    line = np.stack([np.linspace(0, 0.01, 11), np.zeros(11), np.arange(11) * 1e-4], axis=1)
+    stray = np.array([[line[3, 0], 0.5, 0.5]])
+    points, least = np.concatenate([line, stray]), np.full(12, 3.0)
+    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=False)).tolist() == [11]
+    # Point 3 lies in the crowd, but has the x of the outlier.
+    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=True)).tolist() == [3, 11]
 
 
 def test_farthest_points_are_spread():

@@ -1,4 +1,4 @@
-"""The plumbing of GroundingDINO and SAM 2 with tiny, randomly initialised models: real code of `transformers`, no weights.
+"""How GroundingDINO and SAM 2 are called, with tiny, randomly initialized models: real code of `transformers`, no weights.
 
 SAM 2's image and video processors need torchvision, which has no CPU build for every platform: two functions stand in for them.
 """
@@ -122,8 +122,8 @@ def test_sam2_carries_boxes_through_the_video(capture):
     torch.manual_seed(0)
     model, processor = video_models()
     images = [capture.colour("0", frame) for frame in range(FRAMES) if capture.has("0", frame)]
-    found = [Detection((30.0, 20.0, 90.0, 70.0), "toy", 0.9), Detection((60.0, 5.0, 100.0, 40.0), "hand", 0.8)]
-    masks = segment_sam2.propagate(images, found, Models(None, None, model, processor), "cpu")
+    detections = [Detection((30.0, 20.0, 90.0, 70.0), "toy", 0.9), Detection((60.0, 5.0, 100.0, 40.0), "hand", 0.8)]
+    masks = segment_sam2.propagate(images, detections, Models(None, None, model, processor), "cpu")
     assert len(masks) == FRAMES - 1
     assert all(mask.shape == (2, 90, 160) and mask.dtype == bool for mask in masks)
 
@@ -132,18 +132,18 @@ def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path):
     torch.manual_seed(0)
     model, processor = detector_models(tmp_path)
     settings = GroundedSam2(box_threshold=0.001, text_threshold=0.001)
-    found = segment_sam2.detect(capture.colour("0", 0), "toy", settings, Models(model, processor, None, None), "cpu")
-    assert found
-    assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
-    assert all(len(d.box) == 4 and np.isfinite(d.box).all() for d in found)
-    assert {word for d in found for word in d.words.replace(".", " ").split()} <= {"toy", "hand", "[CLS]", "[SEP]"}
+    detections = segment_sam2.detect(capture.colour("0", 0), "toy", settings, Models(model, processor, None, None), "cpu")
+    assert detections
+    assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
+    assert all(len(d.box) == 4 and np.isfinite(d.box).all() for d in detections)
+    assert {word for d in detections for word in d.words.replace(".", " ").split()} <= {"toy", "hand", "[CLS]", "[SEP]"}
 
 
 def test_hands_lie_over_the_object_and_missing_frames_stay_empty(capture, monkeypatch):
-    found = [Detection((0.0, 0.0, 9.0, 9.0), "hand", 0.9), Detection((0.0, 0.0, 9.0, 9.0), "toy", 0.8)]
+    detections = [Detection((0.0, 0.0, 9.0, 9.0), "hand", 0.9), Detection((0.0, 0.0, 9.0, 9.0), "toy", 0.8)]
     both = np.zeros((2, 90, 160), bool)
     both[0, 10:20, 10:20] = both[1, 15:30, 15:30] = True
-    monkeypatch.setattr(segment_sam2, "detect", lambda *_: found)
+    monkeypatch.setattr(segment_sam2, "detect", lambda *_: detections)
     monkeypatch.setattr(segment_sam2, "propagate", lambda images, *_: [both] * len(images))
     labels = segment_sam2.segment(capture, "0", GroundedSam2(), "cpu", Models(None, None, None, None))
     assert labels.shape == (FRAMES, 90, 160)

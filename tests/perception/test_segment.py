@@ -1,4 +1,4 @@
-"""Segmentation without a network on a film whose masks are known, and the plumbing of the network's."""
+"""Segmentation without a network on a film whose masks are known."""
 
 import numpy as np
 import pytest
@@ -45,13 +45,13 @@ def test_an_empty_table_has_no_object(tmp_path):
         segment_opencv.segment(writer.finish(), "0", OpenCvSegmentation())
 
 
-def test_without_a_hand_s_colour_all_is_object_and_the_settings_are_named(capture, capsys):
+def test_without_a_hand_s_color_all_is_object_and_the_settings_are_named(capture, capsys):
     labels = segment_opencv.segment(capture, "0", OpenCvSegmentation(hand_hue=(100.0, 110.0)))
     assert set(np.unique(labels)) == {0, OBJECT}
-    assert "nothing above the table has the colour of hands (hue in [100.0, 110.0] degrees" in capsys.readouterr().out
+    assert "nothing above the table has the color of hands (hue in [100.0, 110.0] degrees" in capsys.readouterr().out
 
 
-def test_small_pieces_of_hand_colour_belong_to_the_object():
+def test_small_pieces_of_hand_color_belong_to_the_object():
     labels = np.zeros((40, 60), np.uint8)
     labels[10:30, 5:35] = OBJECT
     labels[10:14, 5:9] = HANDS
@@ -61,12 +61,12 @@ def test_small_pieces_of_hand_colour_belong_to_the_object():
     assert (tidy[5:25, 40:55] == HANDS).all()
 
 
-def test_holes_are_filled_up_to_a_size():
-    seen = np.zeros((40, 60), bool)
-    seen[5:35, 5:55] = True
+def test_small_holes_are_filled_and_large_ones_stay():
+    seen = np.zeros((80, 120), bool)
+    seen[5:75, 5:115] = True
     seen[10:12, 10:12] = False
     seen[20:30, 20:40] = False
-    filled = seen | segment_opencv._holes(seen, 0.01)
+    filled = seen | segment_opencv._holes(seen)
     assert filled[10:12, 10:12].all()
     assert not filled[20:30, 20:40].any()
     assert not filled[:5].any()

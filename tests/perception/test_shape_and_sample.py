@@ -110,8 +110,8 @@ def test_a_mesh_finds_its_place_wherever_the_object_lies(tmp_path):
 def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3)
     bent = truth.vertices + np.array([0, 0, 0.008]) * np.sin(np.pi * (truth.vertices[:, :1] / 0.1))
-    found = shape_mesh.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings(bend_reach=0.02))
-    before, after = (np.median(cKDTree(v).query(cloud)[0]) for v in (bent, found))
+    result = shape_mesh.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings(bend_reach=0.02))
+    before, after = (np.median(cKDTree(v).query(cloud)[0]) for v in (bent, result))
     assert after < 0.75 * before
 
 
@@ -139,21 +139,21 @@ def tracked(points: np.ndarray) -> LiftedTracks:
 def test_one_point_per_voxel():
     points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3))
     points[0] = 0.0
-    kept, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
-    cells = np.floor(points[kept] / 0.02).astype(int)
+    indices, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
+    cells = np.floor(points[indices] / 0.02).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells) == 125
 
 
 def test_observed_points_come_before_the_surface_and_it_before_the_inside(tmp_path):
     _, _, cloud, truth = film(tmp_path, 3)
     everything = tracked(cloud[::3])
-    kept, outer, inner = structure(everything, truth, Sampling(voxel=0.01), 1.0, 0)
+    indices, outer, inner = structure(everything, truth, Sampling(voxel=0.01), 1.0, 0)
     alone, bare, _ = structure(tracked(cloud[:1]), truth, Sampling(voxel=0.01), 1.0, 0)
-    assert len(kept) > 50
+    assert len(indices) > 50
     assert 10 < len(outer) < len(bare)
     assert len(alone) == 1
     assert inside(truth, inner).mean() > 0.98
-    assert cKDTree(everything.object_points[0, kept]).query(outer)[0].min() > 1e-4
+    assert cKDTree(everything.object_points[0, indices]).query(outer)[0].min() > 1e-4
 
 
 def test_sampling_follows_the_seed(tmp_path):
@@ -165,8 +165,8 @@ def test_sampling_follows_the_seed(tmp_path):
 
 def test_without_a_prior_only_what_was_seen_remains():
     points = np.array([[0.0, 0, 0.01], [0.0, 0, 0.01], [0.05, 0, -0.01], [0.1, 0, 0.02]])
-    kept, outer, inner = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
-    assert kept.tolist() == [0, 2, 3]
+    indices, outer, inner = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
+    assert indices.tolist() == [0, 2, 3]
     assert not len(outer)
     assert not len(inner)
 

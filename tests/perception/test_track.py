@@ -47,38 +47,38 @@ def video(tmp_path):
     return capture, np.repeat(labels0[None], 8, axis=0)
 
 
-def error(found: track_opencv.Followed, frame: int) -> np.ndarray:
-    return np.linalg.norm(found.pixels[frame] - found.pixels[0] - SHIFT * frame, axis=1)
+def error(tracks: track_opencv.Followed, frame: int) -> np.ndarray:
+    return np.linalg.norm(tracks.pixels[frame] - tracks.pixels[0] - SHIFT * frame, axis=1)
 
 
 @pytest.mark.parametrize("method", ["lucas_kanade", "dis"])
 def test_points_move_with_the_texture(video, method):
     capture, labels = video
-    found = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200, window=9), 0)
-    seen = found.visible[2]
+    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200, window=9), 0)
+    seen = tracks.visible[2]
     assert seen.mean() > 0.8
-    assert np.median(error(found, 2)[seen]) < 0.25
+    assert np.median(error(tracks, 2)[seen]) < 0.25
 
 
 def test_hidden_points_are_lost_and_found_again(video):
     capture, labels = video
-    found = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9), 0)
+    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9), 0)
     without = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9, reacquire=False), 0)
-    behind = (np.abs(found.pixels[0, :, 0] + 3 * SHIFT[0] - 56) < 4) & (np.abs(found.pixels[0, :, 1] + 3 * SHIFT[1] - 45) < 10)
+    behind = (np.abs(tracks.pixels[0, :, 0] + 3 * SHIFT[0] - 56) < 4) & (np.abs(tracks.pixels[0, :, 1] + 3 * SHIFT[1] - 45) < 10)
     assert behind.sum() > 10
-    assert found.visible[3][behind].mean() < 0.3
-    again = found.visible[7] & behind
+    assert tracks.visible[3][behind].mean() < 0.3
+    again = tracks.visible[7] & behind
     assert again.sum() > 0.6 * behind.sum() > without.visible[7][behind].sum()
-    assert np.median(error(found, 7)[again]) < 0.5
+    assert np.median(error(tracks, 7)[again]) < 0.5
 
 
 def test_missing_frames_are_bridged(video):
     capture, labels = video
-    found = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200, window=15), 0)
-    assert not found.visible[[3, 4]].any()
-    seen = found.visible[5]
+    tracks = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200, window=15), 0)
+    assert not tracks.visible[[3, 4]].any()
+    seen = tracks.visible[5]
     assert seen.mean() > 0.5
-    assert np.median(error(found, 5)[seen]) < 0.5
+    assert np.median(error(tracks, 5)[seen]) < 0.5
 
 
 def test_points_start_in_the_mask_and_follow_the_seed(video):
@@ -93,8 +93,8 @@ def test_points_start_in_the_mask_and_follow_the_seed(video):
 
 def test_an_empty_mask_has_no_points(video):
     capture, labels = video
-    found = track_opencv.track(capture, "0", np.zeros_like(labels), OpenCvTracking(), 0)
-    assert found.pixels.shape == (8, 0, 2)
+    tracks = track_opencv.track(capture, "0", np.zeros_like(labels), OpenCvTracking(), 0)
+    assert tracks.pixels.shape == (8, 0, 2)
 
 
 def test_points_come_back_after_a_frame_without_a_mask(video):
@@ -137,14 +137,14 @@ class StandIn:
 def test_cotracker_is_called_as_its_online_predictor_wants(video):
     capture, labels = video
     model = StandIn()
-    found = track_cotracker.track(capture, "0", labels, CoTracker3(points=30), 0, "cpu", model)
+    tracks = track_cotracker.track(capture, "0", labels, CoTracker3(points=30), 0, "cpu", model)
     assert tuple(model.queries.shape) == (1, 30, 3)
     assert not model.queries[0, :, 0].any()
     assert model.windows == [(1, 6, 3, 96, 128)] * 2
-    assert found.visible.all()
-    assert error(found, 7).max() < 1e-4
-    found = track_cotracker.track(capture, "late", labels, CoTracker3(points=30), 0, "cpu", StandIn())
-    assert not found.visible[[3, 4]].any()
+    assert tracks.visible.all()
+    assert error(tracks, 7).max() < 1e-4
+    tracks = track_cotracker.track(capture, "late", labels, CoTracker3(points=30), 0, "cpu", StandIn())
+    assert not tracks.visible[[3, 4]].any()
 
 
 def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_path):

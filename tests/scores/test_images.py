@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.scores.images import iou, masked_pair, psnr, silhouettes, ssim, ssim_map
+from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
+from neuspring.splats.ssim import ssim, ssim_map
 
 FOLDER = Path(__file__).parents[1] / "golden"
 SINGLE = {"mean": 1e-5, "map": 1e-4, "gradient": 1e-3, "psnr": 1e-4, "relative": 1e-5}

@@ -1,5 +1,5 @@
-"""The second backend through a stand-in with gsplat's interface (version 1.5), since gsplat itself needs CUDA: what is passed to
-it, what is made of its answer. On a GPU with gsplat the real one is compared with ours."""
+"""The gsplat backend through a stand-in with the interface of gsplat 1.5, since gsplat itself needs CUDA: how it is called, and
+what becomes of its answer. On a GPU with gsplat the real one is compared with ours."""
 
 import sys
 import types
@@ -10,12 +10,13 @@ import torch
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
+from neuspring.splats.blend import blend
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.project import boxes, project, radii
 from neuspring.splats.rasterise import _gsplat_fault, choose_backend, rasterise
-from neuspring.splats.tiles import blend, tiles
+from neuspring.splats.tiles import tiles
 from neuspring.splats.view import LIMITS, Limits, View
-from tests.splats.test_rasterise import random_splats, small_view
+from tests.support.random_splats import random_splats, small_view
 
 
 def rasterization(
@@ -29,18 +30,18 @@ def rasterization(
     limits, view = Limits(near=near_plane, far=far_plane, blur=eps2d), View(viewmats[0], Ks[0], width, height)
     ellipses = project(means, quats, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities[ellipses.index].detach(), view, limits)
-    kept = touching.nonzero().squeeze(1)
-    index = ellipses.index[kept]
+    visible = touching.nonzero().squeeze(1)
+    index = ellipses.index[visible]
     flat = means.new_zeros(len(means), 2).index_put((ellipses.index,), ellipses.means)[None]
     shade = colors[index] if sh_degree is None else harmonics.colours(colors[index], means[index] - view.position, sh_degree)
-    features = torch.cat([shade, ellipses.depths[kept, None]], dim=1)
-    lists = tiles(ellipses.depths[kept].detach(), rectangles[kept], view)
-    total, left = blend(lists, view, limits, flat[0, index], ellipses.conics[kept], opacities[index], features)
+    features = torch.cat([shade, ellipses.depths[visible, None]], dim=1)
+    lists = tiles(ellipses.depths[visible].detach(), rectangles[visible], view)
+    total, left = blend(lists, view, limits, flat[0, index], ellipses.conics[visible], opacities[index], features)
     alpha = 1 - left
     size = torch.zeros(1, len(means), 2, dtype=torch.int32)
-    size[0, index] = radii(ellipses)[kept, None].ceil().int()
-    drawn = torch.cat([total[..., :3], (total[..., 3] / alpha.clamp_min(1e-10))[..., None]], dim=-1)
-    return drawn[None], alpha[None, ..., None], {"means2d": flat, "radii": size}
+    size[0, index] = radii(ellipses)[visible, None].ceil().int()
+    picture = torch.cat([total[..., :3], (total[..., 3] / alpha.clamp_min(1e-10))[..., None]], dim=-1)
+    return picture[None], alpha[None, ..., None], {"means2d": flat, "radii": size}
 
 
 @pytest.fixture
@@ -61,19 +62,19 @@ def test_pictures_and_gradients_are_handed_on(stand_in, degree):
     for name in ("rgb", "alpha", "depth"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-5)
     assert torch.equal(ours.index, theirs.index)
-    gradients = [torch.autograd.grad(drawn.rgb.sum() + drawn.alpha.sum(), splats, retain_graph=True) for drawn in (ours, theirs)]
+    gradients = [torch.autograd.grad(one.rgb.sum() + one.alpha.sum(), splats, retain_graph=True) for one in (ours, theirs)]
     for mine, other in zip(*gradients, strict=True):
         assert torch.allclose(mine, other, atol=1e-3 * float(mine.abs().max()) + 1e-6)
 
 
 def test_density_adapts_alike(stand_in):
-    found = []
+    changes = []
     for backend in ("warp", "gsplat"):
         splats = [tensor.detach().requires_grad_() for tensor in random_splats(4, 50, torch.float32)]
-        drawn = rasterise(*splats, small_view(), backend=backend)
-        drawn.rgb.sum().backward()
+        picture = rasterise(*splats, small_view(), backend=backend)
+        picture.rgb.sum().backward()
         statistics = Statistics.empty(splats[0])
-        statistics.add(drawn, 37, 29)
+        statistics.add(picture, 37, 29)
         named = {
             "means": splats[0].detach(),
             "quaternions": splats[1].detach(),
@@ -81,12 +82,12 @@ def test_density_adapts_alike(stand_in):
             "opacity_logits": torch.logit(splats[3].detach(), 1e-6),
         }
         threshold = float((statistics.pull / statistics.seen.clamp_min(1)).median())
-        kept, added = densify(
+        stay, added = densify(
             named, statistics, Appearance(densify_gradient=threshold), 1.0, False, torch.Generator().manual_seed(0)
         )
-        found.append((kept, len(added["means"])))
-    assert found[0][1] == found[1][1] > 5
-    assert torch.equal(found[0][0], found[1][0])
+        changes.append((stay, len(added["means"])))
+    assert changes[0][1] == changes[1][1] > 5
+    assert torch.equal(changes[0][0], changes[1][0])
 
 
 def test_thresholds_that_gsplat_would_not_keep_are_refused(stand_in):

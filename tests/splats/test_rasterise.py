@@ -1,6 +1,6 @@
-"""The rasteriser against golden pictures and gradients (`tests/golden`), its float64 specification, and bad input.
+"""The rasterizer against golden pictures and gradients (`tests/golden`), its float64 specification, and bad input.
 
-Tolerances are those of the golden data for single precision on stable pixels; r04 has splats centimetres before the camera.
+Tolerances are those of the golden data for single precision on stable pixels; r04 has splats centimeters before the camera.
 """
 
 import dataclasses
@@ -15,8 +15,9 @@ from neuspring.core.errors import InputError
 from neuspring.splats import reference
 from neuspring.splats.project import project
 from neuspring.splats.rasterise import choose_backend, rasterise
-from neuspring.splats.view import LIMITS, View
+from neuspring.splats.view import LIMITS
 from tests.support.golden_splats import CASES, Golden
+from tests.support.random_splats import random_splats, small_view
 
 CLOSE = "r04_culling"
 SINGLE = {"rgb": 2e-5, "alpha": 2e-5, "depth": 1e-4, "means": 1e-4, "conics": 1e-4, "gradient": 1e-4, "loss": 2e-5}
@@ -41,20 +42,20 @@ def test_pictures_and_gradients_are_the_golden_ones(case, precision, device):
     golden = Golden(case, dtype, device)
     stable = golden.values["stable"]
     for which in "AB":
-        drawn = rasterise(*golden.inputs.values(), golden.view, **golden.options)
+        picture = rasterise(*golden.inputs.values(), golden.view, **golden.options)
         for name in ("rgb", "alpha", "depth"):
-            found = getattr(drawn, name).detach().cpu().numpy()
-            error = np.abs(found - golden.values[f"exp_{name}"])[stable].max()
+            result = getattr(picture, name).detach().cpu().numpy()
+            error = np.abs(result - golden.values[f"exp_{name}"])[stable].max()
             assert error <= allowed[name], (name, error)
-        loss = golden.loss(which, drawn.rgb, drawn.alpha, drawn.depth)
+        loss = golden.loss(which, picture.rgb, picture.alpha, picture.depth)
         assert abs(float(loss.detach()) / float(golden.values[f"loss_{which}"]) - 1) <= allowed["loss"]
         gradients = torch.autograd.grad(loss, list(golden.inputs.values()), allow_unused=True)
         for name, gradient in zip(golden.inputs, gradients, strict=True):
             expected = golden.expected_gradient(which, name)
-            found = np.zeros_like(expected) if gradient is None else gradient.cpu().numpy()
+            result = np.zeros_like(expected) if gradient is None else gradient.cpu().numpy()
             # Where the exact gradient is zero there is no ratio to take.
             scale = 1.0 if name == "quats" and case in ISOTROPIC else np.abs(expected).max()
-            assert np.abs(found - expected).max() <= allowed["gradient"] * scale, (which, name)
+            assert np.abs(result - expected).max() <= allowed["gradient"] * scale, (which, name)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -62,14 +63,14 @@ def test_projection_and_order_are_the_golden_ones(case):
     for dtype in PRECISIONS.values():
         golden, allowed = Golden(case, dtype), tolerances(case, dtype)
         v = golden.values
-        found = project(golden.inputs["means"], golden.inputs["quats"], golden.inputs["scales"], golden.view, golden.limits)
-        seen = found.index.numpy()
+        ellipses = project(golden.inputs["means"], golden.inputs["quats"], golden.inputs["scales"], golden.view, golden.limits)
+        seen = ellipses.index.numpy()
         assert np.array_equal(seen, np.flatnonzero(v["visible"]))
-        assert np.abs(found.means.detach().numpy() - v["exp_means2d"][seen]).max() <= allowed["means"]
+        assert np.abs(ellipses.means.detach().numpy() - v["exp_means2d"][seen]).max() <= allowed["means"]
         conics = v["exp_conics"][seen]
-        difference = np.abs(found.conics.detach().numpy() - conics).max(1) / np.abs(conics).max(1)
+        difference = np.abs(ellipses.conics.detach().numpy() - conics).max(1) / np.abs(conics).max(1)
         assert difference.max() <= allowed["conics"]
-        order = torch.sort(found.depths.detach(), stable=True).indices
+        order = torch.sort(ellipses.depths.detach(), stable=True).indices
         assert np.array_equal(seen[order.numpy()], v["order"])
 
 
@@ -81,38 +82,21 @@ def test_the_specification_is_the_golden_data(case):
         assert np.abs(picture.detach().numpy() - golden.values[f"exp_{name}"]).max() <= DOUBLE[name]
 
 
-def random_splats(seed: int, count: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    rng = np.random.default_rng(seed)
-    arrays = [
-        rng.uniform([-0.6, -0.5, 0.4], [0.6, 0.5, 2.0], (count, 3)),
-        rng.normal(size=(count, 4)),
-        np.exp(rng.uniform(-5, -1.5, (count, 3))),
-        rng.uniform(0.0, 1.0, count),
-        rng.uniform(0, 1, (count, 3)),
-    ]
-    return [torch.tensor(a, dtype=dtype).requires_grad_() for a in arrays]
-
-
-def small_view(width: int = 37, height: int = 29) -> View:
-    intrinsics = torch.tensor([[30.0, 0, width / 2 + 1.3], [0, 28.0, height / 2 - 0.7], [0, 0, 1]], dtype=torch.float64)
-    return View(torch.eye(4, dtype=torch.float64), intrinsics, width, height)
-
-
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 60), side=st.sampled_from([(37, 29), (16, 16), (8, 41)]))
 def test_any_scene_looks_as_the_specification_says(seed, count, side):
     """Tiles, lists and early stops change nothing, whatever the size of picture and splats."""
     splats = random_splats(seed, count, torch.float64)
     view = small_view(*side)
-    drawn = rasterise(*splats, view, background=(0.2, 0.3, 0.4))
-    wanted = reference.rasterise(*splats, view, background=(0.2, 0.3, 0.4))
-    for found, expected in zip((drawn.rgb, drawn.alpha, drawn.depth), wanted, strict=True):
-        assert torch.allclose(found, expected, atol=1e-9)
-    weights = torch.rand_like(drawn.rgb)
-    ours = torch.autograd.grad((drawn.rgb * weights).sum() + drawn.depth.sum(), splats)
-    theirs = torch.autograd.grad((wanted[0] * weights).sum() + wanted[2].sum(), splats)
-    for found, expected in zip(ours, theirs, strict=True):
-        assert torch.allclose(found, expected, atol=1e-7 * max(1.0, float(expected.abs().max())))
+    picture = rasterise(*splats, view, background=(0.2, 0.3, 0.4))
+    specification = reference.rasterise(*splats, view, background=(0.2, 0.3, 0.4))
+    for result, expected in zip((picture.rgb, picture.alpha, picture.depth), specification, strict=True):
+        assert torch.allclose(result, expected, atol=1e-9)
+    weights = torch.rand_like(picture.rgb)
+    ours = torch.autograd.grad((picture.rgb * weights).sum() + picture.depth.sum(), splats)
+    theirs = torch.autograd.grad((specification[0] * weights).sum() + specification[2].sum(), splats)
+    for result, expected in zip(ours, theirs, strict=True):
+        assert torch.allclose(result, expected, atol=1e-7 * max(1.0, float(expected.abs().max())))
 
 
 def test_gradients_are_those_of_central_differences():
@@ -123,9 +107,10 @@ def test_gradients_are_those_of_central_differences():
     weights = torch.rand(view.height, view.width, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def loss(*tensors):
-        drawn = rasterise(*tensors, view, limits=limits)
+        picture = rasterise(*tensors, view, limits=limits)
         # The depth of almost nothing jumps where it becomes nothing; times its coverage it does not.
-        return (torch.cat([drawn.rgb, drawn.alpha[..., None], (drawn.alpha * drawn.depth)[..., None]], dim=-1) * weights).sum()
+        depth = picture.alpha * picture.depth
+        return (torch.cat([picture.rgb, picture.alpha[..., None], depth[..., None]], dim=-1) * weights).sum()
 
     assert torch.autograd.gradcheck(loss, splats, eps=1e-6, atol=1e-5, rtol=1e-4)
 
@@ -133,28 +118,28 @@ def test_gradients_are_those_of_central_differences():
 def test_nothing_in_view_is_an_empty_picture_with_zero_gradients():
     splats = random_splats(0, 5, torch.float32)
     behind = [splats[0] * torch.tensor([1.0, 1.0, -1.0]), *splats[1:]]
-    drawn = rasterise(*behind, small_view(), background=(0.1, 0.2, 0.3))
-    assert torch.equal(drawn.alpha, torch.zeros_like(drawn.alpha))
-    assert torch.equal(drawn.depth, torch.zeros_like(drawn.depth))
-    assert torch.allclose(drawn.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(drawn.rgb))
-    drawn.rgb.sum().backward()
+    picture = rasterise(*behind, small_view(), background=(0.1, 0.2, 0.3))
+    assert torch.equal(picture.alpha, torch.zeros_like(picture.alpha))
+    assert torch.equal(picture.depth, torch.zeros_like(picture.depth))
+    assert torch.allclose(picture.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(picture.rgb))
+    picture.rgb.sum().backward()
     assert not splats[0].grad.any()
 
 
 def test_a_camera_among_the_splats_gives_a_finite_picture_and_finite_gradients():
     splats = random_splats(1, 300, torch.float32)
-    centred = [splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]]
-    drawn = rasterise(*centred, small_view())
-    (drawn.rgb.sum() + drawn.depth.sum()).backward()
-    assert torch.isfinite(drawn.rgb).all()
+    centered = [splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]]
+    picture = rasterise(*centered, small_view())
+    (picture.rgb.sum() + picture.depth.sum()).backward()
+    assert torch.isfinite(picture.rgb).all()
     assert all(torch.isfinite(tensor.grad).all() for tensor in splats)
-    assert drawn.alpha.max() > 0.5
+    assert picture.alpha.max() > 0.5
 
 
-@pytest.mark.parametrize("name", ["means", "quaternions", "scales", "opacities", "colours"])
+@pytest.mark.parametrize("name", ["means", "quaternions", "scales", "opacities", "colors"])
 def test_splats_that_are_not_finite_are_named(name):
     splats = [tensor.detach() for tensor in random_splats(0, 4, torch.float32)]
-    position = ["means", "quaternions", "scales", "opacities", "colours"].index(name)
+    position = ["means", "quaternions", "scales", "opacities", "colors"].index(name)
     splats[position][2] = float("nan")
     with pytest.raises(InputError, match=rf"splats, {name}.*finite.*1 of 4"):
         rasterise(*splats, small_view())

@@ -1,6 +1,6 @@
-"""Skinning against golden rollouts (`tests/golden/l*.npz`), rigid motions and degenerate neighbourhoods.
+"""Skinning against golden rollouts (`tests/golden/l*.npz`), rigid motions and degenerate neighborhoods.
 
-Tolerances of the golden data in single precision: 5e-6 m and 2e-5 per component of a quaternion; neighbours equal as sets.
+Tolerances of the golden data in single precision: 5e-6 m and 2e-5 per component of a quaternion; neighbors equal as sets.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from neuspring.splats.skinning import Skin
 
 FOLDER = Path(__file__).parents[1] / "golden"
 CASES = sorted(path.stem for path in FOLDER.glob("l*.npz"))
-METRES, COMPONENTS = 5e-6, 2e-5
+METERS, COMPONENTS = 5e-6, 2e-5
 DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
 
 
@@ -26,8 +26,8 @@ def as_tensor(values: np.ndarray, device: str = "cpu") -> torch.Tensor:
     return torch.tensor(np.asarray(values, np.float32), device=device)
 
 
-def same_sign(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    return found * np.sign((found * wanted).sum(-1, keepdims=True))
+def same_sign(result: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    return result * np.sign((result * expected).sum(-1, keepdims=True))
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -37,15 +37,15 @@ def test_rollouts_are_the_golden_ones(case, frozen, device):
     with np.load(FOLDER / f"{case}.npz") as golden:
         skin = Skin(golden["points"][0], device=device, frozen=frozen)
         ending = "_frozen" if frozen else ""
-        wanted = zip(golden[f"exp_means{ending}"], golden[f"exp_quats{ending}"], strict=True)
+        expected = zip(golden[f"exp_means{ending}"], golden[f"exp_quats{ending}"], strict=True)
         start = (as_tensor(golden[name], device) for name in ("means0", "quats0"))
-        for (means, quaternions), (places, turns) in zip(skin.carry(golden["points"], *start), wanted, strict=True):
-            assert np.abs(means.cpu().numpy() - places).max() <= METRES
+        for (means, quaternions), (places, turns) in zip(skin.carry(golden["points"], *start), expected, strict=True):
+            assert np.abs(means.cpu().numpy() - places).max() <= METERS
             assert np.abs(same_sign(quaternions.cpu().numpy(), turns) - turns).max() <= COMPONENTS
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_neighbours_and_rotations_are_the_golden_ones(case):
+def test_neighbors_and_rotations_are_the_golden_ones(case):
     with np.load(FOLDER / f"{case}.npz") as golden:
         points = golden["points"]
         skin = Skin(points[0])
@@ -66,12 +66,12 @@ def test_nearest_nodes_are_those_of_a_tree(seed, count):
     queries = rng.normal(size=(40, 3)) * rng.choice([0.01, 5.0], (40, 1))
     wanted = min(16, count)
     skin = Skin(points)
-    found = skin._nearest(skin._vectors(points), skin._vectors(queries), own=False, wanted=wanted).numpy()
+    result = skin._nearest(skin._vectors(points), skin._vectors(queries), own=False, wanted=wanted).numpy()
     points, queries = points.astype(np.float32), queries.astype(np.float32)
-    distances = np.linalg.norm(points[found] - queries[:, None], axis=2)
+    distances = np.linalg.norm(points[result] - queries[:, None], axis=2)
     expected = cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0]
     assert np.allclose(distances, expected, atol=1e-5)
-    assert all(len(set(row)) == wanted for row in found.tolist())
+    assert all(len(set(row)) == wanted for row in result.tolist())
 
 
 @settings(max_examples=20, deadline=None)
@@ -83,13 +83,13 @@ def test_a_rigid_motion_moves_splats_rigidly(seed, shape):
     motion, shift = Rotation.from_rotvec(rng.normal(size=3)), rng.normal(size=3)
     quaternions = as_tensor(turns.as_quat(scalar_first=True))
     moved, turned = Skin(nodes).step(nodes, motion.apply(nodes) + shift, as_tensor(means), quaternions)
-    assert np.abs(moved.numpy() - (motion.apply(means) + shift)).max() < METRES
+    assert np.abs(moved.numpy() - (motion.apply(means) + shift)).max() < METERS
     expected = (motion * turns).as_quat(scalar_first=True)
     assert np.abs(same_sign(turned.numpy(), expected) - expected).max() < COMPONENTS
 
 
 def rope(count: int = 40) -> np.ndarray:
-    """Nodes on one line: every neighbourhood is degenerate."""
+    """Nodes on one line: every neighborhood is degenerate."""
     return np.stack([np.linspace(0, 0.4, count), np.zeros(count), np.zeros(count)], axis=1)
 
 
@@ -98,7 +98,7 @@ def test_nodes_on_a_line_turn_by_the_least_angle():
     beside = nodes[10:30] + np.array([0, 0.004, 0])
     identity = as_tensor(np.tile([1.0, 0, 0, 0], (20, 1)))
     moved, turned = Skin(nodes).step(nodes, quarter.apply(nodes), as_tensor(beside), identity)
-    assert np.abs(moved.numpy() - quarter.apply(beside)).max() < METRES
+    assert np.abs(moved.numpy() - quarter.apply(beside)).max() < METERS
     assert np.abs(turned.numpy() - quarter.as_quat(scalar_first=True)).max() < COMPONENTS
 
 
@@ -108,7 +108,7 @@ def test_a_line_turned_round_stays_finite_and_rigid():
         nodes, -nodes, as_tensor(nodes + np.array([0, 0.004, 0])), as_tensor(np.tile([1.0, 0, 0, 0], (40, 1)))
     )
     # Off the line the half turn may go any way round, but to the same distance.
-    assert np.abs(np.linalg.norm(moved.numpy() + nodes, axis=1) - 0.004).max() < METRES
+    assert np.abs(np.linalg.norm(moved.numpy() + nodes, axis=1) - 0.004).max() < METERS
 
 
 def strand_beside_a_body() -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +123,7 @@ def strand_beside_a_body() -> tuple[np.ndarray, np.ndarray]:
     return nodes, after
 
 
-def test_a_degenerate_neighbourhood_stays_local():
+def test_a_degenerate_neighborhood_stays_local():
     nodes, after = strand_beside_a_body()
     means = as_tensor(nodes[:100])
     identity = as_tensor(np.tile([1.0, 0, 0, 0], (100, 1)))
@@ -141,7 +141,7 @@ def test_a_handful_of_nodes_carries_splats_too(count):
     moved, turned = Skin(nodes).step(
         nodes, nodes + np.array([0.1, 0, 0]), as_tensor(nodes), as_tensor(np.tile([1.0, 0, 0, 0], (count, 1)))
     )
-    assert np.abs(moved.numpy() - nodes - [0.1, 0, 0]).max() < METRES
+    assert np.abs(moved.numpy() - nodes - [0.1, 0, 0]).max() < METERS
     assert np.abs(turned.numpy() - [1, 0, 0, 0]).max() < COMPONENTS
 
 

@@ -46,17 +46,17 @@ def known_splats(count: int = 200) -> Splats:
 def shot_of(splats: Splats, view: View, name: str = "0", hands: np.ndarray | None = None) -> Shot:
     """What a camera sees of splats; the mask is where they cover half."""
     with torch.no_grad():
-        drawn = Gaussians.of(splats).draw(view)
-    mask = (drawn.alpha > 0.5).numpy()
-    colour = np.round(255 * drawn.rgb.clamp(0, 1).numpy()).astype(np.uint8)
+        rendered = Gaussians.of(splats).draw(view)
+    mask = (rendered.alpha > 0.5).numpy()
+    color = np.round(255 * rendered.rgb.clamp(0, 1).numpy()).astype(np.uint8)
     covered = np.zeros_like(mask) if hands is None else hands
-    return Shot.of(name, view, colour, mask & ~covered, covered, drawn.depth.numpy(), 0.0)
+    return Shot.of(name, view, color, mask & ~covered, covered, rendered.depth.numpy(), 0.0)
 
 
 def quality(splats: Splats, shot: Shot) -> float:
     with torch.no_grad():
-        drawn = Gaussians.of(splats).draw(shot.view)
-    return float(psnr((drawn.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.colour.permute(2, 0, 1)))
+        rendered = Gaussians.of(splats).draw(shot.view)
+    return float(psnr((rendered.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.colour.permute(2, 0, 1)))
 
 
 @functools.cache
@@ -113,16 +113,16 @@ def test_densify_clones_small_splits_large_and_removes_faint_and_huge():
     pulled = torch.tensor([1.0, 1.0, 0, 0, 0, 0])
     statistics = Statistics(pulled, torch.ones(6), torch.tensor([0, 0, 0, 0.5, 0, 0]))
     generator = torch.Generator().manual_seed(0)
-    kept, added = densify(named(splats), statistics, Appearance(), 1.0, False, generator)
+    stay, added = densify(named(splats), statistics, Appearance(), 1.0, False, generator)
     # 1 is split, 2 is faint; the large ones stay before the first reset.
-    assert kept.tolist() == [True, False, False, True, True, True]
+    assert stay.tolist() == [True, False, False, True, True, True]
     assert added["means"].shape == (3, 3)
     assert torch.equal(added["means"][0], named(splats)["means"][0])
     assert np.allclose(torch.exp(added["log_scales"][1:]), 0.02 / 1.6)
     assert (added["means"][1:] - named(splats)["means"][1]).norm(dim=1).max() < 5 * 0.02
-    kept, _ = densify(named(splats), statistics, Appearance(), 1.0, True, generator)
-    assert kept.tolist() == [True, False, False, False, False, True]
-    kept, added = densify(named(splats), statistics, Appearance(most_splats=6), 1.0, False, generator)
+    stay, _ = densify(named(splats), statistics, Appearance(), 1.0, True, generator)
+    assert stay.tolist() == [True, False, False, False, False, True]
+    stay, added = densify(named(splats), statistics, Appearance(most_splats=6), 1.0, False, generator)
     assert len(added["means"]) == 0
     # New splats are judged as old ones are: no clone of a faint one, no huge child.
     statistics.pull[2] = statistics.pull[4] = 1.0
@@ -140,7 +140,7 @@ def test_hands_hide_and_are_not_compared():
     moved = dataclasses.replace(truth, harmonics=-truth.harmonics)
     with torch.no_grad():
         right, wrong = (Gaussians.of(splats).draw(view) for splats in (truth, moved))
-        # Wrong colours behind the hand alone cost nothing.
+        # Wrong colors behind the hand alone cost nothing.
         patched = dataclasses.replace(right, rgb=torch.where(torch.tensor(hands)[..., None], wrong.rgb, right.rgb))
         settings = Appearance()
         assert float(loss(patched, shot, settings)) == float(loss(right, shot, settings))
@@ -158,16 +158,16 @@ def test_the_margin_of_hands_grows_by_pixels():
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        ("colour", r"camera 0, image of frame 0.*\(64, 96\).*\(10, 96\)"),
+        ("color", r"camera 0, image of frame 0.*\(64, 96\).*\(10, 96\)"),
         ("mask", r"camera 0, mask of frame 0.*\(64, 96\).*\(10, 96\)"),
     ],
 )
 def test_bad_views_are_named(what, message):
     size = (SIZE[1], SIZE[0])
-    arrays = {"colour": np.zeros((*size, 3), np.uint8), "mask": np.ones(size, bool)}
+    arrays = {"color": np.zeros((*size, 3), np.uint8), "mask": np.ones(size, bool)}
     arrays[what] = arrays[what][:10]
     with pytest.raises(InputError, match=message):
-        Shot.of("0", view_from(EYES[0]), arrays["colour"], arrays["mask"], np.zeros(size, bool), np.ones(size), 4.0)
+        Shot.of("0", view_from(EYES[0]), arrays["color"], arrays["mask"], np.zeros(size, bool), np.ones(size), 4.0)
 
 
 def test_a_view_without_the_object_or_only_beside_a_hand_is_none():
@@ -192,26 +192,26 @@ def test_training_that_breaks_is_a_numerical_failure():
 
 def test_the_first_splats_follow_the_points():
     rng = np.random.default_rng(0)
-    points, colours = rng.uniform(0, 0.1, (500, 3)), rng.uniform(0, 1, (500, 3))
-    every = first_splats(points, colours, Appearance(), 0.002)
+    points, colors = rng.uniform(0, 0.1, (500, 3)), rng.uniform(0, 1, (500, 3))
+    every = first_splats(points, colors, Appearance(), 0.002)
     assert np.allclose(every.means, points)
-    shown_colours = harmonics.colours(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
-    assert np.allclose(shown_colours, colours, atol=1e-5)
-    fewer = first_splats(points, colours, Appearance(spacing=10), 0.002)
+    shown_colors = harmonics.colours(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
+    assert np.allclose(shown_colors, colors, atol=1e-5)
+    fewer = first_splats(points, colors, Appearance(spacing=10), 0.002)
     assert 60 < len(fewer.means) <= 216
     assert fewer.log_scales.mean() > every.log_scales.mean()
     with pytest.raises(InputError, match="more than 3 points"):
-        first_splats(points[:2], colours[:2], Appearance(), 0.002)
+        first_splats(points[:2], colors[:2], Appearance(), 0.002)
 
 
 def test_a_fixed_radius_stays_whatever_is_trained():
     shots = [shot_of(known_splats(), view_from(eye), str(k)) for k, eye in enumerate(EYES)]
-    chosen = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004, densify_from=10, densify_every=10, densify_until=60)
-    chosen = dataclasses.replace(chosen, densify_gradient=1e-6, split_size=1e-4)
-    start = first_splats(known_splats().means, np.full((200, 3), 0.5), chosen, 0.01)
-    found = train(start, shots, chosen, 0, "warp")
-    assert len(found.splats.means) > 200, "what is too coarse is cloned, however large"
-    np.testing.assert_allclose(np.exp(found.splats.log_scales), 0.004, rtol=1e-6)
+    settings = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004, densify_from=10, densify_every=10, densify_until=60)
+    settings = dataclasses.replace(settings, densify_gradient=1e-6, split_size=1e-4)
+    start = first_splats(known_splats().means, np.full((200, 3), 0.5), settings, 0.01)
+    result = train(start, shots, settings, 0, "warp")
+    assert len(result.splats.means) > 200, "what is too coarse is cloned, however large"
+    np.testing.assert_allclose(np.exp(result.splats.log_scales), 0.004, rtol=1e-6)
     with pytest.raises(ValueError, match="splats of one radius are isotropic"):
         Appearance(fixed_radius=0.003, isotropic=False)
 

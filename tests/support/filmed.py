@@ -45,10 +45,10 @@ def film(
     missing = missing or {}
     vertices, faces = surface(BODY, (-0.08, -0.08, -0.01), (0.15, 0.08, 0.13), 0.004)
     ball, ball_faces = surface(sphere((0, 0, 0), 0.032), (-0.04,) * 3, (0.04,) * 3, 0.004)
-    colours = np.where(np.sin(90 * vertices[:, :1] + 60 * vertices[:, 1:2]) > 0, [0.15, 0.3, 0.65], [0.3, 0.55, 0.3])
+    colors = np.where(np.sin(90 * vertices[:, :1] + 60 * vertices[:, 1:2]) > 0, [0.15, 0.3, 0.65], [0.3, 0.55, 0.3])
     renderer = Renderer(
         [
-            Part(vertices, faces, colours, OBJECT, (60.0, 0.8)),
+            Part(vertices, faces, colors, OBJECT, (60.0, 0.8)),
             Part(ball, ball_faces, np.tile(SKIN, (len(ball), 1)), HANDS, (45.0, 0.6)),
         ]
     )
@@ -75,12 +75,12 @@ def film(
             if frame not in entry.missing:
                 view = renderer.render(type(camera)(name, camera.width, camera.height, camera.intrinsics, pose))
                 writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
-    chosen = vertices[:: len(vertices) // 20]
-    return writer.finish((chosen + np.arange(FRAMES)[:, None, None] * STEP) @ turn[:3, :3].T)
+    annotated = vertices[:: len(vertices) // 20]
+    return writer.finish((annotated + np.arange(FRAMES)[:, None, None] * STEP) @ turn[:3, :3].T)
 
 
 def write_raw(capture: Capture, case: Path) -> Path:
-    """The capture in PhysTwin's raw layout: one mask per detection, depth as npy in millimetres, poses as a pickle."""
+    """The capture in PhysTwin's raw layout: one mask per detection, depth as npy in millimeters, poses as a pickle."""
     case.mkdir(parents=True)
     first = next(iter(capture.cameras.values()))
     metadata = {

@@ -9,7 +9,7 @@ from neuspring.splats.view import Limits, View
 
 FOLDER = Path(__file__).parents[1] / "golden"
 CASES = sorted(path.stem for path in FOLDER.glob("r*.npz"))
-INPUTS = ("means", "quats", "scales", "opacities", "colours")
+INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 class Golden:
@@ -18,8 +18,8 @@ class Golden:
             self.values = {key: stored[key] for key in stored.files}
         v = self.values
         self.degree = int(v["sh_degree"]) if int(v["sh_degree"]) >= 0 else None
-        self.colour_key = "colors" if self.degree is None else "sh_coeffs"
-        keys = ("means", "quats", "scales", "opacities", self.colour_key)
+        self.color_key = "colors" if self.degree is None else "sh_coeffs"
+        keys = ("means", "quats", "scales", "opacities", self.color_key)
         self.inputs = {
             name: torch.tensor(v[key], dtype=dtype, device=device).requires_grad_() for name, key in zip(INPUTS, keys, strict=True)
         }
@@ -40,7 +40,7 @@ class Golden:
         return {"degree": self.degree, "background": self.background, "limits": self.limits}
 
     def expected_gradient(self, which: str, name: str) -> np.ndarray:
-        return self.values[f"grad{which}_{self.colour_key if name == 'colours' else name}"]
+        return self.values[f"grad{which}_{self.color_key if name == 'colors' else name}"]
 
     def loss(self, which: str, rgb: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         weights = {key: torch.tensor(self.values[f"w_{key}"]).to(rgb) for key in ("rgb", "alpha", "depth")}

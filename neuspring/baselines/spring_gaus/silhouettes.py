@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.scores.images import ssim
+from neuspring.splats.ssim import ssim
 
 Features = Callable[[torch.Tensor], torch.Tensor]
 """Pictures [B, 3, H, W] in 0..1 -> features."""
