@@ -187,9 +187,10 @@ def _score(a: argparse.Namespace) -> int:
 def _tables(a: argparse.Namespace) -> int:
     from neuspring.report import gallery
     from neuspring.report.tables import summary as tables
+    from neuspring.scores.runs import collect, collect_transfers
 
-    collected = tables.collect(a.results, a.scenarios, a.methods, a.seeds, read_left_out(a.left_out))
-    transfers = tables.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
+    collected = collect(a.results, a.scenarios, a.methods, a.seeds, read_left_out(a.left_out))
+    transfers = collect_transfers(a.results, a.transfers, a.methods, a.seeds)
     print(tables.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()

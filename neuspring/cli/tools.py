@@ -66,15 +66,15 @@ def _check_data(a: argparse.Namespace) -> int:
 
 def _study(a: argparse.Namespace) -> int:
     from neuspring.report.tables import study as tables_paper
-    from neuspring.report.tables import summary as tables
     from neuspring.scores import studies
+    from neuspring.scores.runs import read_scores
 
     known = studies.read_studies(a.table)
     if a.study not in known:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(known)}")
     left_out = read_left_out(a.left_out)
     if a.scores:
-        collected = replace(tables.read_scores(a.scores), left_out=left_out)
+        collected = replace(read_scores(a.scores), left_out=left_out)
         text = tables_paper.write_collected(a.study, known[a.study], collected, a.output)
     elif a.scenarios and a.methods and a.seeds:
         text = tables_paper.write_study(a.study, known[a.study], a.results, a.scenarios, a.seeds, a.methods, a.output, left_out)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from neuspring.core.markdown import markdown
 from neuspring.core.records import canonical
 from neuspring.report.explain import Behind, Explanation
 from neuspring.report.tables.render import number, our_change, paper_change
 from neuspring.scores.failures import left_out_lines
-from neuspring.scores.layout import markdown
 from neuspring.scores.paper import MEASURES, Measure
 
 SHORT = 12

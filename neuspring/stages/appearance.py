@@ -36,9 +36,10 @@ from neuspring.report.video import Video
 from neuspring.scores import images as image_metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
+from neuspring.scores.pictures import Scored, picture_scores
 from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import REFERENCE_WIDTH
-from neuspring.splats.draw import BLACK, COVERED, WHITE, Scored, moved, picture, placed, save_picture, turned, view_of
+from neuspring.splats.draw import BLACK, COVERED, WHITE, moved, picture, placed, save_picture, turned, view_of
 from neuspring.splats.losses import Shot
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterise import choose_backend
@@ -177,7 +178,7 @@ def render(
                 if not capture.has(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
-                found = _scores(pair, metric, images.released_quirks.unit_lpips)
+                found = picture_scores(pair, metric, unit_lpips=images.released_quirks.unit_lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in found.items()]
                 if name == first and frame < drawn:
                     strip.add(frame, pair)
@@ -262,17 +263,6 @@ def _held(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:
         yield last
     if last is not None:
         yield from itertools.repeat(last, count)
-
-
-def _scores(pair: figures_images.Pair, lpips: Lpips | str, unit_lpips: bool) -> dict[str, float]:
-    """PSNR, SSIM, IoU and, where its weights are there, LPIPS."""
-    truth, prediction = pair.truth, pair.prediction
-    found = {
-        "psnr": float(image_metrics.psnr(prediction, truth)),
-        "ssim": float(image_metrics.ssim(prediction, truth)),
-        "iou": image_metrics.iou(*pair.silhouettes),
-    }
-    return found if isinstance(lpips, str) else found | {"lpips": float(lpips(prediction, truth, released_range=unit_lpips))}
 
 
 def _shots(capture: Capture, masks: Mapping[str, Masks], images: Images, device: str) -> list[Shot]:

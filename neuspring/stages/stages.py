@@ -374,7 +374,7 @@ def _write_held(
     folder: Path,
 ) -> str:
     """held.parquet, and its name: scores with the last frame held, or frame 0 where there is none."""
-    whole = metrics.held(trajectory, observations)
+    whole = metrics.last_frame_frozen(trajectory, observations)
     table = metrics.score(whole, observations, method, seed)
     if drawn is not None:
         table = _with_pictures(table, drawn, len(whole.positions), observations, method, seed)

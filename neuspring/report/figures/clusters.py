@@ -23,8 +23,8 @@ STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
 
 def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
     """The methods named clusters_<K>, each once, with K; sorted by K."""
-    found = {method: int(match[1]) for method in methods if (match := re.fullmatch(r"clusters_(\d+)", method))}
-    return dict(sorted(found.items(), key=lambda item: item[1]))
+    counts = {method: int(match[1]) for method in methods if (match := re.fullmatch(r"clusters_(\d+)", method))}
+    return dict(sorted(counts.items(), key=lambda item: item[1]))
 
 
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
@@ -33,12 +33,12 @@ def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     `scores` are rows of `metrics.COLUMNS`, metres; methods that are not named clusters_<K> are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.
     """
-    known = cluster_methods(scores["method"])
-    rows = scores[scores["method"].isin(list(known)) & (scores["metric"] == "chamfer")]
+    methods = cluster_methods(scores["method"])
+    rows = scores[scores["method"].isin(list(methods)) & (scores["metric"] == "chamfer")]
     own = rows.groupby(["scenario", "task", "method"], sort=False)["value"].agg(["mean", "std"]).fillna(0.0).reset_index()
     all_of_them = averages(rows, by=("task", "method")).rename(columns={"equal": "mean", "seed_std": "std"}).assign(scenario="")
     names = ["scenario", "task", "clusters", "mean", "std"]
-    table = pd.concat([own, all_of_them]).assign(clusters=lambda t: t["method"].map(known))[names]
+    table = pd.concat([own, all_of_them]).assign(clusters=lambda t: t["method"].map(methods))[names]
     table[["mean", "std"]] *= MM
     return table.sort_values(["scenario", "task", "clusters"], ignore_index=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,6 +15,7 @@ from neuspring.core.artifacts import Scenario
 from neuspring.report.figures.run import chosen_frames
 from neuspring.report.figures.views import save
 from neuspring.scores.images import psnr
+from neuspring.scores.pictures import Pair
 from neuspring.splats.losses import Shot
 
 WORST = 0.5
@@ -28,30 +28,12 @@ TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
 """Colours of the two parts of the time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """What was seen and what is predicted, in one frame of one camera."""
-
-    observed: np.ndarray
-    """[H, W, 3] uint8."""
-    rendered: np.ndarray
-    """[H, W, 4] uint8, over black."""
-    truth: torch.Tensor
-    """[3, H, W], masked as for metrics."""
-    prediction: torch.Tensor
-    """[3, H, W], masked as for metrics."""
-    silhouettes: tuple[np.ndarray, np.ndarray]
-    """Observed and predicted [H, W] bool."""
-    hands: np.ndarray
-    """[H, W] bool."""
-
-    @property
-    def error(self) -> np.ndarray:
-        """Mean absolute colour difference in false colours [H, W, 3] uint8, grey behind hands."""
-        difference = (self.truth - self.prediction).abs().mean(0).numpy() / WORST
-        picture = (255 * matplotlib.colormaps["inferno"](np.clip(difference, 0, 1))[..., :3]).astype(np.uint8)
-        picture[self.hands] = 70
-        return picture
+def error_picture(pair: Pair) -> np.ndarray:
+    """Mean absolute color difference in false colors [H, W, 3] uint8, gray behind hands."""
+    difference = (pair.truth - pair.prediction).abs().mean(0).numpy() / WORST
+    picture = (255 * matplotlib.colormaps["inferno"](np.clip(difference, 0, 1))[..., :3]).astype(np.uint8)
+    picture[pair.hands] = 70
+    return picture
 
 
 def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], around: Mapping[int, np.ndarray], path: Path) -> Path:
@@ -100,7 +82,7 @@ class Strip:
         for column, (frame, pair) in zip(axes.T, self._pairs.items(), strict=False):
             quality = float(psnr(pair.prediction, pair.truth))
             column[0].set_title(f"frame {frame}: {self._names[frame]}\n{quality:.1f} dB", fontsize=9)
-            for axis, picture in zip(column, (pair.observed, pair.rendered[..., :3], pair.error), strict=True):
+            for axis, picture in zip(column, (pair.observed, pair.rendered[..., :3], error_picture(pair)), strict=True):
                 axis.imshow(picture)
         for axis, label in zip(axes[:, 0], ("observed", "predicted", f"difference, 0 to {WORST:g}"), strict=True):
             axis.set_ylabel(label, fontsize=9)
@@ -118,7 +100,7 @@ class Film:
 
     def compared(self, frame: int, pair: Pair) -> np.ndarray:
         """A frame of the comparison [H, W, 3] uint8."""
-        panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": pair.error}
+        panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": error_picture(pair)}
         return self._titled(panels, frame)
 
     def turned(self, frame: int, picture: np.ndarray) -> np.ndarray:

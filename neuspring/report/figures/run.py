@@ -17,11 +17,10 @@ from matplotlib.ticker import MaxNLocator
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
 from neuspring.report.figures.twin import CONTROLLER, stiffness_figure, topology_figure
 from neuspring.report.figures.views import View, limits, point_size, readable, sample, save, side_view, widest_axis
-from neuspring.scores.metrics import chamfer_per_frame, track_error_per_frame
+from neuspring.scores.metrics import PICTURES, chamfer_per_frame, track_error_per_frame
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
-IMAGE_LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "iou": "IoU"}
 MM = 1e3
 PANEL, HEIGHTS = 3.1, (1.1, 3.1)
 """Width of a panel of motion.png, and the least and greatest height, inches."""
@@ -88,15 +87,15 @@ def _errors(observations: Observations, trajectory: Trajectory, title: str) -> F
 
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
     """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
-    shown = [metric for metric in IMAGE_LABELS if metric in set(frames["metric"])]
+    shown = [metric for metric in PICTURES if metric.name in set(frames["metric"])]
     figure, axes = plt.subplots(
         len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False
     )
     for axis, metric in zip(axes[:, 0], shown, strict=True):
-        values = frames[frames["metric"] == metric].groupby("frame")["value"].mean()
+        values = frames[frames["metric"] == metric.name].groupby("frame")["value"].mean()
         axis.plot(values.index / scenario.frame_rate, values, color="tab:blue")
         axis.axvspan(scenario.train_end / scenario.frame_rate, scenario.frame_count / scenario.frame_rate, color="0.92")
-        axis.set(ylabel=IMAGE_LABELS[metric], xlim=(0, None))
+        axis.set(ylabel=metric.label, xlim=(0, None))
     axes[0, 0].set_title(f"{scenario.name}, {method} (grey: future)")
     axes[-1, 0].set_xlabel("time [s]")
     return save(figure, folder / IMAGE_SCORES)

@@ -14,11 +14,11 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.core.progress import Progress
 from neuspring.data.departure import Case
 from neuspring.data.phystwin import FINAL_DATA, SPLIT
 from neuspring.data.released import Released
-from neuspring.report.tables.summary import markdown
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.released import images, physics
