@@ -195,7 +195,7 @@ def _tables(a: argparse.Namespace) -> int:
     print(f"Tables: {a.output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
-    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected.scores, a.output)}")
+    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected, a.output)}")
     return 0
 
 

@@ -100,7 +100,11 @@ class Film:
 
     def compared(self, frame: int, pair: Pair) -> np.ndarray:
         """A frame of the comparison [H, W, 3] uint8."""
-        panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": error_picture(pair)}
+        panels = {
+            "observed": pair.observed,
+            "predicted": pair.rendered[..., :3],
+            f"difference, 0 to {WORST:g}": error_picture(pair),
+        }
         return self._titled(panels, frame)
 
     def turned(self, frame: int, picture: np.ndarray) -> np.ndarray:

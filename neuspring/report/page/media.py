@@ -13,7 +13,7 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from neuspring.report.page.blocks import Picture, Video
+from neuspring.report.blocks import Picture, Video
 
 QUALITY = 75
 """Of WebP."""

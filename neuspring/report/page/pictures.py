@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuspring.report.page.blocks import Block, Fold, Grid, Section, Text
+from neuspring.report.blocks import Block, Fold, Grid, Section, Text
 from neuspring.report.page.media import Media, Wanted
 from neuspring.report.page.sources import Material, Run
 from neuspring.report.page.words import several

@@ -9,7 +9,7 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from neuspring.report.page.blocks import Block, Fold, Grid, Picture, Prose, Section
+from neuspring.report.blocks import Block, Fold, Grid, Picture, Prose, Section
 from neuspring.report.page.media import embedded_png, link
 from neuspring.report.page.sources import UNREADABLE, Material
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-DASH = "–"
+from neuspring.scores.metrics import DASH
 
 
 def several(count: int, noun: str, plural: str = "") -> str:

@@ -1,19 +1,18 @@
-"""Where the time went: hours by step and method, waiting, memory, retries, and which GPU did what when."""
+"""Where the time went: hours by step and by method, waiting, memory, retries."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from neuspring.core.job_records import JobRecord
-from neuspring.report.page.blocks import Block, Cell, Section, Table, Text
+from neuspring.report.blocks import Block, Cell, Section, Table, Text
 from neuspring.report.page.sources import METHOD_RULES, Material, Run
-from neuspring.report.page.timeline import timeline
-from neuspring.report.page.words import DASH, duration, hours, memory
+from neuspring.report.page.words import duration, hours, memory
+from neuspring.scores.metrics import DASH
 
 ORDER = (
     *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "train", "predict"),
@@ -23,7 +22,7 @@ ORDER = (
 
 
 def place(rule: str) -> int:
-    """Where a rule stands in the workflow; those that are not known come last."""
+    """Where a rule stands in the workflow; unknown rules come last."""
     return ORDER.index(rule) if rule in ORDER else len(ORDER)
 
 
@@ -56,7 +55,7 @@ def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
         jobs=len(jobs),
         failed=sum(job.failed for job in jobs),
         retries=sum(len(job.attempts) - 1 for job in jobs),
-        seconds=tuple(sum(a.seconds for a in job.attempts) for job in jobs),
+        seconds=tuple(job.seconds for job in jobs),
         gpu_seconds=sum(a.seconds * len(a.devices) for a in attempts),
         cpu_seconds=sum(a.cpu_seconds for a in attempts),
         waited=sum(a.waited for a in attempts),
@@ -73,7 +72,7 @@ def by_rule(jobs: Iterable[JobRecord]) -> list[Spent]:
 
 
 def by_method(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """Jobs of one method each; searches and splats, which methods share, by their row."""
+    """Jobs by method. Searches and splats, which methods share, have groups of their own."""
     groups = _grouped(jobs, _owner)
     groups.pop("", None)
     return [spent(name, groups[name]) for name in sorted(groups)]
@@ -103,7 +102,7 @@ def _splats(folder: str) -> str:
 
 
 def gpu_hours(material: Material) -> tuple[float | None, str]:
-    """GPU-hours, from job records or else from run records, and from which; None where nothing is known."""
+    """GPU-hours (None where nothing is known), and where they are from: job records, else run records."""
     if material.jobs:
         return sum(a.seconds * len(a.devices) for job in material.jobs for a in job.attempts) / 3600, "job records"
     if not material.runs:
@@ -112,11 +111,11 @@ def gpu_hours(material: Material) -> tuple[float | None, str]:
 
 
 def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
-    """Rule, method, seconds, device and MiB of every stage; shared ones once, for `shared` or the method whose splats they are."""
+    """Rule, method, seconds, device and MiB of every stage. Shared stages count once: for `shared`, or the method of the splats."""
     seen, rows = set(), []
     for run in runs:
-        named = {(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])}
-        places = {path.stem: path for path in named}
+        paths = [(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])]
+        places = {path.stem: path for path in paths}
         for stage, seconds in run.record.timings.items():
             place = places.get(stage, run.folder / stage)
             if place in seen:
@@ -133,13 +132,14 @@ def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
 
 
 def section(material: Material) -> Section:
-    """Tables of hours, and the timeline."""
+    """Tables of hours."""
+    title = "Time and hardware"
     if material.jobs:
-        return Section(key="work", title="Time and hardware", about=_about(material.jobs), blocks=_from_jobs(material.jobs))
+        return Section(key="work", title=title, about=_about(material.jobs), blocks=_from_jobs(material.jobs))
     if not material.runs:
-        return Section(key="work", title="Time and hardware", blocks=[Text(text="Nothing has been timed yet.", tone="mute")])
+        return Section(key="work", title=title, blocks=[Text(text="Nothing has been timed yet.", tone="mute")])
     note = "There are no job records: times are those of the run records, without failed attempts, waiting and steps outside runs."
-    return Section(key="work", title="Time and hardware", blocks=[Text(text=note, tone="mute"), _from_runs(material.runs)])
+    return Section(key="work", title=title, blocks=[Text(text=note, tone="mute"), _from_runs(material.runs)])
 
 
 def _about(jobs: Sequence[JobRecord]) -> str:
@@ -154,24 +154,12 @@ def _from_jobs(jobs: Sequence[JobRecord]) -> list[Block]:
     methods = by_method(jobs)
     if methods:
         blocks.append(_costs("By method (searches and splats apart, since methods share them)", "Method", methods, total=False))
-    return [*blocks, *timeline(jobs, sorted({job.rule for job in jobs}, key=lambda rule: (place(rule), rule)))]
+    return blocks
 
 
 def _costs(caption: str, what: str, groups: Sequence[Spent], *, total: bool) -> Table:
-    header = [
-        what,
-        "Jobs",
-        "Failed",
-        "Retries",
-        "Median",
-        "Longest",
-        "GPU-hours",
-        "CPU-hours",
-        "Waited",
-        "Peak memory",
-        "GPU memory",
-        "GPU use",
-    ]
+    header = [what, "Jobs", "Failed", "Retries", "Median", "Longest", "GPU-hours", "CPU-hours", "Waited", "Peak memory"]
+    header += ["GPU memory", "GPU use"]
     rows = [_cost(group) for group in groups]
     if total and len(groups) > 1:
         rows.append(
@@ -222,16 +210,16 @@ def _from_runs(runs: Sequence[Run]) -> Table:
     for stage, method, seconds, device, peak in _stages(runs):
         groups[stage, method].append((seconds, device, peak))
     rows = []
-    for (stage, method), found in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
-        times = [one for one, _, _ in found]
-        on_gpu = sum(one for one, device, _ in found if device.startswith("cuda"))
-        peak = max((one for _, _, one in found if np.isfinite(one)), default=np.nan)
+    for (stage, method), records in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
+        times = [seconds for seconds, _, _ in records]
+        on_gpu = sum(seconds for seconds, device, _ in records if device.startswith("cuda"))
+        peak = max((mebibytes for _, _, mebibytes in records if np.isfinite(mebibytes)), default=np.nan)
         cells = [Cell(text=duration(v), value=v) for v in (float(np.median(times)), max(times))]
         rows.append(
             [
                 Cell(text=stage),
                 Cell(text=method),
-                _number(len(found)),
+                _number(len(records)),
                 *cells,
                 _hours(sum(times)),
                 _hours(on_gpu),
@@ -242,7 +230,7 @@ def _from_runs(runs: Sequence[Run]) -> Table:
     return Table(caption="By step and method", header=header, rows=rows, stub=2, sortable=True)
 
 
-def machines(runs: Iterable[Run]) -> dict[str, Any]:
+def machines(runs: Iterable[Run]) -> dict[str, int]:
     """Machine and device -> number of runs."""
     counts: dict[str, int] = defaultdict(int)
     for run in runs:

@@ -14,7 +14,7 @@ SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "�
 
 @dataclass(frozen=True, kw_only=True)
 class Chip:
-    """A word on a coloured ground, with a symbol, so that colour says nothing alone."""
+    """A word on a colored ground, with a symbol, so that nothing is said by color alone."""
 
     text: str
     tone: Tone = ""
@@ -104,12 +104,13 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An embedded picture, or, without `data`, a link to the file and why."""
+    """A picture; without `data`, a link to the file and why it is not shown."""
 
     kind: ClassVar[str] = "picture"
     caption: str
     alt: str
     data: str = ""
+    """Its source: a data URI, or on a page that shows files beside it their path."""
     link: str = ""
     reason: str = ""
     wide: bool = False
@@ -121,7 +122,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Video:
-    """An embedded video, or a link to the file and why."""
+    """A video, as `Picture`."""
 
     kind: ClassVar[str] = "video"
     caption: str
@@ -132,18 +133,8 @@ class Video:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawing:
-    """SVG that we drew."""
-
-    kind: ClassVar[str] = "drawing"
-    svg: Markup
-    caption: str
-    wide: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Legend:
-    """Samples of lines: name, colour, dash pattern (SVG)."""
+    """Samples of lines: name, color, dash pattern (SVG)."""
 
     kind: ClassVar[str] = "legend"
     entries: Sequence[tuple[str, str, str]]
@@ -186,7 +177,7 @@ class Fold:
     key: str = ""
 
 
-Block = Table | Text | Items | Facts | Verdict | Picture | Video | Drawing | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Facts | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
