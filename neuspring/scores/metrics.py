@@ -118,8 +118,8 @@ _ALL = (
 )  # fmt: skip
 METRICS = {metric.name: metric for metric in _ALL}
 """By name, in the order of summaries. Tolerances of distances are those of single precision and its order of summation. Pictures
-agree within 1e-6 dB with a drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie
-between."""
+agree within 1e-6 dB with a drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU. Other rasterizers
+lie between."""
 IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
 """The metrics of the paper's tables, in its order."""
 DISTANCES = tuple(metric for metric in _ALL if not metric.of_pictures)

@@ -57,7 +57,7 @@ def tables() -> tuple[str, ...]:
 
 @functools.cache
 def released() -> pd.DataFrame:
-    """Scores of the released PhysTwin: scenario, task, metric, value [m]. Scores of training frames are known for 11 of 22 scenarios."""
+    """Scores of the released PhysTwin: scenario, task, metric, value [m]. 11 of 22 scenarios have scores of training frames."""
     import pandas as pd
 
     names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error"}

@@ -47,7 +47,8 @@ class Pair:
 def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[str, float]:
     """PSNR [dB], SSIM, IoU and LPIPS of a pair.
 
-    `lpips` is the metric, or a text that says why there is none; then it is left out. `unit_lpips`: see `released_range` of `Lpips`.
+    `lpips` is the metric, or a text that says why there is none; then it is left out. `unit_lpips`: `released_range`
+    of `Lpips`.
     """
     truth, prediction = pair.truth, pair.prediction
     values = {

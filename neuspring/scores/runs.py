@@ -124,7 +124,7 @@ def _digest(settings: Mapping[str, Any]) -> str:
 def read_scores(path: Path) -> Collected:
     """The runs of a scores.csv of a folder of tables; the runs.csv beside it says how they ended. Raises InputError.
 
-    Without runs.csv a run counts as finished if it has a Chamfer distance for every task that any run has; a diverged run has fewer.
+    Without runs.csv a run counts as finished if it has a Chamfer distance of every task that any run has. A diverged run has fewer.
     """
     try:
         scores = pd.read_csv(path)

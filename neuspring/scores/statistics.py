@@ -45,7 +45,7 @@ def interval(means: np.ndarray) -> tuple[float, float]:
 def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """Method minus baseline on the same scenarios and seeds: a row per method, task and metric, with 95 % intervals.
 
-    `relative` is the mean difference over the baseline's mean on the same pairs. `ratio` is the geometric mean of method / baseline,
+    `relative` is the mean difference over the baseline's mean on the same pairs. `ratio` is the geometric mean of method/baseline,
     in which scenarios of large errors weigh no more than others; it is NaN where an error is zero.
     """
     rows = []

@@ -189,8 +189,8 @@ PLOTS = (
     ),
     Plot(
         title="Training of baselines: loss",
-        about="Over epochs or iterations; thin: other seeds. Every model has its own loss, so heights of different models cannot be "
-        "compared.",
+        about="Over epochs or iterations; thin: other seeds. Every model has its own loss, so the heights of models "
+        "cannot be compared.",
         collect=_losses("train"),
     ),
 )

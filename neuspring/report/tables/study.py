@@ -187,7 +187,8 @@ def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
 def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame, means: pd.DataFrame) -> list[Grid]:
     """The blocks of the table that have lines; the note of the first says what every reader must know."""
     kept = pairs(scores)
-    which = f"Averages take the {kept} of {pairs(own.runs)} pairs of scenario and seed that every method with a finished run has finished."
+    which = f"Averages take the {kept} of {pairs(own.runs)} pairs of scenario and seed "
+    which += "that every method with a finished run has finished."
     main, change = main_grid(study, table), change_grid(study, table)
     labels = _labels(study)
     removed = " ".join(removed_lines(own.runs, own.left_out, labels))
