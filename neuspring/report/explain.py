@@ -93,15 +93,15 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
     `configfiles` are those that the runs were made with; the commands name them. Raises InputError for an unknown cell, and lists
     the known ones.
     """
-    made, table = _find_table(cell, folder)
-    label, task, metric = _find_cell(cell, made, table)
-    study = of_study(made.study, collect(results, made.scenarios, made.methods, made.seeds, made.left_out))
+    files, table = _find_table(cell, folder)
+    label, task, metric = _find_cell(cell, files, table)
+    study = of_study(files.study, collect(results, files.scenarios, files.methods, files.seeds, files.left_out))
     wanted = (study.scores["task"] == task) & (study.scores["metric"] == metric)
     own = Collected(study.scores[wanted], study.runs, left_out=study.left_out)
-    rows = _records(_only(cells(made.study, own), label, task, metric))
+    rows = _records(_only(cells(files.study, own), label, task, metric))
     if not rows:
-        remedy = f"Make the table again: snakemake {made.name}."
-        raise InputError(f"cell {cell!r}", f"the runs that {made.name}.csv was made of must be in {results}", "none", remedy)
+        remedy = f"Make the table again: snakemake {files.name}."
+        raise InputError(f"cell {cell!r}", f"the runs that {files.name}.csv was made of must be in {results}", "none", remedy)
     method = rows[0]["method"]
     values, scores = (
         {(run["scenario"], run["seed"]): run for run in _records(part[part["method"] == method])}
@@ -109,14 +109,14 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
     )
     runs: list[Behind] = []
     left: list[Behind] = []
-    for run in _records(accounted(made.study, own)):
+    for run in _records(accounted(files.study, own)):
         if run["method"] == method:
             key = (run["scenario"], run["seed"])
             why = run["why"] or ("" if key in scores else _without_value(key in values))
             (left if why else runs).append(_behind(run, why, values.get(key), Path(results), configfiles))
     before = _only(table, label, task, metric)["ours"]
     return Explanation(
-        cell=f"{made.name}/{label}/{task}/{metric}",
+        cell=f"{files.name}/{label}/{task}/{metric}",
         row={name: None if isinstance(value, float) and math.isnan(value) else value for name, value in rows[0].items()},
         in_table=None if before.isna().all() else float(before.iloc[0]),
         runs=runs,
@@ -154,14 +154,14 @@ def _find_table(cell: str, folder: Path) -> tuple[Made, pd.DataFrame]:
     return Made.load(Path(folder) / f"{study}.json"), table
 
 
-def _find_cell(cell: str, made: Made, table: pd.DataFrame) -> tuple[str, str, str]:
+def _find_cell(cell: str, files: Made, table: pd.DataFrame) -> tuple[str, str, str]:
     """Label, task and metric of a cell. Labels may hold a slash."""
-    cells = [f"{made.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
+    cells = [f"{files.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
     parts = cell.split("/")
     if len(parts) < 4:
         raise InputError(f"cell {cell!r}", "a cell is STUDY/ROW/TASK/METRIC", None, _suggestions(cell, cells))
-    labels = {label: label for label in made.study.rows}
-    labels |= {method: label for label, method in made.study.rows.items() if method not in labels}
+    labels = {label: label for label in files.study.rows}
+    labels |= {method: label for label, method in files.study.rows.items() if method not in labels}
     label = _choose("/".join(parts[1:-2]), labels, "row", cell)
     tasks = {task: task for task in table["task"].unique()} | {theirs: ours for ours, theirs in paper.TASKS.items()}
     metrics = {

@@ -1,4 +1,4 @@
-"""How close a rendered picture is to the observed one: SSIM, PSNR and IoU, and the masked pair of pictures they compare.
+"""How close a rendered picture is to the observed one: SSIM, PSNR and IoU, and the masked pair of pictures that they compare.
 
 SSIM (Wang et al. 2004) of a and b, with means, variances and covariance under a Gaussian window (11x11, sigma 1.5), per channel:
 (2 mu_a mu_b + C1)(2 sigma_ab + C2) / ((mu_a^2 + mu_b^2 + C1)(sigma_a^2 + sigma_b^2 + C2)), C1 = 0.01^2, C2 = 0.03^2, data range 1.
@@ -59,7 +59,7 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """SSIM, the mean of its map over everything; differentiable. At most 1, for equal pictures."""
+    """SSIM: the mean of its map; differentiable. 1 for equal pictures, less for all others."""
     return ssim_map(a, b).mean()
 
 
@@ -92,16 +92,16 @@ def _check_bytes(shape: tuple[int, ...], **pictures: np.ndarray) -> None:
 def masked_pair(
     observed: np.ndarray, object_mask: np.ndarray, rendered: np.ndarray, hand_mask: np.ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(observed, rendered) as compared by PhysTwin, each [3, H, W] float32 in [0, 1].
+    """(observed, rendered) as PhysTwin compares them, each [3, H, W] float32 in [0, 1].
 
-    Takes bytes: observed [H, W, 3], object mask [H, W], rendered over black [H, W, 4], hand mask [H, W]. Observed is cut to the
-    object, both lose what the hand hides. Masks weigh by their value / 255. The rendered picture is not cut to the object.
+    Takes bytes: observed [H, W, 3], object mask [H, W], rendered over black [H, W, 4], hand mask [H, W]. The observed picture is
+    cut to the object, the rendered one is not. Both lose what the hand hides. Masks weigh by their value / 255.
     """
     _check_bytes(observed.shape[:2], observed=observed, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     shown = 1.0 - hand_mask / 255.0
     truth = observed * (object_mask / 255.0 * shown / 255.0)[..., None]
-    drawn = rendered[..., :3] * (shown / 255.0)[..., None]
-    first, second = (torch.from_numpy(p.transpose(2, 0, 1).astype(np.float32)) for p in (truth, drawn))
+    prediction = rendered[..., :3] * (shown / 255.0)[..., None]
+    first, second = (torch.from_numpy(p.transpose(2, 0, 1).astype(np.float32)) for p in (truth, prediction))
     return first, second
 
 
@@ -110,8 +110,8 @@ def silhouettes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(observed, rendered) silhouettes whose IoU is reported, each [H, W] bool; inputs as in `masked_pair`.
 
-    An alpha of at least `covered` counts; PhysTwin counts any but 0. Only the rendered one loses what the hand hides, so a part of
-    the observed mask under the hand counts against it.
+    An alpha of at least `covered` counts as object; PhysTwin counts any but 0. Only the rendered silhouette loses what the hand
+    hides, so a part of the observed mask under the hand lowers the IoU.
     """
     _check_bytes(object_mask.shape, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     return object_mask > 0, (rendered[..., 3] >= covered) & (hand_mask < 255)

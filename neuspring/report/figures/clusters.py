@@ -30,7 +30,7 @@ def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     """What is drawn: scenario, task, clusters (K), mean and std, mm, over seeds; the mean over scenarios has the scenario "".
 
-    `scores` are rows of `metrics.COLUMNS`, metres; methods that are not named clusters_<K> are ignored. The standard deviation
+    `scores` are rows of `metrics.COLUMNS`, meters; methods that are not named clusters_<K> are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.
     """
     methods = cluster_methods(scores["method"])
@@ -73,10 +73,10 @@ def clusters_figure(scores: pd.DataFrame, path: Path, note: str = "") -> Path | 
 
 
 def _draw(axis: Axes, curves: pd.DataFrame, *, faint: bool = False) -> None:
-    for task, (colour, marker) in STYLES.items():
+    for task, (color, marker) in STYLES.items():
         part = curves[curves["task"] == task]
         if faint:
-            axis.plot(part["clusters"], part["mean"], color=colour, lw=0.7, alpha=0.35)
+            axis.plot(part["clusters"], part["mean"], color=color, lw=0.7, alpha=0.35)
         elif len(part):
             bars = part["std"] if np.any(part["std"] > 0) else None
-            axis.errorbar(part["clusters"], part["mean"], bars, color=colour, marker=marker, ms=4, capsize=3, label=task)
+            axis.errorbar(part["clusters"], part["mean"], bars, color=color, marker=marker, ms=4, capsize=3, label=task)

@@ -19,13 +19,13 @@ from neuspring.scores.pictures import Pair
 from neuspring.splats.losses import Shot
 
 WORST = 0.5
-"""Colour difference, of 1, at the bright end of error pictures."""
+"""Color difference, of 1, at the bright end of error pictures."""
 BAR = 6
 """Height of the bar that shows the time, px."""
 TITLE = 20
 """Height of the line of names, px."""
 TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
-"""Colours of the two parts of the time."""
+"""Colors of the two parts of the time."""
 
 
 def error_picture(pair: Pair) -> np.ndarray:
@@ -112,16 +112,16 @@ class Film:
         return self._titled({"twin": picture}, frame)
 
     def _titled(self, panels: Mapping[str, np.ndarray], frame: int) -> np.ndarray:
-        """Panels side by side below their names and a bar of the time: training and future coloured, the border between white."""
+        """Panels side by side below their names and a bar of the time: training and future colored, the border between white."""
         picture = np.hstack(list(panels.values()))
         width, total, end = picture.shape[1], self._scenario.frame_count, self._scenario.train_end
         future = frame >= end
         title = np.zeros((TITLE, width, 3), np.uint8)
         for k, name in enumerate(panels):
             text = f"{name}, frame {frame} ({'future' if future else 'training'})" if k == 0 else name
-            colour = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
+            color = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
             place = (6 + k * width // len(panels), TITLE - 6)
-            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
         bar = np.zeros((BAR, width, 3), np.uint8)
         border, now = (round(width * k / total) for k in (end, frame + 1))
         for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):

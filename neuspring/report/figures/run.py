@@ -1,4 +1,4 @@
-"""Pictures of a run: errors over time, losses, predicted against observed points, and the twin (`figures_twin`)."""
+"""Figures of a run: errors over time, losses, predicted against observed points, and the twin (`figures.twin`)."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ SERIES = {
     "fit": (("loss", "frames trained on"), ("tail_loss", "held-back frames")),
     "train": (("loss", "training loss"),),
 }
-"""Stage -> metrics of its history that are drawn, and their labels."""
+"""Stage to the metrics of its history that are drawn, and their labels."""
 AXES = {"search": ("rollout", "training cost"), "fit": ("epoch", "loss [m$^2$]"), "train": ("step", "loss")}
-"""Stage -> labels of its axes. Losses of baselines are of several kinds: epochs or iterations, squared distances or silhouettes."""
+"""Stage to the labels of its axes. Baselines train by epochs or iterations, on squared distances or silhouettes."""
 
 
 def run_figures(
@@ -54,30 +54,30 @@ def run_figures(
     `searched` is the homogeneous stiffness that the search found, N, marked among the twin's.
     """
     title = f"{observations.scenario.name}, {method}"
-    made = []
+    paths = []
     # A picture of an earlier result must not stay beside this one's.
     for name in (*NAMES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
     if trajectory is not None and len(trajectory.positions):
-        made.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
-        made.append(save(_motion(observations, trajectory, title), folder / "motion.png"))
+        paths.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
+        paths.append(save(_motion(observations, trajectory, title), folder / "motion.png"))
     if histories:
-        made.append(save(_losses(histories, title), folder / "losses.png"))
+        paths.append(save(_losses(histories, title), folder / "losses.png"))
     if twin is not None:
-        made.append(save(topology_figure(twin, title), folder / "topology.png"))
+        paths.append(save(topology_figure(twin, title), folder / "topology.png"))
         if twin.topology.object_spring_count:
-            made.append(save(stiffness_figure(twin, searched, title), folder / "stiffness.png"))
-    return made
+            paths.append(save(stiffness_figure(twin, searched, title), folder / "stiffness.png"))
+    return paths
 
 
 def _errors(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
     seconds = np.arange(len(trajectory.positions)) / observations.scenario.frame_rate
-    for label, values, colour in (
+    for label, values, color in (
         ("track error (Euclidean)", track_error_per_frame(trajectory.positions, observations), "tab:blue"),
         ("Chamfer distance (L1)", chamfer_per_frame(trajectory.positions, observations), "tab:orange"),
     ):
-        axis.plot(seconds, MM * values, label=label, color=colour)
+        axis.plot(seconds, MM * values, label=label, color=color)
     split = observations.scenario.train_end / observations.scenario.frame_rate
     axis.axvspan(split, observations.scenario.frame_count / observations.scenario.frame_rate, color="0.92", label="future")
     axis.set(xlabel="time [s]", ylabel="error [mm]", title=title, ylim=(0, None), xlim=(0, None))
@@ -96,7 +96,7 @@ def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, f
         axis.plot(values.index / scenario.frame_rate, values, color="tab:blue")
         axis.axvspan(scenario.train_end / scenario.frame_rate, scenario.frame_count / scenario.frame_rate, color="0.92")
         axis.set(ylabel=metric.label, xlim=(0, None))
-    axes[0, 0].set_title(f"{scenario.name}, {method} (grey: future)")
+    axes[0, 0].set_title(f"{scenario.name}, {method} (gray: future)")
     axes[-1, 0].set_xlabel("time [s]")
     return save(figure, folder / IMAGE_SCORES)
 
@@ -120,8 +120,8 @@ def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
 
 def _scale(axis: Axes, history: pd.DataFrame, search: bool) -> None:
     """A log axis where the values ask for one; in the search only as high as candidates that were simulated."""
-    drawn = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
-    low, high = (drawn.min(), drawn.max()) if len(drawn) else (np.nan, np.nan)
+    values = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
+    low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
     if low > 0 and (search or high >= LOG_FROM * low):
         axis.set_yscale("log")
     else:
@@ -150,22 +150,22 @@ def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
 
 def _motion(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
     """Predicted nodes, observed points and the error of each, in two side views (rows) of a few frames (columns)."""
-    chosen = chosen_frames(observations.scenario, len(trajectory.positions))
+    frames = chosen_frames(observations.scenario, len(trajectory.positions))
     first = widest_axis(observations.nodes)
     views = [side_view(axis, observations.scenario.up) for axis in (first, 1 - first)]
-    shown = _shown_points(observations, trajectory, list(chosen))
+    shown = _shown_points(observations, trajectory, list(frames))
     bounds, heights = zip(*(_panel(view.project(shown)) for view in views), strict=True)
-    size = ((PANEL + 0.35) * len(chosen) + 0.5, sum(heights) + 2.1)
+    size = ((PANEL + 0.35) * len(frames) + 0.5, sum(heights) + 2.1)
     figure, axes = plt.subplots(
-        2, len(chosen), figsize=size, layout="constrained", sharex="row", sharey="row", squeeze=False, height_ratios=heights
+        2, len(frames), figsize=size, layout="constrained", sharex="row", sharey="row", squeeze=False, height_ratios=heights
     )
     errors = track_error_per_frame(trajectory.positions, observations)
     for row, view, bound in zip(axes, views, bounds, strict=True):
-        for axis, frame in zip(row, chosen, strict=True):
+        for axis, frame in zip(row, frames, strict=True):
             _draw_frame(axis, view, observations, trajectory, frame)
             axis.set(xlabel=view.labels[0], aspect="equal", xlim=bound[:, 0], ylim=bound[:, 1])
         row[0].set_ylabel(view.labels[1])
-    for axis, (frame, name) in zip(axes[0], chosen.items(), strict=True):
+    for axis, (frame, name) in zip(axes[0], frames.items(), strict=True):
         axis.set_title(f"frame {frame}: {name}\n{_error_text(observations, errors, frame)}", fontsize=9)
     handles, names = axes[0][0].get_legend_handles_labels()
     readable(figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8))
@@ -203,8 +203,8 @@ def _draw_frame(axis: Axes, view: View, observations: Observations, trajectory: 
     small = point_size(len(predicted))
     _scatter(axis, predicted, s=small, color="0.72", label="predicted nodes", zorder=1)
     some = f" (a random {MOST_ERRORS})" if len(pairs) > MOST_ERRORS else ""
-    drawn = list(pairs[sample(len(pairs), MOST_ERRORS)])
-    axis.add_collection(LineCollection(drawn, colors="0.3", linewidths=0.7, label=f"observed to predicted{some}", zorder=3))
+    lines = list(pairs[sample(len(pairs), MOST_ERRORS)])
+    axis.add_collection(LineCollection(lines, colors="0.3", linewidths=0.7, label=f"observed to predicted{some}", zorder=3))
     _scatter(axis, observed, s=point_size(len(observed)), color="tab:blue", label="observed points", zorder=2)
     hands = view.project(observations.controller_points[frame])
     _scatter(axis, hands, s=14, marker="D", color=CONTROLLER, label="controllers", zorder=4)

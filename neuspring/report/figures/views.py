@@ -40,12 +40,12 @@ class View:
     labels: tuple[str, str]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Picture coordinates [..., 2] of points [..., 3], metres; the second grows upwards in the picture."""
+        """Picture coordinates [..., 2] of points [..., 3], meters; the second grows upwards in the picture."""
         flat: np.ndarray = np.asarray(points, np.float64) @ np.array([self.right, self.upwards]).T
         return flat
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """Distance towards the viewer [...] of points [..., 3], metres."""
+        """Distance towards the viewer [...] of points [..., 3], meters."""
         towards: np.ndarray = np.asarray(points, np.float64) @ np.cross(self.right, self.upwards)
         return towards
 
@@ -96,7 +96,7 @@ class TwoViews:
     below: bool
     """Whether the second view lies below the first (from above) or beside it (other side)."""
     scale: float
-    """Inches per metre."""
+    """Inches per meter."""
 
     @classmethod
     def of(cls, points: np.ndarray, up: Up, width: float = 6.5, height: float = 5.2) -> TwoViews:

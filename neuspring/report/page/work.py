@@ -41,7 +41,7 @@ class Spent:
     waited: float
     memory: float
     gpu_memory: float | None
-    utilisation: float | None
+    utilization: float | None
 
 
 def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
@@ -61,7 +61,7 @@ def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
         waited=sum(a.waited for a in attempts),
         memory=max([a.peak_memory_mb for a in attempts], default=0.0),
         gpu_memory=max([a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None], default=None),
-        utilisation=float(np.average(used, weights=weights)) if sum(weights) else None,
+        utilization=float(np.average(used, weights=weights)) if sum(weights) else None,
     )
 
 
@@ -193,7 +193,7 @@ def _cost(group: Spent) -> list[Cell]:
         Cell(text=duration(group.waited) if group.gpu_seconds else DASH, value=group.waited),
         Cell(text=memory(group.memory), value=group.memory),
         Cell(text=memory(group.gpu_memory), value=group.gpu_memory or 0.0),
-        Cell(text=DASH if group.utilisation is None else f"{group.utilisation:.0f} %", value=group.utilisation or 0.0),
+        Cell(text=DASH if group.utilization is None else f"{group.utilization:.0f} %", value=group.utilization or 0.0),
     ]
 
 

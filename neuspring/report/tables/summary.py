@@ -174,20 +174,20 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
     runs = runs[[bool(facts) for facts in runs["images"]]]
     if not len(runs):
         return ["", "No scores of pictures: these scenarios have no images, or images.enabled is off."]
-    drawn = runs[["failed" not in facts for facts in runs["images"]]]
+    rendered = runs[["failed" not in facts for facts in runs["images"]]]
     pictured = scores[scores["metric"].isin([metric for _, metric in IMAGE_HEADINGS])] if len(scores) else scores
-    if not len(drawn) or not len(pictured):
+    if not len(rendered) or not len(pictured):
         reasons = sorted({str(facts["failed"]) for facts in runs["images"] if "failed" in facts})
         return ["", f"No scores of pictures: {'; '.join(reasons) or 'no run that can be compared has them'}."]
     have, asked = pictured["scenario"].nunique(), collected.runs["scenario"].nunique()
     some = "" if have == asked else f" Of {asked} scenarios {have} have scores of pictures."
     lines = ["", f"Pictures: PSNR in dB, SSIM and IoU, higher is better; LPIPS, lower is better.{some}", ""]
-    lines += [f"{_image_conditions(drawn['images'])} Mean over scenarios; in brackets the frame-weighted mean.", ""]
+    lines += [f"{_image_conditions(rendered['images'])} Mean over scenarios; in brackets the frame-weighted mean.", ""]
     lines += _method_table(pictured, collected.runs, runs, IMAGE_HEADINGS, NOT_COMPUTED)
-    lines += ["", f"Part of the surface that no camera sees in frame 0: {_unseen(drawn)}."]
+    lines += ["", f"Part of the surface that no camera sees in frame 0: {_unseen(rendered)}."]
     computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
     where = "in some runs " if "lpips" in computed else ""
-    reasons = sorted({str(facts["lpips"]) for facts in drawn["images"]} - {"computed"})
+    reasons = sorted({str(facts["lpips"]) for facts in rendered["images"]} - {"computed"})
     lines += [line for reason in reasons for line in ("", f"LPIPS {where}not computed: {reason}")]
     own = differences[differences["metric"].isin(computed)] if len(differences) else differences
     if len(own):
@@ -202,8 +202,8 @@ def _unseen(runs: pd.DataFrame) -> str:
     shares: dict[str, list[float | None]] = {}
     for scenario, facts in zip(runs["scenario"], runs["images"], strict=True):
         shares.setdefault(str(scenario), []).append(facts["unseen_surface"])
-    known = {name: [value for value in values if value is not None] for name, values in shares.items()}
-    return ", ".join(f"{name} {f'{np.mean(v):.0%}' if v else 'unknown (no shape prior)'}" for name, v in known.items())
+    numbers = {name: [value for value in values if value is not None] for name, values in shares.items()}
+    return ", ".join(f"{name} {f'{np.mean(v):.0%}' if v else 'unknown (no shape prior)'}" for name, v in numbers.items())
 
 
 def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
