@@ -1,4 +1,4 @@
-"""What a page is made of. Blocks hold data and text; the template turns them into HTML, and escapes every text."""
+"""The parts of a page. Blocks hold data and text. The template turns them into HTML and escapes every text."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Cell:
     chips: Sequence[Chip] = ()
     best: bool = False
     mark: str = ""
-    """Words for `best` that are read aloud."""
+    """Words for `best`, for screen readers."""
     tone: Tone = ""
     value: float | str | None = None
-    """What the column is sorted by; None: the text."""
+    """Key by which the column is sorted; None: the text."""
     wrap: bool = False
     """May take several lines."""
     link: str = ""
@@ -110,11 +110,11 @@ class Picture:
     caption: str
     alt: str
     data: str = ""
-    """Its source: a data URI, or on a page that shows files beside it their path."""
+    """Its source: a data URI, or the path of a file on a page that is not self-contained."""
     link: str = ""
     reason: str = ""
     wide: bool = False
-    """Keeps a width that can be read, and scrolls on small screens."""
+    """Keeps a readable width, and scrolls on small screens."""
     paper: bool = False
     """Drawn for a white page."""
     size: tuple[int, int] = (0, 0)
@@ -150,7 +150,7 @@ class Prose:
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """Text as it is."""
+    """Preformatted text."""
 
     kind: ClassVar[str] = "code"
     text: str
@@ -168,7 +168,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """Blocks that are shown on demand."""
+    """Blocks that are shown on a click."""
 
     kind: ClassVar[str] = "fold"
     summary: str

@@ -223,7 +223,7 @@ def score(trajectory: Trajectory, observations: Observations, method: str, seed:
 def score_tasks(
     trajectory: Trajectory, observations: Observations, method: str, seed: int, tasks: Mapping[str, range]
 ) -> pd.DataFrame:
-    """As `score`, for any tasks: name -> frames that it averages over."""
+    """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
     per_frame = {

@@ -52,7 +52,7 @@ class Study:
 
 
 def read_studies(path: Path) -> dict[str, Study]:
-    """The table of studies: name -> Study. Raises InputError."""
+    """The studies of a YAML file by name. Raises InputError."""
     studies = {name: parse(Study, row, f"{path}, study {name}") for name, row in read_yaml(path).items()}
     for name in studies:
         if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:

@@ -17,7 +17,7 @@ from neuspring.scores.metrics import averages
 NAME = "clusters.png"
 MM = 1e3
 MOST_PANELS = 4
-"""With more scenarios than this one panel shows their mean."""
+"""For more scenarios than this, one panel shows their mean."""
 STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
 
 
@@ -28,7 +28,7 @@ def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
 
 
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
-    """What is drawn: scenario, task, clusters (K), mean and std, mm, over seeds; the mean over scenarios has the scenario "".
+    """The curves: scenario, task, clusters (K), mean and std [mm] over seeds. Rows of the mean over scenarios have the scenario "".
 
     `scores` are rows of `metrics.COLUMNS`, meters; methods that are not named clusters_<K> are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.

@@ -68,12 +68,12 @@ class Strip:
         self._pairs: dict[int, Pair] = {}
 
     def add(self, frame: int, pair: Pair) -> None:
-        """Keep the frame if it is one to show."""
+        """Keep the pair if its frame is shown."""
         if frame in self._names:
             self._pairs[frame] = pair
 
     def save(self, path: Path) -> Path:
-        """Write the picture."""
+        """Write the figure."""
         count = max(len(self._pairs), 1)
         height, width = next(iter(self._pairs.values())).hands.shape if self._pairs else (9, 16)
         figure, axes = plt.subplots(
@@ -93,7 +93,7 @@ class Strip:
 
 
 class Film:
-    """Lays out the frames of the two videos: observed, predicted and difference side by side; the twin seen all around."""
+    """Lays out the frames of two videos: observed, predicted and difference side by side; the twin from all around."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -112,7 +112,7 @@ class Film:
         return self._titled({"twin": picture}, frame)
 
     def _titled(self, panels: Mapping[str, np.ndarray], frame: int) -> np.ndarray:
-        """Panels side by side below their names and a bar of the time: training and future colored, the border between white."""
+        """Panels side by side, below their names and a bar of time: training and future in colors, their border in white."""
         picture = np.hstack(list(panels.values()))
         width, total, end = picture.shape[1], self._scenario.frame_count, self._scenario.train_end
         future = frame >= end

@@ -48,7 +48,7 @@ def run_figures(
     twin: Twin | None = None,
     searched: float | None = None,
 ) -> list[Path]:
-    """Draw what a run has, and return the files.
+    """Draw the figures of a run, and return the files.
 
     errors.png and motion.png need a trajectory, losses.png a history, topology.png and stiffness.png the run's last twin.
     `searched` is the homogeneous stiffness that the search found, N, marked among the twin's.
@@ -119,7 +119,7 @@ def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
 
 
 def _scale(axis: Axes, history: pd.DataFrame, search: bool) -> None:
-    """A log axis where the values ask for one; in the search only as high as candidates that were simulated."""
+    """A log axis where values span a factor of `LOG_FROM`. A search axis leaves out candidates that could not be simulated."""
     values = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
     low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
     if low > 0 and (search or high >= LOG_FROM * low):
@@ -133,7 +133,7 @@ def _scale(axis: Axes, history: pd.DataFrame, search: bool) -> None:
 
 
 def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
-    """Frames to show, in order, and what each one is, of a trajectory of `frames` frames (fewer than the scenario's: diverged)."""
+    """Frames to show, in order, and their names. The trajectory has `frames` frames; it diverged if the scenario has more."""
     last = scenario.frame_count - 1
     # Where two fall together the later entry names the frame.
     named = {
@@ -175,7 +175,7 @@ def _motion(observations: Observations, trajectory: Trajectory, title: str) -> F
 
 
 def _shown_points(observations: Observations, trajectory: Trajectory, frames: list[int]) -> np.ndarray:
-    """Points [P, 3], m, that a picture of these frames must hold: all that was seen, and the prediction as far as it is near."""
+    """Points [P, 3], m, that a figure of these frames must show: all observed ones, and predicted ones near them."""
     seen = [observations.object_points[frame][observations.object_visibility[frame]] for frame in frames]
     real = np.concatenate([*seen, *observations.controller_points[frames], observations.nodes])
     # A prediction far away (before it diverges) must not shrink everything else to a dot.
@@ -213,7 +213,7 @@ def _draw_frame(axis: Axes, view: View, observations: Observations, trajectory: 
 
 
 def _error_text(observations: Observations, errors: np.ndarray, frame: int) -> str:
-    """The track error of a frame in words; metrics give 0 to a frame without annotation, a title must not."""
+    """The track error of a frame in words. Unlike the metric, it is not 0 for a frame without annotation."""
     annotated = ~np.isnan(observations.tracks[frame]).any(axis=1) & ~np.isnan(observations.tracks[0]).any(axis=1)
     return f"track error {MM * errors[frame]:.1f} mm" if annotated.any() else "no annotated track"
 

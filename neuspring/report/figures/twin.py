@@ -33,7 +33,7 @@ COLORS = "viridis"
 PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
 CONTROLLER = "tab:red"
 LEAST_RATIO = 2.0
-"""Smallest ratio of the ends of a stiffness axis, so that equal values, or nearly equal ones, are not blown up."""
+"""Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it."""
 DEEPEST = 1e4
 """Largest ratio of the ends of the color range."""
 BINS = 41
@@ -43,7 +43,7 @@ KEY, HISTOGRAM = 2.8, 3.3
 
 
 def region_colours(count: int) -> np.ndarray:
-    """One color [count, 4] per region, RGBA; none like the controllers' or the springs'."""
+    """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
     if count <= len(PALETTE):
         return to_rgba_array(PALETTE[:count])
     return np.asarray(colormaps["turbo"](np.linspace(0.05, 0.85, count)))
@@ -126,7 +126,7 @@ def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
 
 
 def widened(low: float, high: float) -> tuple[float, float]:
-    """The same range, or one of a factor of 2 about its middle if it is narrower."""
+    """The same range; a range narrower than a factor of 2 is widened to that about its geometric mean."""
     if high >= LEAST_RATIO * low:
         return low, high
     middle = float(np.sqrt(low * high))
@@ -183,7 +183,7 @@ def histogram_edges(stiffness: np.ndarray) -> np.ndarray:
 
 
 def floored(stiffness: np.ndarray) -> np.ndarray:
-    """Stiffness [S], N, with what lies more than a factor of 10^6 below the largest, 0 included, raised to that."""
+    """Stiffness [S], N. Values below the largest / 10^6 are raised to that."""
     raised: np.ndarray = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     return raised
 
@@ -193,7 +193,7 @@ def _newtons(value: float) -> str:
 
 
 def _histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float | None) -> None:
-    """Numbers of springs over log stiffness, in the colors of the views."""
+    """A histogram of springs over log stiffness, in the colors of the views."""
     shown = floored(stiffness)
     edges = histogram_edges(shown)
     counts, _ = np.histogram(shown, edges)

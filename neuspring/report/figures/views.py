@@ -1,4 +1,4 @@
-"""What pictures share: projections of the world, two views drawn at one scale, sizes that suit many points, and saving."""
+"""Helpers of figures: projections of the world, two views at one scale, sizes for many points, saving."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def place(figure: Figure, left: float, bottom: float, width: float, height: floa
 
 
 def headline(figure: Figure, title: str, text: str) -> None:
-    """A title and a line of text in the upper left corner, where they meet no legend."""
+    """A title and a line of text in the upper left corner, away from legends."""
     high = figure.get_size_inches()[1]
     figure.text(LEFT / figure.get_size_inches()[0], 1 - 0.1 / high, f"{title}\n{text}", ha="left", va="top", fontsize=10)
 
@@ -162,7 +162,7 @@ def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:
 
 
 def sample_note(count: int, most: int = MOST_SPRINGS) -> str:
-    """What a title says about springs that are left out; empty if none is."""
+    """The part of a title that says how many springs are drawn; empty if all are."""
     return "" if count <= most else f", a random {most} of them drawn"
 
 
@@ -177,7 +177,7 @@ def line_width(count: int) -> float:
 
 
 def readable(legend: Legend) -> None:
-    """Give the samples in a legend sizes that can be seen, however fine the lines and points they stand for."""
+    """Enlarge the samples in a legend, so that those of fine lines and points can be seen."""
     for handle in legend.legend_handles:
         if isinstance(handle, Line2D):
             handle.set_linewidth(1.3)

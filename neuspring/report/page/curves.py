@@ -1,4 +1,4 @@
-"""Curves: what the search found, how fits went, and errors over the frames; a panel per scenario, methods over one another."""
+"""Curves of search costs, losses, and errors over time: a panel per scenario with a line per method."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ FRAME = (0.16, 0.11, 0.77, 0.83)
 """Place of the axes in a panel. It is fixed because a computed layout takes most of the time."""
 FAINT = 0.5
 MOST_OPEN = 6
-"""Scenarios whose panels are shown at once; more are folded."""
+"""The panels of more scenarios than this are folded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """What one panel shows."""
+    """The lines of one panel."""
 
     by_name: Mapping[str, Mapping[int, pd.Series]]
-    """Name of a line to seed to values."""
+    """Name of the line, seed, values."""
     future: Scenario | None = None
     """The scenario whose future is marked, if any."""
 
@@ -47,7 +47,7 @@ class Plot:
     title: str
     about: str
     collect: Callable[[Material, str], Curves]
-    """From the material, of a scenario."""
+    """Reads the curves of a scenario."""
     of_methods: bool = True
     """Whether its lines are methods, which have the same style in all plots."""
     open: bool = False
@@ -91,7 +91,7 @@ def _search_row(run: Run) -> str:
 
 
 def _history(material: Material, run: Run, stage: str, metric: str) -> pd.Series | None:
-    """Values by step; None if the run has none."""
+    """Values of a metric by step; None if the run has none."""
     name = run.record.histories.get(stage)
     if not name:
         return None

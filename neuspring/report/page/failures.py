@@ -95,7 +95,7 @@ def _numerical(broken: pd.DataFrame) -> Table:
 
 
 def _matrix(runs: pd.DataFrame) -> Fold:
-    """Which runs there are: scenarios by methods, seeds counted."""
+    """A table of scenarios by methods that counts the finished seeds."""
     counts = runs.groupby(["scenario", "method", "status"]).size().to_dict()
     asked = set(zip(runs["scenario"], runs["method"], strict=True))
     scenarios, methods = (list(dict.fromkeys(runs[name])) for name in ("scenario", "method"))

@@ -16,7 +16,7 @@ import numpy as np
 from neuspring.report.blocks import Picture, Video
 
 QUALITY = 75
-"""Of WebP."""
+"""Quality of WebP pictures, of 100."""
 CHUNK = 32
 """How many pictures are made smaller at once."""
 NO_ROOM = "not embedded, to keep this page small"
@@ -58,21 +58,21 @@ class Media:
         return len(self._embedded)
 
     def picture(self, path: Path, caption: str, alt: str, *, wide: bool = False, paper: bool = False) -> Picture:
-        """A picture, or a link where it had no place."""
+        """A picture, or a link if it did not fit."""
         file = self._embedded.get(path)
         if file:
             return Picture(caption=caption, alt=alt, data=file.uri, size=file.size, wide=wide, paper=paper)
         return Picture(caption=caption, alt=alt, link=self.link(path), reason=self.damaged.get(path, NO_ROOM))
 
     def video(self, path: Path, caption: str, *, wide: bool = False) -> Video:
-        """A video, or a link where it had no place."""
+        """A video, or a link if it did not fit."""
         file = self._embedded.get(path)
         if file:
             return Video(caption=caption, data=file.uri, wide=wide)
         return Video(caption=caption, link=self.link(path), reason=self.damaged.get(path, NO_ROOM))
 
     def link(self, path: Path) -> str:
-        """The path from the page."""
+        """A link from the page to a file."""
         return link(path, self._folder)
 
     def _pictures(self, wanted: Sequence[Wanted], room: int) -> int:

@@ -133,7 +133,7 @@ def _by_method(values: Mapping[str, Any]) -> str:
 
 
 def _variants(runs: Iterable[Run]) -> Table | None:
-    """What each method is, from its runs."""
+    """The switches of each method, as its runs record them."""
     variants: dict[str, Mapping[str, Any]] = {}
     for run in runs:
         variants.setdefault(run.method, run.record.variant)

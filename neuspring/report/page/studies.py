@@ -133,7 +133,7 @@ def _values(study: Study, cells: pd.DataFrame, title: str) -> Table:
 
 
 def _table(cells: pd.DataFrame, title: str, first: Callable[[Any], Cell], value: Callable[[Any, Metric], Cell]) -> Table:
-    """A line per label: what `first` makes of any of its cells, then what `value` makes of each."""
+    """A line per label: its heading by `first`, then a cell per metric by `value`."""
     metrics = [IN_PAPER[name] for name in dict.fromkeys(cells["metric"])]
     rows = []
     for _, part in cells.groupby("label", sort=False):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -26,58 +25,6 @@ def place(rule: str) -> int:
     return ORDER.index(rule) if rule in ORDER else len(ORDER)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spent:
-    """What a group of jobs cost."""
-
-    name: str
-    jobs: int
-    failed: int
-    retries: int
-    seconds: tuple[float, ...]
-    """Wall time of each job, all its attempts."""
-    gpu_seconds: float
-    cpu_seconds: float
-    waited: float
-    memory: float
-    gpu_memory: float | None
-    utilization: float | None
-
-
-def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
-    """The cost of some jobs, their failed attempts included."""
-    attempts = [attempt for job in jobs for attempt in job.attempts]
-    on_gpu = [a for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
-    weights = [a.seconds * len(a.devices) for a in on_gpu]
-    used = [float(a.gpu_utilisation or 0.0) for a in on_gpu]
-    return Spent(
-        name=name,
-        jobs=len(jobs),
-        failed=sum(job.failed for job in jobs),
-        retries=sum(len(job.attempts) - 1 for job in jobs),
-        seconds=tuple(job.seconds for job in jobs),
-        gpu_seconds=sum(a.seconds * len(a.devices) for a in attempts),
-        cpu_seconds=sum(a.cpu_seconds for a in attempts),
-        waited=sum(a.waited for a in attempts),
-        memory=max([a.peak_memory_mb for a in attempts], default=0.0),
-        gpu_memory=max([a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None], default=None),
-        utilization=float(np.average(used, weights=weights)) if sum(weights) else None,
-    )
-
-
-def by_rule(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """In the order of the workflow."""
-    groups = _grouped(jobs, lambda job: job.rule)
-    return [spent(name, groups[name]) for name in sorted(groups, key=lambda name: (place(name), name))]
-
-
-def by_method(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """Jobs by method. Searches and splats, which methods share, have groups of their own."""
-    groups = _grouped(jobs, _owner)
-    groups.pop("", None)
-    return [spent(name, groups[name]) for name in sorted(groups)]
-
-
 def _grouped(jobs: Iterable[JobRecord], key: Callable[[JobRecord], str]) -> dict[str, list[JobRecord]]:
     groups: dict[str, list[JobRecord]] = defaultdict(list)
     for job in jobs:
@@ -97,14 +44,14 @@ def _owner(job: JobRecord) -> str:
 
 
 def _splats(folder: str) -> str:
-    """Whose splats lie in a folder: `shared`, or those of a method."""
+    """The owner of the splats in a folder: a method, or `shared`."""
     return folder.removeprefix("appearance").removeprefix("-") or "shared"
 
 
 def gpu_hours(material: Material) -> tuple[float | None, str]:
     """GPU-hours (None where nothing is known), and where they are from: job records, else run records."""
     if material.jobs:
-        return sum(a.seconds * len(a.devices) for job in material.jobs for a in job.attempts) / 3600, "job records"
+        return _gpu_seconds(material.jobs) / 3600, "job records"
     if not material.runs:
         return None, "no records"
     return sum(seconds for _, _, seconds, device, _ in _stages(material.runs) if device.startswith("cuda")) / 3600, "run records"
@@ -150,51 +97,56 @@ def _about(jobs: Sequence[JobRecord]) -> str:
 
 
 def _from_jobs(jobs: Sequence[JobRecord]) -> list[Block]:
-    blocks: list[Block] = [_costs("By step", "Step", by_rule(jobs), total=True)]
-    methods = by_method(jobs)
+    by_rule, by_method = _grouped(jobs, lambda job: job.rule), _grouped(jobs, _owner)
+    rules = sorted(by_rule, key=lambda name: (place(name), name))
+    steps = {name: by_rule[name] for name in rules} | ({"all": jobs} if len(rules) > 1 else {})
+    methods = {name: by_method[name] for name in sorted(by_method) if name}
+    blocks: list[Block] = [_costs("By step", "Step", steps, sortable=False)]
     if methods:
-        blocks.append(_costs("By method (searches and splats apart, since methods share them)", "Method", methods, total=False))
+        caption = "By method (searches and splats apart, since methods share them)"
+        blocks.append(_costs(caption, "Method", methods, sortable=True))
     return blocks
 
 
-def _costs(caption: str, what: str, groups: Sequence[Spent], *, total: bool) -> Table:
+def _costs(caption: str, what: str, groups: Mapping[str, Sequence[JobRecord]], *, sortable: bool) -> Table:
     header = [what, "Jobs", "Failed", "Retries", "Median", "Longest", "GPU-hours", "CPU-hours", "Waited", "Peak memory"]
     header += ["GPU memory", "GPU use"]
-    rows = [_cost(group) for group in groups]
-    if total and len(groups) > 1:
-        rows.append(
-            [
-                Cell(text="all", best=True),
-                *(_number(sum(getattr(group, name) for group in groups)) for name in ("jobs", "failed", "retries")),
-                Cell(text=""),
-                Cell(text=""),
-                *(_hours(sum(getattr(group, name) for group in groups)) for name in ("gpu_seconds", "cpu_seconds")),
-                Cell(text=duration(sum(group.waited for group in groups))),
-                Cell(text=memory(max(group.memory for group in groups))),
-                Cell(text=""),
-                Cell(text=""),
-            ]
-        )
-    note = "Waited: for a GPU. A GPU that two jobs share counts for both." if any(group.gpu_seconds for group in groups) else ""
-    return Table(caption=caption, header=header, rows=rows, sortable=not total, note=note)
+    rows = [_cost(name, jobs) for name, jobs in groups.items()]
+    on_gpu = any(attempt.devices for jobs in groups.values() for job in jobs for attempt in job.attempts)
+    note = "Waited: for a GPU. A GPU that two jobs share counts for both." if on_gpu else ""
+    return Table(caption=caption, header=header, rows=rows, sortable=sortable, note=note)
 
 
-def _cost(group: Spent) -> list[Cell]:
-    failed = Cell(text=str(group.failed), tone="bad" if group.failed else "", value=group.failed)
+def _cost(name: str, jobs: Sequence[JobRecord]) -> list[Cell]:
+    """The cost of some jobs, their failed attempts included."""
+    attempts = [attempt for job in jobs for attempt in job.attempts]
+    failed, retries = sum(job.failed for job in jobs), sum(len(job.attempts) - 1 for job in jobs)
+    seconds = [job.seconds for job in jobs]
+    median, longest = float(np.median(seconds)), max(seconds)
+    on_gpu, waited = _gpu_seconds(jobs), sum(a.waited for a in attempts)
+    peak = max((a.peak_memory_mb for a in attempts), default=0.0)
+    gpu_peak = max((a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None), default=None)
+    used = [(a.gpu_utilisation, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
+    weight = sum(weight for _, weight in used)
+    use = sum(percent * weight for percent, weight in used) / weight if weight else None
     return [
-        Cell(text=group.name),
-        _number(group.jobs),
-        failed,
-        _number(group.retries),
-        Cell(text=duration(float(np.median(group.seconds))), value=float(np.median(group.seconds))),
-        Cell(text=duration(max(group.seconds)), value=max(group.seconds)),
-        _hours(group.gpu_seconds),
-        _hours(group.cpu_seconds),
-        Cell(text=duration(group.waited) if group.gpu_seconds else DASH, value=group.waited),
-        Cell(text=memory(group.memory), value=group.memory),
-        Cell(text=memory(group.gpu_memory), value=group.gpu_memory or 0.0),
-        Cell(text=DASH if group.utilization is None else f"{group.utilization:.0f} %", value=group.utilization or 0.0),
+        Cell(text=name),
+        _number(len(jobs)),
+        Cell(text=str(failed), tone="bad" if failed else "", value=failed),
+        _number(retries),
+        Cell(text=duration(median), value=median),
+        Cell(text=duration(longest), value=longest),
+        _hours(on_gpu),
+        _hours(sum(a.cpu_seconds for a in attempts)),
+        Cell(text=duration(waited) if on_gpu else DASH, value=waited),
+        Cell(text=memory(peak), value=peak),
+        Cell(text=memory(gpu_peak), value=gpu_peak or 0.0),
+        Cell(text=DASH if use is None else f"{use:.0f} %", value=use or 0.0),
     ]
+
+
+def _gpu_seconds(jobs: Iterable[JobRecord]) -> float:
+    return sum(attempt.seconds * len(attempt.devices) for job in jobs for attempt in job.attempts)
 
 
 def _number(value: int) -> Cell:
@@ -231,7 +183,7 @@ def _from_runs(runs: Sequence[Run]) -> Table:
 
 
 def machines(runs: Iterable[Run]) -> dict[str, int]:
-    """Machine and device -> number of runs."""
+    """Machine and device to the number of runs."""
     counts: dict[str, int] = defaultdict(int)
     for run in runs:
         counts[f"{run.record.machine}; {run.record.device}"] += 1

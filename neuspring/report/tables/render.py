@@ -89,7 +89,7 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
 
 
 def interval_grid(cells: pd.DataFrame) -> Grid:
-    """The interval of our mean, and how far it lies from the paper's value; only what has finished."""
+    """The interval of our mean, and its distance from the paper's value, of finished rows."""
     finished = cells[cells["ours"].notna()]
     columns, lines = _columns(finished), list[Line]()
     compared = bool(finished["difference"].notna().any())
@@ -232,7 +232,7 @@ def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Metric]],
 
 
 def as_markdown(grid: Grid, level: str = "##") -> str:
-    """Heading, note and table."""
+    """Heading, note and table in Markdown."""
     header = [*grid.stub, *grid.headings]
     rows = [[*map(_plain, stub), *map(_marked, texts)] for stub, texts in grid.lines]
     parts = [f"{level} {grid.title}"] * bool(grid.title) + [grid.note] * bool(grid.note)

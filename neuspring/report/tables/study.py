@@ -44,7 +44,7 @@ from neuspring.scores.runs import Collected, collect, mixed_settings, pairs
 from neuspring.scores.studies import Study
 
 RELEASED_METHODS = ("phystwin", "baseline")
-"""Our rows for the method whose scores per scenario are released."""
+"""Our methods that stand for the released PhysTwin."""
 VERDICTS = (
     "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
     "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
@@ -61,14 +61,14 @@ NAMED = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """What a study's table was made of."""
+    """The runs that a study's table was made of."""
 
     __pydantic_config__ = STRICT
     name: Name
     study: Study
     scenarios: tuple[Name, ...]
     methods: tuple[Name, ...]
-    """Those of the study that the benchmark has."""
+    """The methods of the study that the benchmark has."""
     seeds: tuple[int, ...]
     left_out: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
     """Method to the scenarios to which it does not apply."""
@@ -80,7 +80,7 @@ class Made:
 
     @classmethod
     def load(cls, path: Path) -> Made:
-        """Raises InputError."""
+        """Read <name>.json. Raises InputError."""
         return parse(cls, read_json(path, RECORD_FORMAT), str(path))
 
 
@@ -174,7 +174,7 @@ def released_comparison(own: Collected, method: str) -> pd.DataFrame:
 
 
 def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
-    """With units, rows of one scenario or category in the study's order, groups as they first appear."""
+    """The table with units. Scenarios or categories keep their order; their rows are in the order of the study."""
     first = table.columns[0]
     ranks = {first: list(dict.fromkeys(table[first])), "label": list(study.rows)}
     ranks |= {"task": list(paper.TASKS), "metric": list(IN_PAPER)}
@@ -185,7 +185,7 @@ def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame, means: pd.DataFrame) -> list[Grid]:
-    """The blocks of the table that have lines; the note of the first says what every reader must know."""
+    """The grids that have lines. The note of the first one explains averages and verdicts."""
     kept = pairs(scores)
     which = f"Averages take the {kept} of {pairs(own.runs)} pairs of scenario and seed "
     which += "that every method with a finished run has finished."
@@ -230,7 +230,7 @@ def _curve(study: Study, scores: pd.DataFrame, path: Path) -> str:
 
 
 def _left_out(runs: pd.DataFrame, study: Study, name: str, own: Collected) -> str:
-    """The runs that averages do not take: failures one by one, others by their reason; and the rows without a method."""
+    """The runs that averages leave out, failures one by one and others by their reason, and the rows without a method."""
     asked = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
     lines = [
         f"- {label}: {method} is not among the methods of this benchmark"
