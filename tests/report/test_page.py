@@ -10,10 +10,12 @@ import pytest
 
 from neuspring import config
 from neuspring.core.errors import InputError
+from neuspring.report import gallery
 from neuspring.report.page import Options, studies, write
 from neuspring.report.page.prose import render
 from neuspring.report.page.words import duration, hours, signed
 from neuspring.scores import paper
+from neuspring.scores.runs import collect
 from neuspring.scores.studies import Study
 from tests.support import report_tree
 from tests.support.browser import Browser, chromium
@@ -406,6 +408,19 @@ def test_of_many_methods_six_are_drawn_and_the_page_says_which(many):
     assert "1 of 8 methods are drawn: m5." in section(report(many, shown=["m5"]), "curves")
     with pytest.raises(InputError, match="must be among the methods"):
         report(many, shown=["other"])
+
+
+def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
+    collected = collect(full, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1])
+    path = gallery.write(full, ["rope", "cloth", "zebra"], ["baseline", "neuspring"], 0, collected, tmp_path / "tables")
+    parser, page = Strict(), path.read_text()
+    parser.feed(page)
+    assert not parser.open
+    files = [target for target in parser.targets if not target.startswith("#")]
+    assert len([name for name in files if name.endswith(".mp4")]) == 8
+    assert all((path.parent / name).is_file() for name in files)
+    assert re.search(r"neuspring: training PSNR \[dB\] \d+\.\d+, IoU 0\.\d+; future PSNR", page)
+    assert "No pictures: no images, or no finished run." in section(page, "zebra")
 
 
 def test_numbers_read_well():
