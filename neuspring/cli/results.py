@@ -27,14 +27,15 @@ def tables(a: Namespace) -> None:
     """`neuspring tables`."""
     from neuspring.report import gallery
     from neuspring.report.tables import summary
+    from neuspring.scores.runs import collect, collect_transfers
 
-    collected = summary.collect(a.results, a.scenarios, a.methods, a.seeds, _read_left_out(a.left_out))
-    transfers = summary.collect_transfers(a.results, a.transfers, a.methods, a.seeds)
+    collected = collect(a.results, a.scenarios, a.methods, a.seeds, _read_left_out(a.left_out))
+    transfers = collect_transfers(a.results, a.transfers, a.methods, a.seeds)
     print(summary.write(collected, a.baseline or a.methods[0], a.output, transfers))
     print(f"Tables: {a.output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
-    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected.scores, a.output)}")
+    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected, a.output)}")
 
 
 def perception_table_options(parser: ArgumentParser) -> None:
@@ -67,7 +68,8 @@ def study_options(parser: ArgumentParser) -> None:
 
 def study(a: Namespace) -> None:
     """`neuspring study`."""
-    from neuspring.report.tables import study, summary
+    from neuspring.report.tables import study
+    from neuspring.scores.runs import read_scores
     from neuspring.scores.studies import read_studies
 
     studies = read_studies(a.table)
@@ -75,7 +77,7 @@ def study(a: Namespace) -> None:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(studies)}")
     definition, left_out = studies[a.study], _read_left_out(a.left_out)
     if a.scores:
-        collected = replace(summary.read_scores(a.scores), left_out=left_out)
+        collected = replace(read_scores(a.scores), left_out=left_out)
         print(study.write_collected(a.study, definition, collected, a.output))
     elif a.scenarios and a.methods and a.seeds:
         print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out))

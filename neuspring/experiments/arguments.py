@@ -12,7 +12,7 @@ from neuspring.config.select import select
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches
 
-TEMPLATES = Path(__file__).parents[1] / "report" / "page" / "templates"
+TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 
 
 class Arguments:

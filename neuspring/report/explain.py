@@ -1,13 +1,12 @@
 """Where a cell of a study's table comes from: every run behind it, its settings, code and data, and how to make it again.
 
-Everything is read from the records on disk, none of it from MLflow: the value is computed anew and compared with the table's, and
-all files that the runs' records name are checked against their digests.
+Everything is read from the records on disk, nothing from MLflow. The value is computed again and compared with the table's. All
+files that the records of the runs name are compared with their digests.
 """
 
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
 import math
 import shlex
@@ -21,20 +20,17 @@ import pandas as pd
 from neuspring import config
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
-from neuspring.core.records import RECORD_FORMAT, StageRecord, canonical, digest_file, read_json
-from neuspring.core.run_record import RESULT_ROLES
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.run_record import RESULT_ROLES, RUN_RECORD, RunRecord, key_of
 from neuspring.report.tables.cells import accounted, cells, counted, of_study
 from neuspring.report.tables.study import Made
-from neuspring.report.tables.summary import Collected, collect
 from neuspring.scores import paper
-from neuspring.scores.paper import MEASURES
+from neuspring.scores.metrics import IN_PAPER
+from neuspring.scores.runs import Collected, collect, one_line
 
-CONTENT = ("scenario", "method", "variant", "seed", "status", "reason", "notes", "settings", "data_digest")
-"""What the key of a run is taken of, beside its files; see `stages.score`."""
 FACTS = ("run_key", "source", "commit", "device", "machine", "started", "ended", "data_digest")
 PICTURE_STAGES = ("appearance", "render")
 """Their settings are those of `images` and of perception's lifting."""
-UNREADABLE = (InputError, OSError, KeyError, TypeError, AttributeError, ValueError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,11 +50,11 @@ class Behind:
     facts: Mapping[str, Any] = field(default_factory=dict)
     """`FACTS` of the record."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """What differs from the defaults, under the names that MLflow has too; the seed is left out."""
+    """Settings that differ from the defaults, under the names that MLflow shows; without the seed."""
     files: int = 0
     """Files that were compared with their digests."""
     problems: Sequence[str] = ()
-    """What is no longer as recorded."""
+    """Files that are no longer as recorded."""
     command: str = ""
     """Makes the run again."""
 
@@ -72,7 +68,7 @@ class Explanation:
     row: Mapping[str, Any]
     """The cell as in the table's CSV, from the records as they are now."""
     in_table: float | None
-    """What the table says."""
+    """The value in the table."""
     runs: Sequence[Behind]
     left_out: Sequence[Behind]
     not_applying: Sequence[str] = ()
@@ -80,7 +76,7 @@ class Explanation:
 
     @property
     def problems(self) -> list[str]:
-        """What does not hold: a table that is older than its runs, files that are not as recorded."""
+        """A table that is older than its runs, and files that are not as recorded."""
         ours = self.row["ours"]
         stale = [] if ours == self.in_table else [f"the table says {self.in_table}, its runs now say {ours}: make it again"]
         return stale + [f"{run.scenario} / seed {run.seed}: {text}" for run in self.runs for text in run.problems]
@@ -93,19 +89,19 @@ class Explanation:
 def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] = ()) -> Explanation:
     """Explain `cell`, named STUDY/ROW/TASK/METRIC, of the tables in `folder`.
 
-    ROW is a label or a method; labels, tasks and metrics may be shortened where that is clear, and the paper's names will do.
-    `configfiles` are those that the runs were made with, for the commands. Raises InputError for a cell that there is not, with
-    those that there are.
+    ROW is a label or a method. Labels, tasks and metrics may be shortened where only one fits; the paper's names work too.
+    `configfiles` are those that the runs were made with; the commands name them. Raises InputError for an unknown cell, and lists
+    the known ones.
     """
-    made, table = _find_table(cell, folder)
-    label, task, metric = _find_cell(cell, made, table)
-    found = of_study(made.study, collect(results, made.scenarios, made.methods, made.seeds, made.left_out))
-    wanted = (found.scores["task"] == task) & (found.scores["metric"] == metric)
-    own = Collected(found.scores[wanted], found.runs, left_out=found.left_out)
-    rows = _records(_only(cells(made.study, own), label, task, metric))
+    files, table = _find_table(cell, folder)
+    label, task, metric = _find_cell(cell, files, table)
+    study = of_study(files.study, collect(results, files.scenarios, files.methods, files.seeds, files.left_out))
+    wanted = (study.scores["task"] == task) & (study.scores["metric"] == metric)
+    own = Collected(study.scores[wanted], study.runs, left_out=study.left_out)
+    rows = _records(_only(cells(files.study, own), label, task, metric))
     if not rows:
-        remedy = f"Make the table again: snakemake {made.name}."
-        raise InputError(f"cell {cell!r}", f"the runs that {made.name}.csv was made of must be in {results}", "none", remedy)
+        remedy = f"Make the table again: snakemake {files.name}."
+        raise InputError(f"cell {cell!r}", f"the runs that {files.name}.csv was made of must be in {results}", "none", remedy)
     method = rows[0]["method"]
     values, scores = (
         {(run["scenario"], run["seed"]): run for run in _records(part[part["method"] == method])}
@@ -113,19 +109,19 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
     )
     runs: list[Behind] = []
     left: list[Behind] = []
-    for run in _records(accounted(made.study, own)):
+    for run in _records(accounted(files.study, own)):
         if run["method"] == method:
             key = (run["scenario"], run["seed"])
             why = run["why"] or ("" if key in scores else _without_value(key in values))
             (left if why else runs).append(_behind(run, why, values.get(key), Path(results), configfiles))
     before = _only(table, label, task, metric)["ours"]
     return Explanation(
-        cell=f"{made.name}/{label}/{task}/{metric}",
+        cell=f"{files.name}/{label}/{task}/{metric}",
         row={name: None if isinstance(value, float) and math.isnan(value) else value for name, value in rows[0].items()},
         in_table=None if before.isna().all() else float(before.iloc[0]),
         runs=runs,
         left_out=left,
-        not_applying=tuple(found.left_out.get(method, ())),
+        not_applying=tuple(own.left_out.get(method, ())),
     )
 
 
@@ -158,35 +154,35 @@ def _find_table(cell: str, folder: Path) -> tuple[Made, pd.DataFrame]:
     return Made.load(Path(folder) / f"{study}.json"), table
 
 
-def _find_cell(cell: str, made: Made, table: pd.DataFrame) -> tuple[str, str, str]:
+def _find_cell(cell: str, files: Made, table: pd.DataFrame) -> tuple[str, str, str]:
     """Label, task and metric of a cell. Labels may hold a slash."""
-    known = [f"{made.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
+    cells = [f"{files.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
     parts = cell.split("/")
     if len(parts) < 4:
-        raise InputError(f"cell {cell!r}", "a cell is STUDY/ROW/TASK/METRIC", None, _suggestions(cell, known))
-    labels = {label: label for label in made.study.rows}
-    labels |= {method: label for label, method in made.study.rows.items() if method not in labels}
+        raise InputError(f"cell {cell!r}", "a cell is STUDY/ROW/TASK/METRIC", None, _suggestions(cell, cells))
+    labels = {label: label for label in files.study.rows}
+    labels |= {method: label for label, method in files.study.rows.items() if method not in labels}
     label = _choose("/".join(parts[1:-2]), labels, "row", cell)
     tasks = {task: task for task in table["task"].unique()} | {theirs: ours for ours, theirs in paper.TASKS.items()}
     metrics = {
         name: metric
         for metric in table["metric"].unique()
-        for name in (MEASURES[metric].heading.lower(), MEASURES[metric].paper, metric)
+        for name in (IN_PAPER[metric].paper_heading.lower(), IN_PAPER[metric].paper_name, metric)
     }
     return label, _choose(parts[-2], tasks, "task", cell), _choose(parts[-1], metrics, "metric", cell)
 
 
 def _choose(word: str, options: Mapping[str, str], what: str, cell: str) -> str:
-    """The option that `word` names: in full, in another case, or as the beginning of one alone. Raises InputError."""
+    """The option that `word` names: in full, in another case, or as the beginning of only one. Raises InputError."""
     lower = word.lower()
     matches = [{options[word]}] if word in options else []
     matches += [{value for name, value in options.items() if name.lower() == lower}]
     matches += [{value for name, value in options.items() if name.lower().startswith(lower)}] if word else []
-    found = next((values for values in matches if values), set())
-    if len(found) != 1:
-        rule = f"must name one {what}" + (f"; it could be {', '.join(sorted(found))}" if found else "")
+    fitting = next((values for values in matches if values), set())
+    if len(fitting) != 1:
+        rule = f"must name one {what}" + (f"; it could be {', '.join(sorted(fitting))}" if fitting else "")
         raise InputError(f"cell {cell!r}", rule, repr(word), _suggestions(word, options))
-    return found.pop()
+    return fitting.pop()
 
 
 def _suggestions(word: str, options: Iterable[str]) -> str:
@@ -196,38 +192,37 @@ def _suggestions(word: str, options: Iterable[str]) -> str:
 
 
 def _behind(run: Mapping[str, Any], why: str, score: Mapping[str, Any] | None, results: Path, configfiles: Sequence[str]) -> Behind:
-    """All that the records say of a run."""
+    """All that the records tell of a run."""
     scenario, method, seed = run["scenario"], run["method"], run["seed"]
-    path = results / scenario / method / str(seed) / "run.json"
+    path = results / scenario / method / str(seed) / RUN_RECORD
     identity: dict[str, Any] = {"scenario": scenario, "seed": seed, "status": run["status"], "why": why}
     identity |= {"value": score["value"], "frames": score["frames"]} if score else {}
     if not path.is_file():
-        return Behind(**identity, command=rerun(results, scenario, method, seed, {}, configfiles))
+        return Behind(**identity, command=rerun(results, scenario, method, seed, None, configfiles))
     try:
-        record = read_json(path, RECORD_FORMAT)
+        record = RunRecord.load(path)
         files, problems = check_files(path, record, results / scenario / "observations.npz")
         return Behind(
             **identity,
             record=str(path),
-            facts={name: record[name] for name in FACTS},
-            settings=departures(record["settings"]),
+            facts={name: getattr(record, name) for name in FACTS},
+            settings=departures(record.settings),
             files=files,
             problems=problems,
             command=rerun(results, scenario, method, seed, record, configfiles),
         )
-    except UNREADABLE as error:
-        problem = f"{path}: damaged: {' '.join(str(error).split()) or type(error).__name__}"
-        return Behind(**identity, record=str(path), problems=[problem])
+    except (OSError, ValueError) as error:
+        return Behind(**identity, record=str(path), problems=[f"{path}: damaged: {one_line(error)}"])
 
 
-def check_files(path: Path, record: Mapping[str, Any], observations: Path) -> tuple[int, list[str]]:
-    """How many files of a run were compared with their digests, and what is no longer as recorded.
+def check_files(path: Path, record: RunRecord, observations: Path) -> tuple[int, list[str]]:
+    """How many files of a run were compared with their digests, and which are no longer as recorded.
 
-    The run's key is taken anew of its content, its scores and the results of its stages, so that a change of any shows.
+    The key of the run is computed again from its content, its scores and the results of its stages, so that any change shows.
     """
     stages: dict[str, StageRecord] = {}
     problems, files = [], 0
-    for name in record["artifacts"]["records"]:
+    for name in record.artifacts.get("records", []):
         place = path.parent / name
         try:
             stage = StageRecord.load(place)
@@ -241,48 +236,48 @@ def check_files(path: Path, record: Mapping[str, Any], observations: Path) -> tu
                 stage.file(role, place)
             except InputError as error:
                 problems.append(str(error))
-    made = {name: stage.files[role][1] for name, stage in stages.items() for role in RESULT_ROLES if role in stage.files}
-    scores = path.parent / record["scores_file"]
-    made["scores"] = digest_file(scores) if scores.is_file() else ""
-    key = hashlib.sha256(canonical([{name: record[name] for name in CONTENT}, made]).encode()).hexdigest()
-    if key != record["run_key"]:
+    digests = {name: stage.files[role][1] for name, stage in stages.items() for role in RESULT_ROLES if role in stage.files}
+    scores = path.parent / (record.scores_file or "")
+    digests["scores"] = digest_file(scores) if scores.is_file() else ""
+    if key_of(record.content, digests) != record.run_key:
         problems.append(f"{path}: its run_key is not that of its content, its scores and the results of its stages")
-    if observations.is_file() and digest_file(observations) != record["data_digest"]:
+    if observations.is_file() and digest_file(observations) != record.data_digest:
         problems.append(f"{observations}: other content than the run was scored on")
     return files + 1 + observations.is_file(), problems
 
 
 def departures(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Stage -> settings, as flat names of those that differ from the defaults; what has no default is always named."""
+    """The settings of every stage that differ from the defaults or have no default, under dotted names."""
     defaults = config.plain(config.Config())
     pictures = defaults["images"] | {"lift": defaults["perception"]["lift"]}
     models = {None: defaults, **defaults["baselines"]}
-    found: dict[str, Any] = {}
+    different: dict[str, Any] = {}
     for stage, values in settings.items():
-        # What trains a baseline's model has the settings of its section side by side.
+        # The settings of a baseline's training are those of the section of its model.
         of_model = models.get(values.get("model"), defaults)
-        _compare(values, pictures if stage in PICTURE_STAGES else of_model, stage, found)
-    return {name: value for name, value in sorted(found.items()) if not name.endswith(".seed")}
+        different |= _different(values, pictures if stage in PICTURE_STAGES else of_model, stage)
+    return {name: value for name, value in sorted(different.items()) if not name.endswith(".seed")}
 
 
-def _compare(values: Mapping[str, Any], defaults: Mapping[str, Any], prefix: str, found: dict[str, Any]) -> None:
+def _different(values: Mapping[str, Any], defaults: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    different: dict[str, Any] = {}
     for name, value in values.items():
         default = defaults.get(name)
         if isinstance(value, Mapping) and isinstance(default, Mapping):
-            _compare(value, default, f"{prefix}.{name}", found)
+            different |= _different(value, default, f"{prefix}.{name}")
         elif name not in defaults or value != default:
-            found[f"{prefix}.{name}"] = value
+            different[f"{prefix}.{name}"] = value
+    return different
 
 
-def rerun(results: Path, scenario: str, method: str, seed: int, record: Mapping[str, Any], configfiles: Sequence[str] = ()) -> str:
-    """The command that makes a run again, every stage of it; from the records that there are where it has not run."""
+def rerun(results: Path, scenario: str, method: str, seed: int, record: RunRecord | None, configfiles: Sequence[str] = ()) -> str:
+    """The command that makes a run again with all its stages, or that continues one without a record."""
     target = f"{results}/{scenario}/{method}/{seed}/run.json"
     words = ["snakemake", target, "--profile", "workflow/profiles/default", "--cores", "1"]
     words += ["--configfile", *configfiles] if configfiles else []
     words += ["--config", f"results={results}", f"only=scenario={scenario} method={method} seed={seed}"]
     if record:
-        # A baseline's model has a rule of its own for its rollout.
-        model = record["variant"].get("model")
-        rules = ["predict" if model and stage == "rollout" else stage for stage in record["settings"]]
-        words += [f"device={str(record['device']).partition(':')[0]}", "--forcerun", *rules, "score"]
+        # A baseline's model has its own rule for the rollout.
+        rules = ["predict" if record.model and stage == "rollout" else stage for stage in record.settings]
+        words += [f"device={record.device.partition(':')[0]}", "--forcerun", *rules, "score"]
     return shlex.join(words)

@@ -10,62 +10,60 @@ from typing import Any
 
 import numpy as np
 
+from neuspring.core.markdown import markdown
 from neuspring.core.records import canonical
 from neuspring.report.explain import Behind, Explanation
-from neuspring.report.tables.render import number, our_change, paper_change
+from neuspring.report.tables.render import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
-from neuspring.scores.layout import markdown
-from neuspring.scores.paper import MEASURES, Measure
+from neuspring.scores.metrics import DASH, IN_PAPER, Metric
 
 SHORT = 12
 """Characters of a digest; --json has all."""
 
+COMMANDS = """Commands make the run and all its stages again and replace these files: check out the commit of the run first.
+To keep the files, give another folder: --config results=... The commands need the --configfile and --config of the
+benchmark; give --configfile to this command too. The same seed on the same type of device gives the same run_key."""
 
-def text(found: Explanation) -> str:
-    """The value, the runs behind it, those left out, and what does not hold."""
-    measure = MEASURES[found.row["metric"]]
-    lines = [f"{found.cell} (method {found.row['method']})", "", *_value(found, measure), ""]
-    lines += _runs(found.runs)
-    if found.not_applying:
-        lines += ["", *left_out_lines({found.row["method"]: found.not_applying})]
-    elif not found.runs and not found.left_out:
-        lines.append(f"{found.row['method']} was not among the methods of the benchmark.")
-    if found.left_out:
-        lines += ["", f"Left out: {len(found.left_out)}", ""]
-        lines += [f"- {run.scenario} / seed {run.seed}: {run.why}{_command(run)}" for run in found.left_out]
-    if found.runs:
+
+def text(explanation: Explanation) -> str:
+    """The value, the runs behind it, the runs left out, and what is not as recorded."""
+    metric = IN_PAPER[explanation.row["metric"]]
+    lines = [f"{explanation.cell} (method {explanation.row['method']})", "", *_value(explanation, metric), ""]
+    lines += _runs(explanation.runs)
+    if explanation.not_applying:
+        lines += ["", *left_out_lines({explanation.row["method"]: explanation.not_applying})]
+    elif not explanation.runs and not explanation.left_out:
+        lines.append(f"{explanation.row['method']} was not among the methods of the benchmark.")
+    if explanation.left_out:
+        lines += ["", f"Left out: {len(explanation.left_out)}", ""]
+        lines += [f"- {run.scenario} / seed {run.seed}: {run.why}{_command(run)}" for run in explanation.left_out]
+    if explanation.runs:
         lines += ["", 'In MLflow (`neuspring ui`), a run has the tag run_key: search for tags.run_key = "...".']
-        lines.append(
-            "Commands make the run and all its stages again, in place of these: check out the commit of the run first, and"
-        )
-        lines.append("to keep these give another folder, --config results=... They need the --configfile and --config of the")
-        lines.append("benchmark; name them to this command too (--configfile). The same seed on the same type of device gives the")
-        lines.append("same run_key.")
-    checked = sum(run.files for run in found.runs)
-    lines += ["", f"{checked} files compared with their digests; {len(found.problems) or 'nothing'} not as recorded"]
-    lines += [f"- {problem}" for problem in found.problems]
+        lines.append(COMMANDS)
+    checked = sum(run.files for run in explanation.runs)
+    lines += ["", f"{checked} files compared with their digests; {len(explanation.problems) or 'nothing'} not as recorded"]
+    lines += [f"- {problem}" for problem in explanation.problems]
     return "\n".join(lines) + "\n"
 
 
-def _value(found: Explanation, measure: Measure) -> list[str]:
-    row = {name: np.nan if value is None else value for name, value in found.row.items()}
-    cell: Any = SimpleNamespace(**row)
-    unit = f" {measure.unit}" * bool(measure.unit)
-    kind = "scenarios weigh equally" if measure.average == "equal" else "scenarios weigh by their frames"
-    lines = [f"ours     {number(cell.ours, measure)}{unit}"]
+def _value(explanation: Explanation, metric: Metric) -> list[str]:
+    cell: Any = SimpleNamespace(**{name: np.nan if value is None else value for name, value in explanation.row.items()})
+    unit = f" {metric.paper_unit}" * bool(metric.paper_unit)
+    kind = "scenarios weigh equally" if metric.average == "equal" else "scenarios weigh by their frames"
+    ours = f"ours     {metric.paper_text(cell.ours)}{unit}"
+    lines = [ours]
     if np.isfinite(cell.ours):
-        lines = [
-            f"ours     {number(cell.ours, measure)}{unit} ({cell.ours!r}): {cell.scenarios} scenarios, {cell.seeds} seeds, {kind}"
-        ]
-        lines.append(f"         the other average: {number(cell.other_average, measure)}{unit}")
+        lines = [f"{ours} ({cell.ours!r}): {cell.scenarios} scenarios, {cell.seeds} seeds, {kind}"]
+        lines.append(f"         the other average: {metric.paper_text(cell.other_average)}{unit}")
     if np.isfinite(cell.spread):
-        lines.append(f"         ± {number(cell.spread, measure)} over seeds")
+        lines.append(f"         ± {metric.paper_text(cell.spread)} over seeds")
     if np.isfinite(cell.low):
-        lines.append(f"         95 % bootstrap interval: [{number(cell.low, measure)}, {number(cell.high, measure)}]")
-    lines.append(f"paper    {cell.paper or '–'}{unit * bool(cell.paper)}; ours - paper: {number(cell.difference, measure, '+')}")
+        lines.append(f"         95 % bootstrap interval: [{metric.paper_text(cell.low)}, {metric.paper_text(cell.high)}]")
+    difference = metric.paper_text(cell.difference, "+")
+    lines.append(f"paper    {cell.paper or DASH}{unit * bool(cell.paper)}; ours - paper: {difference}")
     lines.append(f"verdict  {cell.verdict}")
     if cell.label != cell.baseline:
-        change = f"paper {paper_change(cell, measure)}, ours {our_change(cell, measure)}"
+        change = f"paper {paper_change(cell, metric)}, ours {our_change(cell, metric)}"
         lines.append(f"change   against {cell.baseline}: {change}: {cell.direction}")
     return lines
 
@@ -77,9 +75,15 @@ def _runs(runs: Sequence[Behind]) -> list[str]:
     groups = {canonical(run.settings): run for run in runs}
     rows = [
         [
-            *(run.scenario, str(run.seed), f"{run.value!r}", str(run.frames), run.status),
-            *(_commit(str(run.facts.get("commit", ""))), str(run.facts.get("device", "?"))),
-            *(str(run.facts.get("data_digest", "?"))[:SHORT], _digest(run)),
+            run.scenario,
+            str(run.seed),
+            repr(run.value),
+            str(run.frames),
+            run.status,
+            _commit(str(run.facts.get("commit", ""))),
+            str(run.facts.get("device", "?")),
+            str(run.facts.get("data_digest", "?"))[:SHORT],
+            _digest(run),
             f"{len(run.problems)} not as recorded" if run.problems else "as recorded",
         ]
         for run in runs

@@ -1,4 +1,4 @@
-"""Pictures to a video that any browser plays: H.264 (libx264) in MP4, yuv420p, BT.709 colours, through PyAV."""
+"""Pictures to a video that any browser plays: H.264 (libx264) in MP4, yuv420p, BT.709 colors, through PyAV."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Video:
     def add(self, picture: np.ndarray) -> None:
         """Append a picture [H, W, 3] uint8 RGB; all have one size.
 
-        An odd width or height grows by one pixel, the edge repeated, because colours are stored at half resolution.
+        An odd width or height grows by one pixel, the edge repeated, because colors are stored at half resolution.
         """
         where, number = self._path, self._count
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:

@@ -44,16 +44,16 @@ def _check_bytes(shape: tuple[int, ...], **pictures: np.ndarray) -> None:
 def masked_pair(
     observed: np.ndarray, object_mask: np.ndarray, rendered: np.ndarray, hand_mask: np.ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(observed, rendered) as compared by PhysTwin, each [3, H, W] float32 in [0, 1].
+    """(observed, rendered) as PhysTwin compares them, each [3, H, W] float32 in [0, 1].
 
-    Takes bytes: observed [H, W, 3], object mask [H, W], rendered over black [H, W, 4], hand mask [H, W]. Observed is cut to the
-    object, both lose what the hand hides. Masks weigh by their value / 255. The rendered picture is not cut to the object.
+    Takes bytes: observed [H, W, 3], object mask [H, W], rendered over black [H, W, 4], hand mask [H, W]. The observed picture is
+    cut to the object, the rendered one is not. Both lose what the hand hides. Masks weigh by their value / 255.
     """
     _check_bytes(observed.shape[:2], observed=observed, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     shown = 1.0 - hand_mask / 255.0
     truth = observed * (object_mask / 255.0 * shown / 255.0)[..., None]
-    drawn = rendered[..., :3] * (shown / 255.0)[..., None]
-    first, second = (torch.from_numpy(p.transpose(2, 0, 1).astype(np.float32)) for p in (truth, drawn))
+    prediction = rendered[..., :3] * (shown / 255.0)[..., None]
+    first, second = (torch.from_numpy(p.transpose(2, 0, 1).astype(np.float32)) for p in (truth, prediction))
     return first, second
 
 
@@ -62,8 +62,8 @@ def silhouettes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(observed, rendered) silhouettes whose IoU is reported, each [H, W] bool; inputs as in `masked_pair`.
 
-    An alpha of at least `covered` counts; PhysTwin counts any but 0. Only the rendered one loses what the hand hides, so a part of
-    the observed mask under the hand counts against it.
+    An alpha of at least `covered` counts as object; PhysTwin counts any but 0. Only the rendered silhouette loses what the hand
+    hides, so a part of the observed mask under the hand lowers the IoU.
     """
     _check_bytes(object_mask.shape, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     return object_mask > 0, (rendered[..., 3] >= covered) & (hand_mask < 255)

@@ -1,8 +1,8 @@
 """LPIPS, the perceptual distance of two pictures (Zhang et al. 2018): AlexNet features under the linear heads v0.1.
 
 d(a, b) = sum over the five ReLUs l of the mean over pixels of w_l . (f_l(a) - f_l(b))^2, f_l of unit length over its channels.
-AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so torchvision is not needed. Its weights and
-the heads are files (`lpips_weights`); nothing is downloaded.
+AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so that torchvision is not needed. Its
+weights and the heads are files (`lpips_weights`); nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ WINDOWS = (11, 5, 3, 3, 3)
 STRIDES = (4, 1, 1, 1, 1)
 PADDINGS = (2, 2, 1, 1, 1)
 LAYERS = (0, 3, 6, 8, 10)
-"""Places of the convolutions in torchvision's `features`."""
+"""Indices of the convolutions in torchvision's `features`."""
 POOLED = (1, 2)
-"""Convolutions after a max-pooling of 3 px, stride 2."""
+"""Convolutions that follow a max-pooling of 3 px, stride 2."""
 SMALLEST = 31
 """px: below it nothing is left after the second pooling."""
 SHIFT = (-0.030, -0.088, -0.188)
@@ -63,14 +63,14 @@ class Lpips:
         return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
-        """What follows each ReLU [B, channels, h, w], of normalised pictures [B, 3, H, W]."""
-        found = []
+        """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""
+        layers = []
         for k, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
             if k in POOLED:
                 pictures = max_pool2d(pictures, 3, 2)
             pictures = relu(conv2d(pictures, kernel, bias, STRIDES[k], PADDINGS[k]))
-            found.append(pictures)
-        return found
+            layers.append(pictures)
+        return layers
 
     def __call__(self, a: torch.Tensor, b: torch.Tensor, *, released_range: bool = False) -> torch.Tensor:
         """Distances [...] of pictures [..., 3, H, W] in [0, 1], at least 31 px wide and high; 0 for equal ones. Differentiable.

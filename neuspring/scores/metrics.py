@@ -1,23 +1,162 @@
-"""What is reported: Chamfer distance and track error (as in the released evaluation) and scores of pictures, per frame and per
-task, both averages.
+"""The metrics: what they measure, how tables show them, and the functions that compute them.
 
-Chamfer: each visible observed point to its nearest surface node, single direction, in the L1 norm |dx| + |dy| + |dz|.
-Track: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
+Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
+Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
+Both follow the released evaluation of PhysTwin. Metrics of pictures are in `images` and `lpips`.
+
+pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
+
+To add a metric, write its function, add its values in `score_tasks` or `pictures.picture_scores`, and declare it in `METRICS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import pandas as pd
-from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from scipy.spatial import cKDTree
+
 TASKS = ("reconstruction", "future")
-UNITS = {"chamfer": "m", "track_error": "m", "psnr": "dB", "ssim": "1", "lpips": "1", "iou": "1"}
+SHORT = {"reconstruction": "Recon.", "future": "Future"}
+"""Tasks in headings of columns."""
 COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
+DASH = "–"
+"""Stands for a value that there is not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """A metric, and how tables show it: in summaries, and beside the paper's values in the units and digits of the paper."""
+
+    name: str
+    title: str
+    """In words, for legends."""
+    heading: str
+    unit: str
+    """Of stored values; 1 for plain numbers."""
+    factor: float = 1.0
+    """From the stored unit to that of summaries."""
+    digits: int
+    """After the point, in summaries."""
+    higher_is_better: bool = False
+    relative: bool = True
+    """Whether a change in per cent means something. It does not in dB."""
+    of_pictures: bool = False
+    average: Literal["equal", "frames"] = "equal"
+    """How the paper averages over scenarios: equally, or weighted by their frames."""
+    tolerance: float
+    """Largest difference, in the stored unit, from a published value of the same data that conformance checks allow.
+
+    Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another drawing
+    in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie between, none was at hand.
+    """
+    paper_name: str
+    """In paper_tables.csv."""
+    paper_heading: str
+    paper_unit: str
+    """Empty for plain numbers."""
+    paper_factor: float = 1.0
+    """From the stored unit to the paper's."""
+    paper_digits: int
+    """After the point, for our values beside the paper's."""
+
+    @property
+    def other_average(self) -> Literal["equal", "frames"]:
+        """The average that the paper does not use for this metric."""
+        return "frames" if self.average == "equal" else "equal"
+
+    @property
+    def label(self) -> str:
+        """For an axis: heading and unit."""
+        return self.heading if self.unit == "1" else f"{self.heading} [{self.unit}]"
+
+    @property
+    def paper_column(self) -> str:
+        """The paper's heading with an arrow that says which direction is better."""
+        return f"{self.paper_heading} {'↑' if self.higher_is_better else '↓'}"
+
+    def text(self, value: float, sign: str = "") -> str:
+        """A stored value as summaries print it."""
+        return f"{self.factor * value:{sign}.{self.digits}f}"
+
+    def paper_text(self, value: float, sign: str = "") -> str:
+        """A value in the paper's unit; a dash for NaN."""
+        return DASH if np.isnan(value) else f"{value:{sign}.{self.paper_digits}f}"
+
+
+_ALL = (
+    Metric(
+        name="chamfer", title="Chamfer distance", heading="CD", unit="m", factor=1e3, digits=2, tolerance=1e-6,
+        paper_name="cd", paper_heading="CD", paper_unit="m", paper_digits=5,
+    ),
+    Metric(
+        name="track_error", title="track error", heading="TE", unit="m", factor=1e3, digits=2, tolerance=1e-6,
+        paper_name="track_error", paper_heading="TE", paper_unit="m", paper_digits=5,
+    ),
+    Metric(
+        name="psnr", title="PSNR", heading="PSNR", unit="dB", digits=2, tolerance=0.02, relative=False,
+        higher_is_better=True, of_pictures=True, average="frames",
+        paper_name="psnr", paper_heading="PSNR", paper_unit="dB", paper_digits=3,
+    ),
+    Metric(
+        name="ssim", title="SSIM", heading="SSIM", unit="1", digits=4, tolerance=5e-4,
+        higher_is_better=True, of_pictures=True, average="frames",
+        paper_name="ssim", paper_heading="SSIM", paper_unit="", paper_digits=3,
+    ),
+    Metric(
+        name="lpips", title="LPIPS", heading="LPIPS", unit="1", digits=4, tolerance=5e-4, of_pictures=True, average="frames",
+        paper_name="lpips", paper_heading="LPIPS", paper_unit="", paper_digits=3,
+    ),
+    Metric(
+        name="iou", title="IoU", heading="IoU", unit="1", digits=3, tolerance=2e-3,
+        higher_is_better=True, of_pictures=True, average="frames",
+        paper_name="iou", paper_heading="IoU %", paper_unit="%", paper_factor=100.0, paper_digits=1,
+    ),
+)  # fmt: skip
+METRICS = {metric.name: metric for metric in _ALL}
+"""By name, in the order of summaries. Tolerances of distances are those of single precision and its order of summation. Pictures
+agree within 1e-6 dB with a drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU. Other rasterizers
+lie between."""
+IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
+"""The metrics of the paper's tables, in its order."""
+DISTANCES = tuple(metric for metric in _ALL if not metric.of_pictures)
+PICTURES = tuple(metric for metric in _ALL if metric.of_pictures)
+UNITS = {metric.name: metric.unit for metric in _ALL}
+Headings = Mapping[tuple[str, str], str]
+"""Task and metric to the heading of their column."""
+HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in DISTANCES}
+IMAGE_HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in PICTURES}
+TRANSFER_HEADINGS = {("transfer", m.name): f"Transfer {m.heading}" for m in DISTANCES}
+
+
+def present(table: pd.DataFrame) -> set[tuple[str, str]]:
+    """The pairs of task and metric that a table has rows of."""
+    return set(zip(table["task"], table["metric"], strict=True))
+
+
+def headings_of(table: pd.DataFrame) -> Headings:
+    """Headings of all distances, and of the metrics of pictures that a table has rows of."""
+    columns = present(table)
+    return HEADINGS | {key: text for key, text in IMAGE_HEADINGS.items() if key in columns}
+
+
+def _tree(points: np.ndarray) -> cKDTree:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points.astype(np.float64))
+
+
+def _table(rows: Iterable[tuple[object, ...]]) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarray, surface: int) -> float:
@@ -25,7 +164,7 @@ def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarra
     seen = points[visible].astype(np.float64)
     if not len(seen):
         return float("nan")
-    return float(cKDTree(nodes[:surface].astype(np.float64)).query(seen, p=1)[0].mean())
+    return float(_tree(nodes[:surface]).query(seen, p=1)[0].mean())
 
 
 def chamfer_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
@@ -45,7 +184,7 @@ def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
     if not matched.any():
         return np.full(len(positions), np.nan)
     tracks = tracks.astype(np.float64)
-    index = cKDTree(positions[0].astype(np.float64)).query(tracks[0][matched])[1]
+    index = _tree(positions[0]).query(tracks[0][matched])[1]
     error = np.linalg.norm(positions[:, index].astype(np.float64) - tracks[:, matched], axis=2)
     valid = annotated[:, matched]
     count = valid.sum(axis=1)
@@ -67,18 +206,19 @@ def task_frames(scenario: Scenario, task: str) -> range:
     return range(1, scenario.train_end) if task == "reconstruction" else range(scenario.train_end, scenario.frame_count)
 
 
-def held(trajectory: Trajectory | None, observations: Observations) -> Trajectory:
-    """A trajectory of all frames: the last one, at least frame 0, is held where the rollout ended early."""
+def last_frame_frozen(trajectory: Trajectory | None, observations: Observations) -> Trajectory:
+    """A trajectory of all frames: where the rollout ended early, its last frame (frame 0 if there is none) stands for the rest."""
     frames = observations.scenario.frame_count
-    known = observations.nodes[None] if trajectory is None or not len(trajectory.positions) else trajectory.positions
-    still = np.repeat(known[-1:], frames - len(known), axis=0)
-    return Trajectory(positions=np.concatenate([known, still]), frame_count=frames)
+    empty = trajectory is None or not len(trajectory.positions)
+    positions = observations.nodes[None] if trajectory is None or empty else trajectory.positions
+    rest = np.repeat(positions[-1:], frames - len(positions), axis=0)
+    return Trajectory(positions=np.concatenate([positions, rest]), frame_count=frames)
 
 
 def score(trajectory: Trajectory, observations: Observations, method: str, seed: int) -> pd.DataFrame:
-    """Tidy scores, one row per task and metric. Rows that cannot be computed are left out, never NaN:
+    """Tidy scores, one row per task and metric.
 
-    a task without frames, a metric without annotation, a task that the rollout diverged in.
+    There is no row, and never NaN, for a task without frames, a metric without annotation, a task that the rollout diverged in.
     """
     tasks = {task: task_frames(observations.scenario, task) for task in TASKS}
     return score_tasks(trajectory, observations, method, seed, tasks)
@@ -87,7 +227,7 @@ def score(trajectory: Trajectory, observations: Observations, method: str, seed:
 def score_tasks(
     trajectory: Trajectory, observations: Observations, method: str, seed: int, tasks: Mapping[str, range]
 ) -> pd.DataFrame:
-    """As `score`, for any tasks: name -> frames that it averages over."""
+    """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
     per_frame = {
@@ -103,14 +243,14 @@ def score_tasks(
             if len(usable):
                 identity = (scenario.name, scenario.category, method, seed, task, metric)
                 rows.append((*identity, float(usable.mean()), UNITS[metric], len(usable)))
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return _table(rows)
 
 
 def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int) -> pd.DataFrame:
-    """Tidy scores of pictures from `frames` (columns frame, camera, metric, value), of which the first `drawn` frames exist.
+    """Tidy scores of pictures from `frames` (columns frame, camera, metric, value). The prediction has `drawn` frames.
 
-    Cameras are averaged within a frame, then frames; a task that the rollout diverged in is left out. An infinite PSNR (nothing but
-    black on both sides) is left out of the mean.
+    Cameras are averaged within a frame, then frames. A task that the rollout diverged in has no row. The mean leaves out an
+    infinite PSNR, which pictures have that are black on both sides.
     """
     rows = []
     frames = frames[np.isfinite(frames["value"])]
@@ -123,15 +263,15 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
             per_frame = values.groupby("frame")["value"].mean()
             identity = (scenario.name, scenario.category, method, seed, task, metric)
             rows.append((*identity, float(per_frame.mean()), UNITS[str(metric)], len(per_frame)))
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return _table(rows)
 
 
 def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:
     """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
 
-    The paper mixes the two (equal for Chamfer and track, frame-weighted for images), so both are kept. Seeds are averaged
-    within each scenario first; `seed_std` is the standard deviation over seeds of the equal average (0 for one seed), over the
-    seeds that have every scenario (NaN where fewer than two of several do).
+    The paper uses the first for distances and the second for pictures. Seeds are averaged within each scenario first. `seed_std` is
+    the standard deviation over seeds of the equal average, of the seeds that have every scenario: 0 for one seed, NaN where there
+    are several seeds and fewer than two of them have every scenario.
     """
     keys = list(by)
     groups = scores.groupby([*keys, "scenario"], sort=False)

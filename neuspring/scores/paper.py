@@ -6,13 +6,15 @@ import csv
 import functools
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
+
+from neuspring.scores.metrics import IN_PAPER
 
 if TYPE_CHECKING:
     import pandas as pd
 
 TASKS = {"reconstruction": "reconstruction_resimulation", "future": "future_prediction"}
-"""Our tasks -> the paper's."""
+"""Our tasks to the paper's."""
 UNDERLINED = ("table1_comparison", "table3_network")
 """Tables in which the paper underlines the second best; in all of them the best is bold."""
 CLUSTER_CLAIM = (
@@ -20,46 +22,6 @@ CLUSTER_CLAIM = (
     "It takes K = 5 everywhere."
 )
 _MEANS = "MEAN22"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measure:
-    """A metric as the paper prints it."""
-
-    name: str
-    """Ours."""
-    paper: str
-    """Its name in paper_tables.csv."""
-    heading: str
-    unit: str
-    """The paper's; empty for a plain number."""
-    higher: bool
-    """Higher is better."""
-    average: Literal["equal", "frames"]
-    """How the paper averages over scenarios: equally, or weighted by their frames."""
-    digits: int
-    """After the point, where tables print ours."""
-    factor: float = 1.0
-    """From our unit to the paper's."""
-    relative: bool = True
-    """A change in per cent means something (it does not in dB)."""
-
-    @property
-    def other(self) -> Literal["equal", "frames"]:
-        """The average that the paper does not use here."""
-        return "frames" if self.average == "equal" else "equal"
-
-
-_ALL = (
-    Measure(name="chamfer", paper="cd", heading="CD", unit="m", higher=False, average="equal", digits=5),
-    Measure(name="track_error", paper="track_error", heading="TE", unit="m", higher=False, average="equal", digits=5),
-    Measure(name="iou", paper="iou", heading="IoU %", unit="%", higher=True, average="frames", digits=1, factor=100.0),
-    Measure(name="psnr", paper="psnr", heading="PSNR", unit="dB", higher=True, average="frames", digits=3, relative=False),
-    Measure(name="ssim", paper="ssim", heading="SSIM", unit="", higher=True, average="frames", digits=3),
-    Measure(name="lpips", paper="lpips", heading="LPIPS", unit="", higher=False, average="frames", digits=3),
-)
-MEASURES = {measure.name: measure for measure in _ALL}
-"""By our name, in the paper's order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +42,7 @@ Values = dict[tuple[str, str, str], Printed]
 def table(name: str) -> Values:
     """One of the paper's tables; empty if there is none of that name."""
     tasks = {theirs: ours for ours, theirs in TASKS.items()}
-    metrics = {measure.paper: measure.name for measure in _ALL}
+    metrics = {metric.paper_name: metric.name for metric in IN_PAPER.values()}
     return {
         (row["method"], tasks[row["task"]], metrics[row["metric"]]): _printed(row["value"])
         for row in _rows("paper_tables.csv")
@@ -95,7 +57,7 @@ def tables() -> tuple[str, ...]:
 
 @functools.cache
 def released() -> pd.DataFrame:
-    """Scores of the released PhysTwin: scenario, task, metric (ours), value (our unit: m). The training frames of 11 of 22 only."""
+    """Scores of the released PhysTwin: scenario, task, metric, value [m]. 11 of 22 scenarios have scores of training frames."""
     import pandas as pd
 
     names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error"}

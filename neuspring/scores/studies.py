@@ -1,4 +1,4 @@
-"""Studies: which methods stand in the rows of which of the paper's tables."""
+"""Studies: the paper's tables, and which method stands in each row."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from neuspring.scores import paper
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
 TAKEN = ("summary", "scores", "runs", "averages", "differences", "held", "transfers", "perception", "pictures")
-"""Files that other commands write into the folder of tables."""
+"""Names of files that other commands write into the folder of tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A row of studies.yaml: a table of methods that stand beside each other."""
+    """A row of studies.yaml: one of the paper's tables, or a table of ours."""
 
     __pydantic_config__ = STRICT
     title: Text
     reference: str | None
-    """A table of the paper, as paper_tables.csv names it; null: the paper gives no numbers."""
+    """Name of the table in paper_tables.csv; null: the paper gives no numbers."""
     baseline: str
     """Label of the row that the others are compared with, on the same scenarios and seeds."""
     rows: dict[Text, Name]
-    """Label, as in the paper, to a row of the method table. Labels beyond the paper's are shown without its values."""
+    """The paper's label to a method of methods.yaml. A label that the paper does not have is shown without its values."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
@@ -43,7 +43,7 @@ class Study:
             raise ValueError(f"reference: must be null or one of {', '.join(paper.tables())}, received {self.reference!r}")
         missing = [label for label in dict.fromkeys(label for label, _, _ in self.values) if label not in self.rows]
         if missing:
-            raise ValueError(f"rows: the paper's {self.reference} also has {missing}; labels must be spelt as there")
+            raise ValueError(f"rows: the paper's {self.reference} also has {missing}; labels must be spelled as there")
 
     @property
     def values(self) -> paper.Values:
@@ -52,7 +52,7 @@ class Study:
 
 
 def read_studies(path: Path) -> dict[str, Study]:
-    """The table of studies: name -> Study. Raises InputError."""
+    """The studies of a YAML file by name. Raises InputError."""
     studies = {name: parse(Study, row, f"{path}, study {name}") for name, row in read_yaml(path).items()}
     for name in studies:
         if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,12 +14,9 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, Capture
-from neuspring.perception.results import Masks
-from neuspring.report.figures.images import Pair
-from neuspring.scores import images as image_metrics
+from neuspring.data.capture import Camera
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.rasterise import Backend
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 
@@ -78,44 +75,3 @@ def save_picture(path: Path, rgba: np.ndarray) -> None:
     ok, data = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
     assert ok, "a picture can be encoded"
     write_atomically(path, lambda temporary: temporary.write_bytes(data.tobytes()))
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """What predictions are compared with: cameras, their masks, and how."""
-
-    capture: Capture
-    masks: Mapping[str, np.ndarray]
-    """Perceived labels [T, H, W] by camera; empty where the capture has masks of its own."""
-    masks_from: str
-    views: Mapping[str, View]
-    backend: Backend
-    covered: int
-    """Least coverage, of 255, that counts as object."""
-
-    @classmethod
-    def of(cls, capture: Capture, perceived: Mapping[str, Masks], images: Images, device: str) -> Scored:
-        """The cameras that `images.views` asks for. Raises InputError if a second camera is asked for and there is none."""
-        quirks, cameras = images.released_quirks, list(capture.cameras.values())
-        if quirks.second_camera_intrinsics and len(cameras) < 2:
-            rule = "images.released_quirks.second_camera_intrinsics needs a second camera"
-            raise InputError(capture.folder / CAPTURE, rule, f"{len(cameras)} camera")
-        borrowed = cameras[1] if quirks.second_camera_intrinsics else None
-        chosen = cameras[: 1 if images.views == "first" else None]
-        views = {camera.name: view_of(camera, images, device, borrowed) for camera in chosen}
-        # Scores should not depend on the segmentation under test, where the capture comes with masks of its own.
-        own = capture.description.masks
-        labels = {} if own else {name: perceived[name].labels for name in views}
-        source = "given" if own else next(iter(perceived.values())).backend
-        covered = 1 if quirks.any_alpha else COVERED
-        return cls(capture, labels, source, views, choose_backend(images.backend, device), covered)
-
-    def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:
-        """Observed and predicted picture of one camera in one frame."""
-        labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
-        mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-        colour = self.capture.colour(name, frame)
-        rendered = picture(gaussians, self.views[name], self.backend)
-        truth, prediction = image_metrics.masked_pair(colour, mask, rendered, hands)
-        silhouettes = image_metrics.silhouettes(mask, rendered, hands, self.covered)
-        return Pair(colour, rendered, truth, prediction, silhouettes, hands > 0)

@@ -25,10 +25,10 @@ from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import masks_of_cameras
 from neuspring.report.figures import images as figures
 from neuspring.report.video import Video
-from neuspring.scores import images as image_metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
-from neuspring.splats.draw import Scored, moved, placed, turned
+from neuspring.scores.pictures import Scored, picture_scores
+from neuspring.splats.draw import moved, placed, turned
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.train import restricted
 from neuspring.stages import options as shared
@@ -111,7 +111,7 @@ def run(
                 if not capture.has(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
-                scores = _scores(pair, lpips, images.released_quirks.unit_lpips)
+                scores = picture_scores(pair, lpips, unit_lpips=images.released_quirks.unit_lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in scores.items()]
                 if name == first and frame < predicted:
                     strip.add(frame, pair)
@@ -162,14 +162,3 @@ def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussian
         yield last
     if last is not None:
         yield from itertools.repeat(last, count)
-
-
-def _scores(pair: figures.Pair, lpips: Lpips | str, unit_lpips: bool) -> dict[str, float]:
-    """PSNR, SSIM, IoU and, where its weights are there, LPIPS."""
-    truth, prediction = pair.truth, pair.prediction
-    scores = {
-        "psnr": float(image_metrics.psnr(prediction, truth)),
-        "ssim": float(image_metrics.ssim(prediction, truth)),
-        "iou": image_metrics.iou(*pair.silhouettes),
-    }
-    return scores if isinstance(lpips, str) else scores | {"lpips": float(lpips(prediction, truth, released_range=unit_lpips))}

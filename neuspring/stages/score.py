@@ -200,7 +200,7 @@ def _write_frozen(
     folder: Path,
 ) -> str:
     """held.parquet, and its name: scores with the last frame frozen, or frame 0 where there is none."""
-    frozen = metrics.held(trajectory, observations)
+    frozen = metrics.last_frame_frozen(trajectory, observations)
     scores = metrics.score(frozen, observations, method, seed)
     if pictures is not None:
         scores = _with_pictures(scores, pictures, len(frozen.positions), observations, method, seed)

@@ -45,11 +45,11 @@ def test_what_ended_early_is_held_at_its_last_frame():
     frames = seen.scenario.frame_count
     known = seen.nodes + np.arange(3)[:, None, None] * np.array([0.01, 0, 0])
     ended = Trajectory(positions=known, frame_count=frames, diverged_frame=3, reason="test")
-    whole = metrics.held(ended, seen)
+    whole = metrics.last_frame_frozen(ended, seen)
     assert whole.diverged_frame is None and len(whole.positions) == frames
     np.testing.assert_array_equal(whole.positions[:3], ended.positions)
     assert (whole.positions[3:] == ended.positions[2]).all()
     # Without any frame, the rest state is what is left.
     nothing = Trajectory(positions=known[:0], frame_count=frames, diverged_frame=0, reason="test")
     for lost in (None, nothing):
-        assert (metrics.held(lost, seen).positions == seen.nodes).all()
+        assert (metrics.last_frame_frozen(lost, seen).positions == seen.nodes).all()

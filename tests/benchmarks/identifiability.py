@@ -44,12 +44,13 @@ from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.data.synthetic import toy
 from neuspring.experiments.benchmark import read_scenarios
 from neuspring.report.figures import twin as figures_twin
 from neuspring.report.figures import views as figures_views
-from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
+from neuspring.scores.statistics import paired_differences
 from neuspring.twin.fit import FitProblem, fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import roll_out
@@ -195,10 +196,10 @@ def report(table: pd.DataFrame) -> list[str]:
             cells = [cell(metric, values[of == metric].dropna(), sign) for metric in METRICS]
             rows.append([str(scene), f"{1e3 * float(noise):g}", str(kind), *cells])
     headings = [heading for heading, _, _ in METRICS.values()]
-    lines = tables.markdown(["scene", "noise [mm]", "kind", *headings], rows)
+    lines = markdown(["scene", "noise [mm]", "kind", *headings], rows)
     fits = table[table["kind"].isin(list(RATES))].rename(columns={"scene": "scenario", "kind": "method"})
     both = pd.concat([fits.assign(task=[f"{1e3 * noise:g}" for noise in fits["noise"]]), fits.assign(task="all")])
-    differences, rows = tables.paired_differences(both, "springs"), []
+    differences, rows = paired_differences(both, "springs"), []
     for task, part in differences.groupby("task", sort=False) if len(differences) else []:
         by, cells = part.set_index("metric"), [str(task)]
         for metric, (_, factor, digits) in METRICS.items():
@@ -206,7 +207,7 @@ def report(table: pd.DataFrame) -> list[str]:
             cells.append("{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*(factor * of[["difference", "low", "high"]]), d=digits))
         rows.append(cells)
     lines += ["", "Field − springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
-    return lines + tables.markdown(["noise [mm]", *headings], rows)
+    return lines + markdown(["noise [mm]", *headings], rows)
 
 
 def picture(found: dict[str, dict[str, np.ndarray]]) -> Figure:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from neuspring import config
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.run_record import RunRecord
 from neuspring.report import explain_text
 from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.report.tables import study as tables_paper
@@ -19,6 +21,7 @@ from neuspring.scores import paper
 from neuspring.scores.studies import read_studies
 from neuspring.stages import score
 from tests.support import small
+from tests.support.runs import STARTED, run_record
 from tests.support.study_runs import all_scores, write_benchmark, write_run
 
 STUDIES = read_studies(Path(__file__).resolve().parents[2] / "config" / "studies.yaml")
@@ -226,9 +229,10 @@ def test_settings_of_a_baseline_are_compared_with_those_of_its_model():
 
 
 def test_the_command_names_the_rules_of_a_baseline():
-    record = {"device": "cuda:0", "variant": {"model": "gs_dynamics"}, "settings": {"train": {}, "rollout": {}, "render": {}}}
+    settings = {"train": {}, "rollout": {}, "render": {}}
+    record = run_record(device="cuda:0", variant={"model": "gs_dynamics"}, settings=settings)
     assert rerun(Path("results"), "a", "gs", 0, record).endswith("--forcerun train predict render score")
-    twin = record | {"variant": {"search": "uniform"}, "settings": {"search": {}, "rollout": {}}}
+    twin = run_record(device="cuda:0", variant={"search": "uniform"}, settings={"search": {}, "rollout": {}})
     assert rerun(Path("results"), "a", "m", 0, twin).endswith("--forcerun search rollout score")
 
 
@@ -241,10 +245,10 @@ def test_the_key_is_that_of_a_real_run(tmp_path):
     Trajectory(positions=still, frame_count=len(still)).save(folder / "trajectory.npz")
     named = {"trajectory": ["trajectory.npz", digest_file(folder / "trajectory.npz")]}
     records = {"search": folder / "search.json", "rollout": folder / "rollout.json"}
-    StageRecord(stage="search", status="ok", settings={"seed": 0}, started="2026").save(records["search"])
-    StageRecord(stage="rollout", status="ok", files=named, started="2026").save(records["rollout"])
+    StageRecord(stage="search", status="ok", settings={"seed": 0}, started=STARTED).save(records["search"])
+    StageRecord(stage="rollout", status="ok", files=named, started=STARTED).save(records["rollout"])
     score.run(seen, records, "search_only", {"fit": "none"}, 0, folder / "run.json")
-    record = json.loads((folder / "run.json").read_text())
+    record = RunRecord.load(folder / "run.json")
     assert check_files(folder / "run.json", record, seen) == (3, [])
-    _, problems = check_files(folder / "run.json", record | {"seed": 1}, seen)
+    _, problems = check_files(folder / "run.json", replace(record, seed=1), seen)
     assert len(problems) == 1

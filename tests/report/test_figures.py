@@ -18,9 +18,10 @@ from neuspring.report.figures import twin as figures_twin
 from neuspring.report.figures import views as figures_views
 from neuspring.report.tables import summary as tables
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.runs import Collected
 from neuspring.twin.topology import piecewise_topology, regions
-from tests.report.test_tables import collected
 from tests.support import small
+from tests.support.study_runs import collected
 
 HISTORIES = {
     "search": pd.DataFrame(
@@ -289,13 +290,13 @@ def test_the_loss_of_a_baseline_has_no_unit_that_it_may_not_have():
     plt.close(figure)
 
 
-def chamfer(values: dict[tuple[str, str, int], float], **options) -> tables.Collected:
+def chamfer(values: dict[tuple[str, str, int], float], **options) -> Collected:
     """Future Chamfer distances in metres, and reconstruction ones half as large."""
     found = collected(values, **options)
     future = found.scores.assign(metric="chamfer")
     past = future.assign(task="reconstruction", value=future["value"] / 2)
     # Other metrics must not reach the picture.
-    return tables.Collected(pd.concat([future, past, found.scores])[list(COLUMNS)], found.runs)
+    return Collected(pd.concat([future, past, found.scores])[list(COLUMNS)], found.runs)
 
 
 STUDY = {
@@ -367,7 +368,7 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monk
     failed = [("a", "clusters_10", 1), *((scenario, "clusters_4", seed) for scenario in "ab" for seed in (0, 1))]
     kept = []
     monkeypatch.setattr(tables, "clusters_figure", lambda scores, path, note: kept.append((scores, note)))
-    assert tables.write_clusters(chamfer(values, failed=tuple(failed)), tmp_path) == ""
+    assert tables.draw_clusters(chamfer(values, failed=tuple(failed)), tmp_path) == ""
     ((scores, note),) = kept
     assert set(zip(scores["scenario"], scores["seed"], strict=True)) == {("a", 0), ("b", 0), ("b", 1)}
     # clusters_4 finished no run: it is not drawn and holds nobody back.

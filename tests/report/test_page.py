@@ -1,25 +1,25 @@
 """The report says what is on disk, whatever state that is in, and needs nothing else to be read."""
 
-import html
 import re
 import shutil
 from collections import Counter
 from html.parser import HTMLParser
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from neuspring import config
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import read_jobs
-from neuspring.report.page import Options, studies, timeline, write
+from neuspring.report import gallery
+from neuspring.report.page import Options, studies, write
 from neuspring.report.page.prose import render
 from neuspring.report.page.words import duration, hours, signed
 from neuspring.scores import paper
+from neuspring.scores.runs import collect
 from neuspring.scores.studies import Study
 from tests.support import report_tree
 from tests.support.browser import Browser, chromium
+from tests.support.report_tree import page_section as section
 
 WRITTEN = "2026-01-05T12:00:00+00:00"
 ABLATION = Study(
@@ -41,13 +41,6 @@ def report(results: Path, **options) -> str:
     """The page of a results folder, as text."""
     values = {"studies": {"pieces": ABLATION, "systems": SYSTEMS}} | options
     return write(results, results / "report.html", Options(**values), WRITTEN).read_text()
-
-
-def section(page: str, key: str) -> str:
-    """The text of a section, without tags; what cells and lines hold is separated by spaces."""
-    found = re.search(rf'<section id="{key}">(.*?)</section>', page, re.DOTALL)
-    assert found, key
-    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", found[1])).split())
 
 
 def damage(path: Path) -> None:
@@ -231,8 +224,6 @@ def test_runs_that_were_asked_for_and_are_not_there_are_missing(small):
     assert "Without any finished run, and not counted: later." in section(page, "scores")
     assert "zebra – – –" in section(page, "failures")
     assert "rope ✓ 2 ✓ 2 –" in section(page, "failures")
-    assert "observe ✓" not in section(page, "workflow")
-    assert "2 of 3" in section(page, "workflow")
 
 
 def test_what_began_without_a_result_is_found(tmp_path):
@@ -249,7 +240,6 @@ def test_damaged_files_are_listed_and_stop_nothing(tmp_path):
     broken = [
         *("rope/baseline/0/run.json", "rope/baseline/1/scores.parquet", "cloth/neuspring/0/history.parquet"),
         *("cloth/neuspring/0/trajectory.npz", "cloth/neuspring/0/plots/motion.png", "jobs/fit/rope/baseline/0.json"),
-        *("cloth/baseline/0/fit.json",),
     ]
     for name in broken:
         damage(results / name)
@@ -272,7 +262,7 @@ def test_failed_jobs_come_with_cause_message_attempts_and_log(page):
 
 
 def test_failed_runs_give_their_reason_as_text(small):
-    seen = report_tree._observations("rope", "synthetic", 30)
+    seen = report_tree.observations("rope", "synthetic", 30)
     changes = {"status": "failed", "reason": "rollout: <script>alert(1)</script> diverged in frame 3"}
     report_tree.write_run(small, seen, "baseline", 0, {}, **changes)
     page = report(small)
@@ -291,7 +281,7 @@ def test_how_pictures_were_scored_is_said(small):
         "quirks": [],
         "unseen_surface": 0.25,
     }
-    seen = report_tree._observations("rope", "synthetic", 30)
+    seen = report_tree.observations("rope", "synthetic", 30)
     for method in ("baseline", "neuspring"):
         report_tree.write_run(small, seen, method, 0, {"images.png": b""}, images=facts, notes=["fit: 1 epoch rolled back"])
     text = section(report(small), "scores")
@@ -337,27 +327,11 @@ def test_without_job_records_times_come_from_the_runs_and_shared_stages_count_on
     assert "search shared 1" in section(page, "work")
 
 
-def test_pauses_are_cut_out_and_no_two_bars_of_a_lane_overlap(small):
-    starts = [0, 0, 100, 300, 100_000]
-    for index, start in enumerate(starts):
-        job = [report_tree.attempt(start, 200, devices=["0"])]
-        report_tree.save_job(small, f"fit/rope/baseline/{index}", job)
-    found = timeline.bars(read_jobs(small))
-    ((_, length),) = timeline.pauses(found)
-    assert 99_400 < length < 99_500
-    lanes = timeline.laned(found)
-    assert [name for name, _ in lanes] == ["GPU 0.1", "GPU 0.2", "GPU 0.3"]
-    assert all(before.end <= after.start + 1 for _, bars in lanes for before, after in pairwise(bars))
-    assert sum(len(bars) for _, bars in lanes) == len(starts)
-    assert "Dotted: 1 pauses cut out." in section(report(small), "work")
-
-
 def test_curves_have_a_panel_per_scenario_and_are_told_in_words(page):
-    labels = re.findall(r'<svg [^>]*role="img" aria-label="([^"]*)"', page)
+    labels = re.findall(r'<img src="data:image/svg[^>]* alt="([^"]*)" class="paper"', page)
     for title in ("Track error over time", "Search: best cost", "Fit: loss"):
         assert [label for label in labels if label.startswith(f"{title}, rope: ")]
         assert [label for label in labels if label.startswith(f"{title}, cloth: ")]
-    assert "currentColor" in page
 
 
 def test_the_same_folder_makes_the_same_page_but_for_its_date(full, page):
@@ -422,7 +396,7 @@ def test_settings_are_read_from_the_runs_where_none_are_given(page):
 
 def test_runs_of_several_commits_are_pointed_out(small):
     assert "All runs were made by commit 0123456789ab." in section(report(small), "setup")
-    seen = report_tree._observations("rope", "synthetic", 30)
+    seen = report_tree.observations("rope", "synthetic", 30)
     report_tree.write_run(small, seen, "baseline", 0, {}, commit="fedcba9876543210-dirty")
     text = section(report(small), "setup")
     assert "Runs were made by 2 states of the code" in text
@@ -436,11 +410,17 @@ def test_of_many_methods_six_are_drawn_and_the_page_says_which(many):
         report(many, shown=["other"])
 
 
-def test_the_workflow_is_drawn_with_what_is_there(page):
-    (label,) = re.findall(r'aria-label="Steps of the workflow\. ([^"]*)"', page)
-    assert "observe: 2 done, 0 failed" in label
-    assert "score: 8 done, 0 failed" in label
-    assert "capture" not in label
+def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
+    collected = collect(full, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1])
+    path = gallery.write(full, ["rope", "cloth", "zebra"], ["baseline", "neuspring"], 0, collected, tmp_path / "tables")
+    parser, page = Strict(), path.read_text()
+    parser.feed(page)
+    assert not parser.open
+    files = [target for target in parser.targets if not target.startswith("#")]
+    assert len([name for name in files if name.endswith(".mp4")]) == 8
+    assert all((path.parent / name).is_file() for name in files)
+    assert re.search(r"neuspring: training PSNR \[dB\] \d+\.\d+, IoU 0\.\d+; future PSNR", page)
+    assert "No pictures: no images, or no finished run." in section(page, "zebra")
 
 
 def test_numbers_read_well():

@@ -1,6 +1,6 @@
 """The report shows methods without a search: their steps, settings, curves, times and splats."""
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,13 +10,19 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import StageRecord
-from neuspring.report.page import dag
+from neuspring.core.run_record import RunRecord
+from neuspring.report.page import Options, write
 from neuspring.report.page.sources import Choice
 from neuspring.scores.studies import Study
-from tests.report.test_page import report, section
 from tests.support import report_tree
+from tests.support.report_tree import page_section as section
 
 SYSTEMS = Study(title="Systems", reference=None, baseline="Ours", rows={"SG": "spring_gaus", "Ours": "baseline"})
+
+
+def report(results: Path, **options) -> str:
+    """The page of a results folder, as text."""
+    return write(results, results / "report.html", Options(**options)).read_text()
 
 
 def write_baseline(results: Path, scenario: str, method: str, model: str, *, trained: bool = True, splats: str = "") -> None:
@@ -29,7 +35,7 @@ def write_baseline(results: Path, scenario: str, method: str, model: str, *, tra
     if trained:
         own = config.plain(config.Config())["baselines"][model]
         settings["train"] = {"model": model, **own, "seed": 0} | ({"anchors": 77} if model == "spring_gaus" else {})
-        report_tree._history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
+        report_tree.write_history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
         StageRecord(stage="train", status="ok", settings=settings["train"]).save(folder / "train.json")
         records.insert(0, "train.json")
     images = []
@@ -56,7 +62,7 @@ def write_baseline(results: Path, scenario: str, method: str, model: str, *, tra
     (folder / "fit.json").unlink()
     StageRecord(stage="rollout", status="ok", settings=settings["rollout"]).save(folder / "rollout.json")
     if trained:
-        report_tree._history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
+        report_tree.write_history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
 
 
 @pytest.fixture(scope="module")
@@ -72,32 +78,6 @@ def results(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def page(results) -> str:
     return report(results, studies={"systems": SYSTEMS})
-
-
-def drawn(page: str) -> dict[str, str]:
-    """Step -> what its box says."""
-    words = page.partition('aria-label="Steps of the workflow. ')[2].partition('"')[0]
-    return dict(part.split(": ", 1) for part in words.split("; "))
-
-
-def test_steps_of_baselines_are_drawn_and_their_rollouts_are_their_own(page):
-    boxes = drawn(page)
-    assert boxes["train"].startswith("2 done") and boxes["predict"].startswith("3 done")
-    assert boxes["rollout"].startswith("1 done") and boxes["appearance"].startswith("2 done")
-
-
-def test_without_baselines_there_are_no_such_steps(tmp_path):
-    folder = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0], pictures=False, curves=False)
-    boxes = drawn(report(folder))
-    assert "train" not in boxes and "predict" not in boxes and boxes["rollout"].startswith("1 done")
-
-
-def test_a_prediction_without_training_follows_the_observations():
-    count = dag.Count(finished=1, failed=0, jobs_failed=0, expected=None)
-    assert dag._before("predict", {"observe": count, "predict": count}) == ["observe"]
-    assert dag._before("predict", {"observe": count, "train": count}) == ["train"]
-    places = [step.place for step in dag.STEPS.values()]
-    assert len(set(places)) == len(places)
 
 
 def test_settings_and_models_are_shown(page):
@@ -164,13 +144,14 @@ def test_failures_have_both_averages_in_the_report(tmp_path):
         tmp_path / "results", ["rope", "cloth"], ["baseline", "spring_gaus"], [0], pictures=False, curves=False
     )
     place = folder / "rope" / "spring_gaus" / "0"
-    run = json.loads((place / "run.json").read_text())
+    run = RunRecord.load(place / "run.json")
     (place / "held.parquet").write_bytes((place / "scores.parquet").read_bytes())
-    (place / "run.json").write_text(json.dumps(run | {"status": "failed", "reason": "it diverged", "held_file": "held.parquet"}))
+    failed = replace(run, status="failed", reason="it diverged")
+    replace(failed, held_file="held.parquet").save(place / "run.json")
     page = report(folder, studies={"systems": SYSTEMS})
     text = section(page, "scores")
     assert "spring_gaus 1 of 2 its successes" in text and "all, failures held" in text and "baseline 2 of 2 all" in text
     assert "spring_gaus 1 (1 by its failures alone)" in text
     assert "SG 1/2 its successes" in section(page, "studies")
-    (place / "run.json").write_text(json.dumps(run | {"status": "failed", "reason": "it diverged"}))
+    failed.save(place / "run.json")
     assert "spring_gaus: 1 of 1 failed runs have no scores of a held prediction" in section(report(folder), "scores")

@@ -17,9 +17,10 @@ from neuspring.report.tables import cells as tables_cells
 from neuspring.report.tables import render as tables_render
 from neuspring.report.tables import study as tables_paper
 from neuspring.report.tables import summary as tables
-from neuspring.report.tables.summary import Collected
 from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, averages
+from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores
+from neuspring.scores.statistics import paired_differences
 from neuspring.scores.studies import Study, read_studies
 from tests.support.study_runs import all_scores, write_benchmark, write_run
 
@@ -38,7 +39,7 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
         rows += [(scenario, "rope", method, seed, *key, value, "", counts) for key, value in scores.items()]
         runs.append((scenario, method, seed, "ok", "", "", None, source, "k"))
     runs += [(*run, "failed", "it diverged", "", None, source, "k") for run in failed]
-    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(tables.RUN_COLUMNS)))
+    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(RUN_COLUMNS)))
 
 
 def cells_of(name: str, runs: Collected) -> pd.DataFrame:
@@ -162,7 +163,7 @@ def test_intervals_agree_with_those_of_the_summary():
     """The same bootstrap with other draws: the ends of 10,000 resamples agree within some per cent of the width."""
     runs = collected(varied({"baseline": 1.0, "neuspring": 0.8}, noise=0.3))
     found = cells_of("table2", runs).loc[("NeuSpring (PT+NSF)", *CD)]
-    row = tables.paired_differences(runs.scores, "baseline").iloc[0]
+    row = paired_differences(runs.scores, "baseline").iloc[0]
     width = row["high"] - row["low"]
     assert found["change"] == pytest.approx(row["difference"])
     assert found["relative"] == pytest.approx(row["relative"])
@@ -351,7 +352,7 @@ def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values()
 
 def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_path):
     folder, out, _ = written
-    everything = tables.collect(folder, RELEASED[:8], ["neuspring", "search_only", "phystwin"], [0, 1])
+    everything = collect(folder, RELEASED[:8], ["neuspring", "search_only", "phystwin"], [0, 1])
     tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
     for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
@@ -362,7 +363,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     for number, (method, factor) in itertools.product(range(7), methods.items()):
         write_run(tmp_path, f"cable_{number}", method, 0, {CD: 0.01 * factor * (1 + number)}, source="mocap")
     names = [f"cable_{number}" for number in range(7)]
-    tables.write(tables.collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    tables.write(collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
     tables_paper.write_study("table2", STUDIES["table2"], tmp_path, names, [0], methods, tmp_path / "records")
     command = ["study", "--study", "table2", "--table", str(STUDY_TABLE), "--output", str(tmp_path / "scores")]
     assert main([*command, "--scores", str(tmp_path / "tables" / "scores.csv")]) == 0
@@ -372,12 +373,12 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
     write_run(tmp_path, "cable_6", "neuspring", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged")
-    tables.write(tables.collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    tables.write(collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
     scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
     other = scores[scores["task"] == "future"].assign(task="reconstruction")
     pd.concat([scores, other]).to_csv(tmp_path / "tables" / "scores.csv", index=False)
     for _ in range(2):
-        runs = tables.read_scores(tmp_path / "tables" / "scores.csv").runs.set_index(["scenario", "method"])["status"]
+        runs = read_scores(tmp_path / "tables" / "scores.csv").runs.set_index(["scenario", "method"])["status"]
         assert (runs["cable_6", "neuspring"], runs["cable_6", "baseline"]) == ("failed", "ok")
         (tmp_path / "tables" / "runs.csv").unlink(missing_ok=True)
     assert main(command) == 2

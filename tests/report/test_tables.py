@@ -7,23 +7,15 @@ import pandas as pd
 import pytest
 
 from neuspring.report.tables import summary as tables
-from neuspring.report.tables.summary import Collected
 from neuspring.scores.metrics import COLUMNS
-
-
-def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str, str, int], ...] = ()) -> Collected:
-    """Future track errors in metres by (scenario, method, seed); the other runs failed."""
-    rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
-    runs = [{"scenario": s, "method": m, "seed": seed, "status": "ok", "reason": "", "notes": ""} for s, m, seed in values]
-    runs += [
-        {"scenario": s, "method": m, "seed": seed, "status": "failed", "reason": "diverged", "notes": ""} for s, m, seed in failed
-    ]
-    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs))
+from neuspring.scores.runs import Collected, collect
+from neuspring.scores.statistics import paired_differences, resampled_means
+from tests.support.study_runs import collected
 
 
 def test_paired_differences_use_the_same_scenario_and_seed():
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.100, ("b", "y", 0): 0.098}
-    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    row = paired_differences(collected(values).scores, "x").iloc[0]
     assert row["difference"] == pytest.approx(-0.002)
     assert row["low"] == pytest.approx(-0.002)
     assert row["high"] == pytest.approx(-0.002)
@@ -36,7 +28,7 @@ def test_the_interval_covers_the_mean_of_noisy_differences():
     for _ in range(60):
         deltas = rng.normal(0.001, 0.002, 20)
         values = {(f"s{i}", m, 0): 0.05 + (d if m == "y" else 0.0) for i, d in enumerate(deltas) for m in ("x", "y")}
-        row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+        row = paired_differences(collected(values).scores, "x").iloc[0]
         hits += row["low"] <= 0.001 <= row["high"]
     # 95 % nominal; with 60 trials, below 50 has a probability under 1e-3 even at the bootstrap's usual 92 %.
     assert hits >= 50
@@ -44,7 +36,7 @@ def test_the_interval_covers_the_mean_of_noisy_differences():
 
 def test_seeds_of_one_scenario_are_not_independent():
     values = {("a", m, seed): 0.01 + (0.001 if m == "y" else 0) for m in ("x", "y") for seed in range(5)}
-    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    row = paired_differences(collected(values).scores, "x").iloc[0]
     assert row["scenarios"] == 1
     assert np.isnan(row["low"])
 
@@ -52,7 +44,7 @@ def test_seeds_of_one_scenario_are_not_independent():
 def test_the_relative_difference_weighs_scenarios_equally():
     values = {("a", "x", 0): 0.1, ("a", "y", 0): 0.09}
     values |= {("b", m, seed): v for m, v in (("x", 0.01), ("y", 0.009)) for seed in range(3)}
-    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    row = paired_differences(collected(values).scores, "x").iloc[0]
     assert row["difference"] == pytest.approx(-0.0055)
     assert row["relative"] == pytest.approx(-0.1)
 
@@ -66,12 +58,12 @@ def test_the_ratio_weighs_a_scenario_of_large_errors_like_another():
         ("c", "x", 0): 0.01,
         ("c", "y", 0): 0.005,
     }
-    row = tables.paired_differences(collected(values).scores, "x").iloc[0]
+    row = paired_differences(collected(values).scores, "x").iloc[0]
     assert row["difference"] > 0
     assert row["ratio"] == pytest.approx((2 * 0.5 * 0.5) ** (1 / 3))
     assert pytest.approx(row["ratio_low"]) == 0.5
     assert row["ratio_low"] < row["ratio"] < row["ratio_high"] <= 2.0
-    perfect = tables.paired_differences(collected(values | {("c", "y", 0): 0.0}).scores, "x").iloc[0]
+    perfect = paired_differences(collected(values | {("c", "y", 0): 0.0}).scores, "x").iloc[0]
     assert np.isnan(perfect["ratio"])
     assert np.isfinite(perfect["difference"])
     assert "0.794 [" in tables.summary_text(collected(values), "x")
@@ -83,7 +75,8 @@ def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
     runs = [rng.normal(size=3) for _ in range(12)]
     within = np.mean([part.var() / 3 for part in runs]) / 12
     between = np.var([part.mean() for part in runs]) / 12
-    assert tables._resampled_means(runs, np.random.default_rng(0)).var() == pytest.approx(within + between, rel=0.05)
+    means = resampled_means([part[None] for part in runs], np.random.default_rng(0))
+    assert means.var() == pytest.approx(within + between, rel=0.05)
 
 
 def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collected:
@@ -165,7 +158,7 @@ def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
 
 
 def test_missing_runs_are_listed(tmp_path):
-    found = tables.collect(tmp_path, ["a"], ["x", "y"], [0, 1])
+    found = collect(tmp_path, ["a"], ["x", "y"], [0, 1])
     assert (found.runs["status"] == "missing").all()
     text = tables.write(found, "x", tmp_path / "tables")
     assert text.count("missing: no run.json") == 4
@@ -173,7 +166,7 @@ def test_missing_runs_are_listed(tmp_path):
 
 
 def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
-    found = tables.collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
+    found = collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
     found.runs.loc[0, ["status", "reason"]] = ["failed", "diverged"]
     text = tables.summary_text(found, "x")
     assert "- s0 / x / seed 0: failed: diverged" in text

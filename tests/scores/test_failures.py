@@ -13,28 +13,27 @@ from neuspring.report.explain import explain
 from neuspring.report.explain_text import text as explained
 from neuspring.report.tables import study as tables_paper
 from neuspring.report.tables import summary as tables
-from neuspring.report.tables.summary import Collected
-from neuspring.scores import failures as tables_held
+from neuspring.scores import failures
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.runs import DAMAGED, Collected, collect, comparable, read_scores
 from neuspring.scores.studies import Study
-from tests.report.test_tables import collected
-from tests.support.study_runs import write_run
+from tests.support.study_runs import collected, write_run
 
 FUTURE = ("future", "track_error")
 STUDY = Study(title="Systems", reference=None, baseline="Ours", rows={"Spring-Gaus": "spring_gaus", "Ours": "ours"})
 
 
-def held(values: dict[tuple[str, str, int], float], metric: str = "track_error") -> pd.DataFrame:
+def frozen(values: dict[tuple[str, str, int], float], metric: str = "track_error") -> pd.DataFrame:
     rows = [(s, "rope", m, seed, "future", metric, value, "m", 10) for (s, m, seed), value in values.items()]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def with_held(found: Collected, values: dict[tuple[str, str, int], float], **options) -> Collected:
-    return Collected(found.scores, found.runs, held(values), **options)
+def with_frozen(found: Collected, values: dict[tuple[str, str, int], float], **options) -> Collected:
+    return Collected(found.scores, found.runs, frozen(values), **options)
 
 
 def means(found: Collected) -> dict[str, pd.Series]:
-    table = tables_held.both_averages(found.scores, found.runs, found.held)
+    table = failures.both_averages(found.scores, found.runs, found.frozen)
     return {str(row["method"]): row for _, row in table.iterrows()}
 
 
@@ -44,7 +43,7 @@ LOST = (("b", "y", 0),)
 
 def test_both_averages_weigh_scenarios_equally():
     values = VALUES | {("a", "y", 1): 0.006}
-    row = means(with_held(collected(values, failed=LOST), {("b", "y", 0): 0.100}))["y"]
+    row = means(with_frozen(collected(values, failed=LOST), {("b", "y", 0): 0.100}))["y"]
     assert (row["succeeded"], row["attempted"], row["unknown"]) == (2, 3, 0)
     assert row["own"] == pytest.approx(0.005)
     assert row["all"] == pytest.approx((0.005 + 0.100) / 2)
@@ -52,35 +51,35 @@ def test_both_averages_weigh_scenarios_equally():
 
 
 def test_a_method_without_failures_has_one_average():
-    row = means(with_held(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100}))["x"]
+    row = means(with_frozen(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100}))["x"]
     assert row["own"] == row["all"] == pytest.approx(0.015)
 
 
 def test_what_a_failed_run_scored_before_it_failed_is_in_no_average():
     found = collected(VALUES | {("b", "y", 0): 7.0}, failed=())
     found.runs.loc[(found.runs["scenario"] == "b") & (found.runs["method"] == "y"), "status"] = "failed"
-    row = means(with_held(found, {("b", "y", 0): 0.100}))["y"]
+    row = means(with_frozen(found, {("b", "y", 0): 0.100}))["y"]
     assert row["own"] == pytest.approx(0.004)
     assert row["all"] == pytest.approx(0.052)
 
 
 def test_held_scores_of_runs_that_succeeded_are_passed_over():
-    row = means(with_held(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100, ("a", "y", 0): 9.0}))["y"]
+    row = means(with_frozen(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100, ("a", "y", 0): 9.0}))["y"]
     assert row["all"] == pytest.approx(0.052)
 
 
 def test_missing_runs_are_no_attempts():
     found = collected(VALUES, failed=LOST)
     found.runs.loc[found.runs["status"] == "failed", "status"] = "missing"
-    assert not len(tables_held.both_averages(found.scores, found.runs, found.held))
-    assert tables_held.held_text(tables_held.both_averages(found.scores, found.runs, found.held)) == ""
+    assert not len(failures.both_averages(found.scores, found.runs, found.frozen))
+    assert failures.failures_text(failures.both_averages(found.scores, found.runs, found.frozen)) == ""
 
 
 def test_failures_without_held_scores_are_told_and_not_averaged():
     found = collected(VALUES, failed=LOST)
     row = means(found)["y"]
     assert row["unknown"] == 1 and math.isnan(row["all"]) and row["own"] == pytest.approx(0.004)
-    text = tables_held.held_text(tables_held.both_averages(found.scores, found.runs, found.held))
+    text = failures.failures_text(failures.both_averages(found.scores, found.runs, found.frozen))
     assert "y: 1 of 1 failed runs have no scores of a held prediction" in text
     (line,) = [line for line in text.splitlines() if "all, failures held" in line]
     assert {cell.strip() for cell in line.split("|")[4:-1]} == {"–"}
@@ -90,15 +89,15 @@ def test_a_metric_that_a_failed_run_has_no_held_score_of_has_no_mean_over_all():
     """Pictures, for example, that could not be drawn."""
     found = collected(VALUES, failed=LOST)
     pictures = found.scores.assign(metric="psnr", value=30.0)
-    found = Collected(pd.concat([found.scores, pictures], ignore_index=True), found.runs, held({("b", "y", 0): 0.1}))
-    table = tables_held.both_averages(found.scores, found.runs, found.held).set_index(["method", "metric"])
+    found = Collected(pd.concat([found.scores, pictures], ignore_index=True), found.runs, frozen({("b", "y", 0): 0.1}))
+    table = failures.both_averages(found.scores, found.runs, found.frozen).set_index(["method", "metric"])
     assert math.isnan(table.loc[("y", "psnr"), "all"]) and table.loc[("y", "psnr"), "own"] == 30.0
     assert table.loc[("y", "track_error"), "all"] == pytest.approx(0.052)
     assert table.loc[("x", "psnr"), "all"] == 30.0
 
 
 def test_a_method_that_failed_everywhere_has_the_mean_of_held_predictions():
-    found = with_held(collected({("a", "x", 0): 0.01}, failed=(("a", "y", 0),)), {("a", "y", 0): 0.2})
+    found = with_frozen(collected({("a", "x", 0): 0.01}, failed=(("a", "y", 0),)), {("a", "y", 0): 0.2})
     row = means(found)["y"]
     assert (row["succeeded"], row["attempted"]) == (0, 1)
     assert math.isnan(row["own"]) and row["all"] == pytest.approx(0.2)
@@ -107,7 +106,7 @@ def test_a_method_that_failed_everywhere_has_the_mean_of_held_predictions():
 
 
 def test_summary_and_csv_have_both_averages(tmp_path):
-    found = with_held(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100})
+    found = with_frozen(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100})
     text = tables.write(found, "x", tmp_path)
     assert text.count("## Failures") == 1 and "published numbers of Spring-Gaus cover successful cases only" in text
     assert "## Failures" in (tmp_path / "summary.md").read_text()
@@ -125,16 +124,16 @@ def test_it_is_said_whose_failures_removed_how_many_pairs():
     for lost in (("b", "y", 0), ("c", "y", 0), ("c", "z", 0)):
         del values[lost]
     found = collected(values, failed=(("b", "y", 0), ("c", "y", 0), ("c", "z", 0)))
-    (line,) = tables_held.removed_lines(found.runs)
+    (line,) = failures.removed_lines(found.runs)
     assert line.endswith(": y 2 (1 by its failures alone), z 1 (0 by its failures alone).")
     text = tables.summary_text(found, "x")
     assert f"Averages take 2 of 4 pairs of scenario and seed, those that every method finished. {line}" in text
-    assert tables_held.removed_lines(collected({("a", "x", 0): 0.01}).runs) == []
+    assert failures.removed_lines(collected({("a", "x", 0): 0.01}).runs) == []
 
 
 def test_it_is_said_if_failures_leave_no_pair():
     found = collected({("a", "x", 0): 0.01, ("b", "y", 0): 0.01}, failed=(("b", "x", 0), ("a", "y", 0)))
-    assert not len(tables.comparable(found))
+    assert not len(comparable(found))
     text = tables.summary_text(found, "x")
     assert "No pair of scenario and seed was finished by every method" in text
     assert ": x 1 (1 by its failures alone), y 1 (1 by its failures alone)." in text
@@ -142,8 +141,8 @@ def test_it_is_said_if_failures_leave_no_pair():
 
 def test_a_method_that_finished_nothing_removes_nothing():
     found = collected({("a", "x", 0): 0.01}, failed=(("a", "y", 0),))
-    assert tables_held.removed_lines(found.runs) == []
-    assert len(tables.comparable(found)) == 1
+    assert failures.removed_lines(found.runs) == []
+    assert len(comparable(found)) == 1
 
 
 @pytest.fixture
@@ -154,12 +153,12 @@ def results(tmp_path) -> Path:
         write_run(folder, scenario, "ours", 0, {FUTURE: 0.01, ("future", "chamfer"): 0.002}, source="mocap")
     write_run(folder, "a", "spring_gaus", 0, {FUTURE: 0.03, ("future", "chamfer"): 0.004}, source="mocap")
     kept = {FUTURE: 0.5, ("future", "chamfer"): 0.1}
-    write_run(folder, "b", "spring_gaus", 0, {}, status="failed", reason="rollout: it diverged", held=kept)
+    write_run(folder, "b", "spring_gaus", 0, {}, status="failed", reason="rollout: it diverged", frozen=kept)
     return folder
 
 
 def of(results: Path) -> Collected:
-    return tables.collect(results, ["a", "b", "cable"], ["spring_gaus", "ours"], [0], {"spring_gaus": ["cable"], "z": ["a"]})
+    return collect(results, ["a", "b", "cable"], ["spring_gaus", "ours"], [0], {"spring_gaus": ["cable"], "z": ["a"]})
 
 
 def test_runs_left_out_are_neither_missing_nor_failed(results):
@@ -167,16 +166,16 @@ def test_runs_left_out_are_neither_missing_nor_failed(results):
     assert len(found.runs) == 5
     assert set(found.runs["status"]) == {"ok", "failed"}
     assert found.left_out == {"spring_gaus": ("cable",)}
-    assert found.held["value"].tolist() == [0.5, 0.1]
+    assert found.frozen["value"].tolist() == [0.5, 0.1]
     text = tables.summary_text(found, "ours")
     assert "Left out: spring_gaus on cable: it needs images." in text
     assert "spring_gaus does not apply to cable, so that averages of all methods are over the other 2." in text
     assert "missing" not in text
-    assert set(tables.comparable(found)["scenario"]) == {"a"}
+    assert set(comparable(found)["scenario"]) == {"a"}
 
 
 def test_a_method_left_out_everywhere_takes_nothing_from_the_others(results):
-    found = tables.collect(results, ["cable"], ["spring_gaus", "ours"], [0], {"spring_gaus": ["cable"]})
+    found = collect(results, ["cable"], ["spring_gaus", "ours"], [0], {"spring_gaus": ["cable"]})
     assert set(found.runs["method"]) == {"ours"}
     text = tables.summary_text(found, "ours")
     assert "Left out: spring_gaus on cable" in text and "does not apply" not in text
@@ -186,7 +185,7 @@ def test_a_method_left_out_everywhere_takes_nothing_from_the_others(results):
 def test_a_damaged_held_file_is_a_damaged_run(results):
     (results / "b" / "spring_gaus" / "0" / "held.parquet").write_bytes(b"half")
     runs = of(results).runs.set_index(["scenario", "method"])
-    assert runs.loc[("b", "spring_gaus"), "reason"].startswith(tables.DAMAGED)
+    assert runs.loc[("b", "spring_gaus"), "reason"].startswith(DAMAGED)
 
 
 def test_a_study_has_the_success_count_and_both_averages(results, tmp_path):
@@ -248,7 +247,7 @@ def test_every_command_of_tables_takes_what_is_left_out(results, tmp_path, capsy
 
 def test_old_scores_say_nothing_of_held_predictions(results, tmp_path):
     tables.write(of(results), "ours", tmp_path)
-    again = tables.read_scores(tmp_path / "scores.csv")
-    assert not len(again.held) and not again.left_out
+    again = read_scores(tmp_path / "scores.csv")
+    assert not len(again.frozen) and not again.left_out
     with pytest.raises(InputError):
-        tables.read_scores(tmp_path / "held.csv")
+        read_scores(tmp_path / "held.csv")

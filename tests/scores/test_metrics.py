@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from neuspring.core.artifacts import Trajectory
-from neuspring.scores import metrics
+from neuspring.scores import metrics, paper
 from tests.support.scenarios import observations, scenario
 
 GOLDEN = 1e-5
@@ -196,3 +196,21 @@ def test_averages_of_nothing_are_empty() -> None:
     given = observations()
     empty = metrics.score(rollout(given.nodes[None], frame_count=5, diverged_frame=1, reason="x"), given, "ours", 0)
     assert metrics.averages(empty).empty
+
+
+# Declarations -----
+
+
+def test_every_metric_of_the_papers_tables_is_declared_once() -> None:
+    printed = {metric for name in paper.tables() for _, _, metric in paper.table(name)}
+    assert printed == set(metrics.IN_PAPER)
+    headings = metrics.HEADINGS | metrics.IMAGE_HEADINGS
+    assert len(set(headings.values())) == len(headings) == 2 * len(metrics.METRICS)
+
+
+def test_values_are_printed_in_the_unit_of_the_table() -> None:
+    assert metrics.METRICS["chamfer"].text(0.00512) == "5.12"
+    assert metrics.METRICS["psnr"].text(1.234, "+") == "+1.23"
+    assert metrics.METRICS["iou"].paper_text(84.06) == "84.1"
+    assert metrics.METRICS["iou"].paper_text(float("nan")) == "–"
+    assert [metric.paper_column for metric in metrics.IN_PAPER.values()][:3] == ["CD ↓", "TE ↓", "IoU % ↑"]

@@ -14,6 +14,7 @@ from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
+from neuspring.scores.runs import collect
 from neuspring.stages import fit, observe, rollout, score, search
 from tests.support import small
 
@@ -157,7 +158,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     run_all(tmp_path, "bad")
     monkeypatch.undo()
     run_all(tmp_path, "good")
-    collected = tables.collect(tmp_path, ["bad", "good"], ["phystwin"], [0])
+    collected = collect(tmp_path, ["bad", "good"], ["phystwin"], [0])
     by_name = collected.runs.set_index("scenario")
     assert by_name.loc["bad", "status"] == "failed"
     assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"

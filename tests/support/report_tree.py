@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
-import json
+import html
 import os
+import re
 import sys
 import time
 import zlib
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from neuspring.core.records import StageRecord, digest_file
 from neuspring.report.video import Video
 from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, UNITS
+from tests.support.runs import run_record
 
 FRAMES, TRAIN, RATE = 20, 14, 30.0
 SEARCHES = {"search_only": "uniform", "baseline": "uniform", "phystwin": "uniform", "model_b": "uniform"}
@@ -49,7 +52,7 @@ def make(
     """Finished runs of every combination; returns `results`."""
     drawn = _pictures(results / "drawn") if pictures else {}
     for scenario in scenarios:
-        seen = _observations(scenario, source, nodes)
+        seen = observations(scenario, source, nodes)
         seen.save(results / scenario / "observations.npz")
         for method in methods:
             for seed in seeds:
@@ -73,12 +76,12 @@ def write_run(
     chosen = config.plain(config.Config(fit=config.Fit(epochs=5), search=config.Search(rollouts=30)))
     own = {name: chosen[name] for name in ("simulation", "losses", "released_quirks")}
     settings: dict[str, dict[str, Any]] = {"search": own | {"search": chosen["search"]}, "rollout": {}}
-    _history(search / "history.parquet", "best_cost", np.minimum.accumulate(rng.uniform(1e-5, 2e-3, 30)))
+    write_history(search / "history.parquet", "best_cost", np.minimum.accumulate(rng.uniform(1e-5, 2e-3, 30)))
     StageRecord(stage="search", status="ok", settings=settings["search"]).save(search / "search.json")
     records, histories = {"search": search / "search.json"}, {"search": search / "history.parquet"}
     if method != "search_only":
         settings["fit"] = own | {"fit": chosen["fit"]}
-        _history(folder / "history.parquet", "loss", 1e-4 * np.exp(-np.arange(5.0)))
+        write_history(folder / "history.parquet", "loss", 1e-4 * np.exp(-np.arange(5.0)))
         StageRecord(stage="fit", status="ok", settings=settings["fit"]).save(folder / "fit.json")
         records["fit"], histories["fit"] = folder / "fit.json", folder / "history.parquet"
     named = {}
@@ -93,22 +96,26 @@ def write_run(
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
     names = list(drawn)
-    run = {
-        **{"scenario": scenario.name, "method": method, "seed": seed, "source": scenario.source, "category": scenario.category},
-        **{"format": 1, "status": "ok", "reason": "", "notes": [], "run_key": digest_file(folder / "scores.parquet")},
-        **{"commit": "0123456789abcdef", "device": "cuda:0", "machine": "x86_64, Python 3.11.7", "attempt": 1},
-        **{"variant": {"search": row, "clusters": 5, "fit": "field", "carry_over": False, "average_seeds": False, "horizon": 10}},
-        **{"images": None, "params": {}, "settings": settings, "data_digest": "0" * 64, "scores_file": "scores.parquet"},
-        "histories": {name: _relative(path, folder) for name, path in histories.items() if curves},
-        "timings": {name: float(rng.uniform(60, 600)) for name in records} | {"score": 2.0},
-        "peak_memory_mb": dict.fromkeys(records, 900.0),
-        "artifacts": {
+    record = run_record(
+        scenario=scenario.name,
+        method=method,
+        seed=seed,
+        source=scenario.source,
+        category=scenario.category,
+        run_key=digest_file(folder / "scores.parquet").rpartition(":")[2],
+        device="cuda:0",
+        variant={"search": row, "clusters": 5, "fit": "field", "carry_over": False, "average_seeds": False, "horizon": 10},
+        settings=settings,
+        histories={name: _relative(path, folder) for name, path in histories.items() if curves},
+        timings={name: float(rng.uniform(60, 600)) for name in records} | {"score": 2.0},
+        peak_memory_mb=dict.fromkeys(records, 900.0),
+        artifacts={
             "records": [_relative(path, folder) for path in records.values()],
             "plots": [name for name in names if name.startswith("plots/")],
             "images": [name for name in names if not name.startswith("plots/")],
         },
-    }
-    write_text(folder / "run.json", json.dumps(run | changes))
+    )
+    replace(record, **changes).save(folder / "run.json")
     return folder / "run.json"
 
 
@@ -159,7 +166,7 @@ def save_job(results: Path, name: str, attempts: Sequence[Attempt]) -> None:
     write_text(results / "logs" / f"{name}.log", "what it said\n")
 
 
-def _observations(name: str, source: str, nodes: int) -> Observations:
+def observations(name: str, source: str, nodes: int) -> Observations:
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     category = name.removeprefix("synthetic_").split("_")[-1] if not name[-1].isdigit() else name.split("_")[-2]
     scenario = Scenario(name=name, source=source, category=category, frame_count=FRAMES, train_end=TRAIN, frame_rate=RATE, up="+z")
@@ -192,7 +199,7 @@ def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def _history(path: Path, metric: str, values: np.ndarray) -> None:
+def write_history(path: Path, metric: str, values: np.ndarray) -> None:
     write_table(pd.DataFrame({"step": np.arange(len(values)), "metric": metric, "value": values}), path)
 
 
@@ -213,6 +220,13 @@ def _pictures(folder: Path) -> dict[str, bytes]:
         (folder / name).unlink()
     folder.rmdir()
     return found
+
+
+def page_section(page: str, key: str) -> str:
+    """The text of a section of a report, without tags; what cells and lines hold is separated by spaces."""
+    match = re.search(rf'<section id="{key}">(.*?)</section>', page, re.DOTALL)
+    assert match, key
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", match[1])).split())
 
 
 def _relative(path: Path, folder: Path) -> str:

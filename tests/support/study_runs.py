@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from neuspring.core.records import StageRecord, canonical, digest_file
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.run_record import key_of
 from neuspring.scores.metrics import COLUMNS, UNITS
+from neuspring.scores.runs import Collected
+from tests.support.runs import run_record
 
 Scores = Mapping[tuple[str, str], float]
 """By task and metric, in our units."""
@@ -32,15 +34,15 @@ def write_run(
     reason: str = "",
     images: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
-    held: Scores | None = None,
+    frozen: Scores | None = None,
 ) -> Path:
     """A finished (or failed) run as `stages.score` leaves it; returns the path of run.json.
 
-    `held`: of a failed run, the scores of a prediction that stays at its last finite frame.
+    `frozen`: of a failed run, the scores of a prediction that stays at its last finite frame.
     """
     folder = results / scenario / method / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, values in {"scores": scores, "held": held}.items():
+    for name, values in {"scores": scores, "held": frozen}.items():
         rows = [(scenario, category, method, seed, *key, value, UNITS[key[1]], frames) for key, value in (values or {}).items()]
         if values is not None:
             pd.DataFrame(rows, columns=list(COLUMNS)).to_parquet(folder / f"{name}.parquet")
@@ -50,37 +52,31 @@ def write_run(
     own = {"fit": {"epochs": 7, "horizon": 1}, "kind": "springs", "seed": seed} | dict(settings or {})
     twin = ["twin.npz", digest_file(folder / "twin.npz")]
     StageRecord(stage="fit", status="ok", files={"twin": twin}, settings=own).save(folder / "fit.json")
-    content = {
-        "scenario": scenario,
-        "method": method,
-        "variant": {},
-        "seed": seed,
-        "status": status,
-        "reason": reason,
-        "notes": [],
-        "settings": {"fit": own},
-        "data_digest": digest_file(observations),
-    }
-    made = {"fit": twin[1], "scores": digest_file(folder / "scores.parquet")}
-    run = content | {
-        "images": images,
-        "format": 1,
-        "run_key": hashlib.sha256(canonical([content, made]).encode()).hexdigest(),
-        "source": source,
-        "category": category,
-        "commit": "0123456789abcdef",
-        "device": "cpu",
-        "machine": "x86_64, Python 3.11",
-        "started": "2026-11-21T10:00:00+00:00",
-        "ended": "2026-11-21T10:05:00+00:00",
-        "timings": {},
-        "params": {},
-        "scores_file": "scores.parquet",
-        "held_file": None if held is None else "held.parquet",
-        "artifacts": {"records": ["fit.json"]},
-    }
-    (folder / "run.json").write_text(json.dumps(run))
+    record = run_record(
+        scenario=scenario,
+        method=method,
+        seed=seed,
+        status=status,
+        reason=reason,
+        settings={"fit": own},
+        data_digest=digest_file(observations),
+        images=images,
+        source=source,
+        category=category,
+        held_file=None if frozen is None else "held.parquet",
+        artifacts={"records": ["fit.json"]},
+    )
+    key = key_of(record.content, {"fit": twin[1], "scores": digest_file(folder / "scores.parquet")})
+    replace(record, run_key=key).save(folder / "run.json")
     return folder / "run.json"
+
+
+def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str, str, int], ...] = ()) -> Collected:
+    """Future track errors in meters by (scenario, method, seed), without files; the other runs failed."""
+    rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
+    runs = [(*run, "ok", "", "") for run in values] + [(*run, "failed", "diverged", "") for run in failed]
+    columns = ["scenario", "method", "seed", "status", "reason", "notes"]
+    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=columns))
 
 
 def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:
@@ -91,7 +87,7 @@ def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:
 
 
 def write_benchmark(
-    results: Path, scenarios: Iterable[str], methods: Mapping[str, float], seeds: Iterable[int] = (0, 1), **kept: Any
+    results: Path, scenarios: Iterable[str], methods: Mapping[str, float], seeds: Iterable[int] = (0, 1), **facts: Any
 ) -> None:
     """Runs of every scenario, method and seed; `methods` maps each to the factor of its errors, which scenarios and seeds vary."""
     rng = np.random.default_rng(0)
@@ -99,4 +95,4 @@ def write_benchmark(
         size = rng.uniform(0.5, 1.5)
         for seed in seeds:
             for method, factor in methods.items():
-                write_run(results, scenario, method, seed, all_scores(size * factor * rng.uniform(0.99, 1.01)), **kept)
+                write_run(results, scenario, method, seed, all_scores(size * factor * rng.uniform(0.99, 1.01)), **facts)

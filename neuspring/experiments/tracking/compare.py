@@ -18,10 +18,10 @@ import pandas as pd
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.experiments.tracking.query import LoggedRun, logged_runs
-from neuspring.report.tables.summary import paired_differences
-from neuspring.scores.layout import SHOWN, markdown
-from neuspring.scores.metrics import TASKS, UNITS
+from neuspring.scores.metrics import METRICS, TASKS, UNITS
+from neuspring.scores.statistics import paired_differences
 
 DIRTY = "-dirty"
 SECONDS = "seconds"
@@ -156,7 +156,8 @@ def _score_lines(differences: pd.DataFrame, first: str, second: str) -> list[str
 
 
 def _cells(row: Any) -> list[str]:
-    factor, digits = SHOWN.get(row.metric, (1.0, 1))
+    metric = METRICS.get(row.metric)
+    factor, digits = (metric.factor, metric.digits) if metric else (1.0, 1)
     unit = {"m": "mm", "1": ""}.get(row.unit, row.unit)
     first, second = (f"{factor * value:.{digits}f}" for value in (row.mean_first, row.mean_second))
     difference = f"{factor * row.difference:+.{digits}f}"

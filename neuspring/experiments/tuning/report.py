@@ -17,11 +17,11 @@ from neuspring import config
 from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.records import FACTS, VALUES, labels, write_sweep, write_trial
 from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan
 from neuspring.experiments.tuning.store import DEFINITION, WORKER, Slot, Store, slots
-from neuspring.report.tables.summary import markdown
 
 if TYPE_CHECKING:
     from optuna.study import Study

@@ -1,1 +1,1 @@
-"""Pictures of a run and of a benchmark."""
+"""PNG figures: of a run (`run`, `twin`, `images`), of a benchmark (`ratios`, `clusters`); `views` has their helpers."""

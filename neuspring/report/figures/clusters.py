@@ -17,28 +17,28 @@ from neuspring.scores.metrics import averages
 NAME = "clusters.png"
 MM = 1e3
 MOST_PANELS = 4
-"""With more scenarios than this one panel shows their mean."""
+"""For more scenarios than this, one panel shows their mean."""
 STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
 
 
 def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
     """The methods named clusters_<K>, each once, with K; sorted by K."""
-    found = {method: int(match[1]) for method in methods if (match := re.fullmatch(r"clusters_(\d+)", method))}
-    return dict(sorted(found.items(), key=lambda item: item[1]))
+    counts = {method: int(match[1]) for method in methods if (match := re.fullmatch(r"clusters_(\d+)", method))}
+    return dict(sorted(counts.items(), key=lambda item: item[1]))
 
 
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
-    """What is drawn: scenario, task, clusters (K), mean and std, mm, over seeds; the mean over scenarios has the scenario "".
+    """The curves: scenario, task, clusters (K), mean and std [mm] over seeds. Rows of the mean over scenarios have the scenario "".
 
-    `scores` are rows of `metrics.COLUMNS`, metres; methods that are not named clusters_<K> are ignored. The standard deviation
+    `scores` are rows of `metrics.COLUMNS`, meters; methods that are not named clusters_<K> are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.
     """
-    known = cluster_methods(scores["method"])
-    rows = scores[scores["method"].isin(list(known)) & (scores["metric"] == "chamfer")]
+    methods = cluster_methods(scores["method"])
+    rows = scores[scores["method"].isin(list(methods)) & (scores["metric"] == "chamfer")]
     own = rows.groupby(["scenario", "task", "method"], sort=False)["value"].agg(["mean", "std"]).fillna(0.0).reset_index()
     all_of_them = averages(rows, by=("task", "method")).rename(columns={"equal": "mean", "seed_std": "std"}).assign(scenario="")
     names = ["scenario", "task", "clusters", "mean", "std"]
-    table = pd.concat([own, all_of_them]).assign(clusters=lambda t: t["method"].map(known))[names]
+    table = pd.concat([own, all_of_them]).assign(clusters=lambda t: t["method"].map(methods))[names]
     table[["mean", "std"]] *= MM
     return table.sort_values(["scenario", "task", "clusters"], ignore_index=True)
 
@@ -73,10 +73,10 @@ def clusters_figure(scores: pd.DataFrame, path: Path, note: str = "") -> Path | 
 
 
 def _draw(axis: Axes, curves: pd.DataFrame, *, faint: bool = False) -> None:
-    for task, (colour, marker) in STYLES.items():
+    for task, (color, marker) in STYLES.items():
         part = curves[curves["task"] == task]
         if faint:
-            axis.plot(part["clusters"], part["mean"], color=colour, lw=0.7, alpha=0.35)
+            axis.plot(part["clusters"], part["mean"], color=color, lw=0.7, alpha=0.35)
         elif len(part):
             bars = part["std"] if np.any(part["std"] > 0) else None
-            axis.errorbar(part["clusters"], part["mean"], bars, color=colour, marker=marker, ms=4, capsize=3, label=task)
+            axis.errorbar(part["clusters"], part["mean"], bars, color=color, marker=marker, ms=4, capsize=3, label=task)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,42 +15,25 @@ from neuspring.core.artifacts import Scenario
 from neuspring.report.figures.run import chosen_frames
 from neuspring.report.figures.views import save
 from neuspring.scores.images import psnr
+from neuspring.scores.pictures import Pair
 from neuspring.splats.losses import Shot
 
 WORST = 0.5
-"""Colour difference, of 1, at the bright end of error pictures."""
+"""Color difference, of 1, at the bright end of error pictures."""
 BAR = 6
 """Height of the bar that shows the time, px."""
 TITLE = 20
 """Height of the line of names, px."""
 TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
-"""Colours of the two parts of the time."""
+"""Colors of the two parts of the time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """What was seen and what is predicted, in one frame of one camera."""
-
-    observed: np.ndarray
-    """[H, W, 3] uint8."""
-    rendered: np.ndarray
-    """[H, W, 4] uint8, over black."""
-    truth: torch.Tensor
-    """[3, H, W], masked as for metrics."""
-    prediction: torch.Tensor
-    """[3, H, W], masked as for metrics."""
-    silhouettes: tuple[np.ndarray, np.ndarray]
-    """Observed and predicted [H, W] bool."""
-    hands: np.ndarray
-    """[H, W] bool."""
-
-    @property
-    def error(self) -> np.ndarray:
-        """Mean absolute colour difference in false colours [H, W, 3] uint8, grey behind hands."""
-        difference = (self.truth - self.prediction).abs().mean(0).numpy() / WORST
-        picture = (255 * matplotlib.colormaps["inferno"](np.clip(difference, 0, 1))[..., :3]).astype(np.uint8)
-        picture[self.hands] = 70
-        return picture
+def error_picture(pair: Pair) -> np.ndarray:
+    """Mean absolute color difference in false colors [H, W, 3] uint8, gray behind hands."""
+    difference = (pair.truth - pair.prediction).abs().mean(0).numpy() / WORST
+    picture = (255 * matplotlib.colormaps["inferno"](np.clip(difference, 0, 1))[..., :3]).astype(np.uint8)
+    picture[pair.hands] = 70
+    return picture
 
 
 def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], around: Mapping[int, np.ndarray], path: Path) -> Path:
@@ -86,12 +68,12 @@ class Strip:
         self._pairs: dict[int, Pair] = {}
 
     def add(self, frame: int, pair: Pair) -> None:
-        """Keep the frame if it is one to show."""
+        """Keep the pair if its frame is shown."""
         if frame in self._names:
             self._pairs[frame] = pair
 
     def save(self, path: Path) -> Path:
-        """Write the picture."""
+        """Write the figure."""
         count = max(len(self._pairs), 1)
         height, width = next(iter(self._pairs.values())).hands.shape if self._pairs else (9, 16)
         figure, axes = plt.subplots(
@@ -100,7 +82,7 @@ class Strip:
         for column, (frame, pair) in zip(axes.T, self._pairs.items(), strict=False):
             quality = float(psnr(pair.prediction, pair.truth))
             column[0].set_title(f"frame {frame}: {self._names[frame]}\n{quality:.1f} dB", fontsize=9)
-            for axis, picture in zip(column, (pair.observed, pair.rendered[..., :3], pair.error), strict=True):
+            for axis, picture in zip(column, (pair.observed, pair.rendered[..., :3], error_picture(pair)), strict=True):
                 axis.imshow(picture)
         for axis, label in zip(axes[:, 0], ("observed", "predicted", f"difference, 0 to {WORST:g}"), strict=True):
             axis.set_ylabel(label, fontsize=9)
@@ -111,14 +93,18 @@ class Strip:
 
 
 class Film:
-    """Lays out the frames of the two videos: observed, predicted and difference side by side; the twin seen all around."""
+    """Lays out the frames of two videos: observed, predicted and difference side by side; the twin from all around."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
 
     def compared(self, frame: int, pair: Pair) -> np.ndarray:
         """A frame of the comparison [H, W, 3] uint8."""
-        panels = {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": pair.error}
+        panels = {
+            "observed": pair.observed,
+            "predicted": pair.rendered[..., :3],
+            f"difference, 0 to {WORST:g}": error_picture(pair),
+        }
         return self._titled(panels, frame)
 
     def turned(self, frame: int, picture: np.ndarray) -> np.ndarray:
@@ -126,16 +112,16 @@ class Film:
         return self._titled({"twin": picture}, frame)
 
     def _titled(self, panels: Mapping[str, np.ndarray], frame: int) -> np.ndarray:
-        """Panels side by side below their names and a bar of the time: training and future coloured, the border between white."""
+        """Panels side by side, below their names and a bar of time: training and future in colors, their border in white."""
         picture = np.hstack(list(panels.values()))
         width, total, end = picture.shape[1], self._scenario.frame_count, self._scenario.train_end
         future = frame >= end
         title = np.zeros((TITLE, width, 3), np.uint8)
         for k, name in enumerate(panels):
             text = f"{name}, frame {frame} ({'future' if future else 'training'})" if k == 0 else name
-            colour = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
+            color = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
             place = (6 + k * width // len(panels), TITLE - 6)
-            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+            cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
         bar = np.zeros((BAR, width, 3), np.uint8)
         border, now = (round(width * k / total) for k in (end, frame + 1))
         for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):

@@ -10,15 +10,19 @@ from matplotlib import pyplot as plt
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from neuspring.report.figures.views import save
+from neuspring.scores.metrics import DISTANCES
 
 NAME = "ratios.png"
-STYLES = {"chamfer": ("Chamfer distance", "tab:orange", "s", 0.15), "track_error": ("track error", "tab:blue", "o", -0.15)}
+STYLES = (("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:purple", "D"))
+"""Color and marker of each distance."""
+SHIFT = 0.15
+"""The markers of a method stand within so much of its line."""
 TITLES = {"reconstruction": "training frames", "future": "future"}
 TICKS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0)
 
 
 def ratios_figure(differences: pd.DataFrame, path: Path, note: str) -> Path | None:
-    """Draw `tables.paired_differences`, a panel per task, methods in the order given; returns the file.
+    """Draw `statistics.paired_differences`, a panel per task, methods in the order given; returns the file.
 
     None, and no file, if no ratio has an interval (one scenario, or nothing to compare). `note` is added below the title.
     """
@@ -31,13 +35,13 @@ def ratios_figure(differences: pd.DataFrame, path: Path, note: str) -> Path | No
     size = (4.2 * len(tasks) + 1.2, 0.34 * len(methods) + 1.6)
     figure, axes = plt.subplots(1, len(tasks), figsize=size, layout="constrained", squeeze=False, sharey=True)
     for axis, task in zip(axes[0], tasks, strict=True):
-        for metric, (label, colour, marker, shift) in STYLES.items():
-            part = rows[(rows["task"] == task) & (rows["metric"] == metric)]
+        for metric, (color, marker), shift in zip(DISTANCES, STYLES, np.linspace(SHIFT, -SHIFT, len(DISTANCES)), strict=False):
+            part = rows[(rows["task"] == task) & (rows["metric"] == metric.name)]
             if not len(part):
                 continue
             place = np.array([methods.index(method) for method in part["method"]]) - shift
             reach = np.stack([part["ratio"] - part["ratio_low"], part["ratio_high"] - part["ratio"]])
-            axis.errorbar(part["ratio"], place, xerr=reach, fmt=marker, color=colour, ms=4, capsize=2, label=label)
+            axis.errorbar(part["ratio"], place, xerr=reach, fmt=marker, color=color, ms=4, capsize=2, label=metric.title)
         axis.axvline(1.0, color="0.3", lw=0.8, ls="--")
         axis.set(title=TITLES[task], xscale="log", xlabel=f"error / that of {baseline} (below 1 is better)")
         low, high = axis.get_xlim()

@@ -1,4 +1,4 @@
-"""Pictures of a run: errors over time, losses, predicted against observed points, and the twin (`figures_twin`)."""
+"""Figures of a run: errors over time, losses, predicted against observed points, and the twin (`figures.twin`)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from matplotlib.ticker import MaxNLocator
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
 from neuspring.report.figures.twin import CONTROLLER, stiffness_figure, topology_figure
 from neuspring.report.figures.views import View, limits, point_size, readable, sample, save, side_view, widest_axis
-from neuspring.scores.metrics import chamfer_per_frame, track_error_per_frame
+from neuspring.scores.metrics import PICTURES, chamfer_per_frame, track_error_per_frame
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
-IMAGE_LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "iou": "IoU"}
 MM = 1e3
 PANEL, HEIGHTS = 3.1, (1.1, 3.1)
 """Width of a panel of motion.png, and the least and greatest height, inches."""
@@ -34,9 +33,9 @@ SERIES = {
     "fit": (("loss", "frames trained on"), ("tail_loss", "held-back frames")),
     "train": (("loss", "training loss"),),
 }
-"""Stage -> metrics of its history that are drawn, and their labels."""
+"""Stage to the metrics of its history that are drawn, and their labels."""
 AXES = {"search": ("rollout", "training cost"), "fit": ("epoch", "loss [m$^2$]"), "train": ("step", "loss")}
-"""Stage -> labels of its axes. Losses of baselines are of several kinds: epochs or iterations, squared distances or silhouettes."""
+"""Stage to the labels of its axes. Baselines train by epochs or iterations, on squared distances or silhouettes."""
 
 
 def run_figures(
@@ -49,36 +48,36 @@ def run_figures(
     twin: Twin | None = None,
     searched: float | None = None,
 ) -> list[Path]:
-    """Draw what a run has, and return the files.
+    """Draw the figures of a run, and return the files.
 
     errors.png and motion.png need a trajectory, losses.png a history, topology.png and stiffness.png the run's last twin.
     `searched` is the homogeneous stiffness that the search found, N, marked among the twin's.
     """
     title = f"{observations.scenario.name}, {method}"
-    made = []
+    paths = []
     # A picture of an earlier result must not stay beside this one's.
     for name in (*NAMES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
     if trajectory is not None and len(trajectory.positions):
-        made.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
-        made.append(save(_motion(observations, trajectory, title), folder / "motion.png"))
+        paths.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
+        paths.append(save(_motion(observations, trajectory, title), folder / "motion.png"))
     if histories:
-        made.append(save(_losses(histories, title), folder / "losses.png"))
+        paths.append(save(_losses(histories, title), folder / "losses.png"))
     if twin is not None:
-        made.append(save(topology_figure(twin, title), folder / "topology.png"))
+        paths.append(save(topology_figure(twin, title), folder / "topology.png"))
         if twin.topology.object_spring_count:
-            made.append(save(stiffness_figure(twin, searched, title), folder / "stiffness.png"))
-    return made
+            paths.append(save(stiffness_figure(twin, searched, title), folder / "stiffness.png"))
+    return paths
 
 
 def _errors(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
     seconds = np.arange(len(trajectory.positions)) / observations.scenario.frame_rate
-    for label, values, colour in (
+    for label, values, color in (
         ("track error (Euclidean)", track_error_per_frame(trajectory.positions, observations), "tab:blue"),
         ("Chamfer distance (L1)", chamfer_per_frame(trajectory.positions, observations), "tab:orange"),
     ):
-        axis.plot(seconds, MM * values, label=label, color=colour)
+        axis.plot(seconds, MM * values, label=label, color=color)
     split = observations.scenario.train_end / observations.scenario.frame_rate
     axis.axvspan(split, observations.scenario.frame_count / observations.scenario.frame_rate, color="0.92", label="future")
     axis.set(xlabel="time [s]", ylabel="error [mm]", title=title, ylim=(0, None), xlim=(0, None))
@@ -88,16 +87,16 @@ def _errors(observations: Observations, trajectory: Trajectory, title: str) -> F
 
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
     """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
-    shown = [metric for metric in IMAGE_LABELS if metric in set(frames["metric"])]
+    shown = [metric for metric in PICTURES if metric.name in set(frames["metric"])]
     figure, axes = plt.subplots(
         len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False
     )
     for axis, metric in zip(axes[:, 0], shown, strict=True):
-        values = frames[frames["metric"] == metric].groupby("frame")["value"].mean()
+        values = frames[frames["metric"] == metric.name].groupby("frame")["value"].mean()
         axis.plot(values.index / scenario.frame_rate, values, color="tab:blue")
         axis.axvspan(scenario.train_end / scenario.frame_rate, scenario.frame_count / scenario.frame_rate, color="0.92")
-        axis.set(ylabel=IMAGE_LABELS[metric], xlim=(0, None))
-    axes[0, 0].set_title(f"{scenario.name}, {method} (grey: future)")
+        axis.set(ylabel=metric.label, xlim=(0, None))
+    axes[0, 0].set_title(f"{scenario.name}, {method} (gray: future)")
     axes[-1, 0].set_xlabel("time [s]")
     return save(figure, folder / IMAGE_SCORES)
 
@@ -120,9 +119,9 @@ def _losses(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
 
 
 def _scale(axis: Axes, history: pd.DataFrame, search: bool) -> None:
-    """A log axis where the values ask for one; in the search only as high as candidates that were simulated."""
-    drawn = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
-    low, high = (drawn.min(), drawn.max()) if len(drawn) else (np.nan, np.nan)
+    """A log axis where values span a factor of `LOG_FROM`. A search axis leaves out candidates that could not be simulated."""
+    values = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
+    low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
     if low > 0 and (search or high >= LOG_FROM * low):
         axis.set_yscale("log")
     else:
@@ -134,7 +133,7 @@ def _scale(axis: Axes, history: pd.DataFrame, search: bool) -> None:
 
 
 def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
-    """Frames to show, in order, and what each one is, of a trajectory of `frames` frames (fewer than the scenario's: diverged)."""
+    """Frames to show, in order, and their names. The trajectory has `frames` frames; it diverged if the scenario has more."""
     last = scenario.frame_count - 1
     # Where two fall together the later entry names the frame.
     named = {
@@ -151,22 +150,22 @@ def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
 
 def _motion(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
     """Predicted nodes, observed points and the error of each, in two side views (rows) of a few frames (columns)."""
-    chosen = chosen_frames(observations.scenario, len(trajectory.positions))
+    frames = chosen_frames(observations.scenario, len(trajectory.positions))
     first = widest_axis(observations.nodes)
     views = [side_view(axis, observations.scenario.up) for axis in (first, 1 - first)]
-    shown = _shown_points(observations, trajectory, list(chosen))
+    shown = _shown_points(observations, trajectory, list(frames))
     bounds, heights = zip(*(_panel(view.project(shown)) for view in views), strict=True)
-    size = ((PANEL + 0.35) * len(chosen) + 0.5, sum(heights) + 2.1)
+    size = ((PANEL + 0.35) * len(frames) + 0.5, sum(heights) + 2.1)
     figure, axes = plt.subplots(
-        2, len(chosen), figsize=size, layout="constrained", sharex="row", sharey="row", squeeze=False, height_ratios=heights
+        2, len(frames), figsize=size, layout="constrained", sharex="row", sharey="row", squeeze=False, height_ratios=heights
     )
     errors = track_error_per_frame(trajectory.positions, observations)
     for row, view, bound in zip(axes, views, bounds, strict=True):
-        for axis, frame in zip(row, chosen, strict=True):
+        for axis, frame in zip(row, frames, strict=True):
             _draw_frame(axis, view, observations, trajectory, frame)
             axis.set(xlabel=view.labels[0], aspect="equal", xlim=bound[:, 0], ylim=bound[:, 1])
         row[0].set_ylabel(view.labels[1])
-    for axis, (frame, name) in zip(axes[0], chosen.items(), strict=True):
+    for axis, (frame, name) in zip(axes[0], frames.items(), strict=True):
         axis.set_title(f"frame {frame}: {name}\n{_error_text(observations, errors, frame)}", fontsize=9)
     handles, names = axes[0][0].get_legend_handles_labels()
     readable(figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8))
@@ -176,7 +175,7 @@ def _motion(observations: Observations, trajectory: Trajectory, title: str) -> F
 
 
 def _shown_points(observations: Observations, trajectory: Trajectory, frames: list[int]) -> np.ndarray:
-    """Points [P, 3], m, that a picture of these frames must hold: all that was seen, and the prediction as far as it is near."""
+    """Points [P, 3], m, that a figure of these frames must show: all observed ones, and predicted ones near them."""
     seen = [observations.object_points[frame][observations.object_visibility[frame]] for frame in frames]
     real = np.concatenate([*seen, *observations.controller_points[frames], observations.nodes])
     # A prediction far away (before it diverges) must not shrink everything else to a dot.
@@ -204,8 +203,8 @@ def _draw_frame(axis: Axes, view: View, observations: Observations, trajectory: 
     small = point_size(len(predicted))
     _scatter(axis, predicted, s=small, color="0.72", label="predicted nodes", zorder=1)
     some = f" (a random {MOST_ERRORS})" if len(pairs) > MOST_ERRORS else ""
-    drawn = list(pairs[sample(len(pairs), MOST_ERRORS)])
-    axis.add_collection(LineCollection(drawn, colors="0.3", linewidths=0.7, label=f"observed to predicted{some}", zorder=3))
+    lines = list(pairs[sample(len(pairs), MOST_ERRORS)])
+    axis.add_collection(LineCollection(lines, colors="0.3", linewidths=0.7, label=f"observed to predicted{some}", zorder=3))
     _scatter(axis, observed, s=point_size(len(observed)), color="tab:blue", label="observed points", zorder=2)
     hands = view.project(observations.controller_points[frame])
     _scatter(axis, hands, s=14, marker="D", color=CONTROLLER, label="controllers", zorder=4)
@@ -214,7 +213,7 @@ def _draw_frame(axis: Axes, view: View, observations: Observations, trajectory: 
 
 
 def _error_text(observations: Observations, errors: np.ndarray, frame: int) -> str:
-    """The track error of a frame in words; metrics give 0 to a frame without annotation, a title must not."""
+    """The track error of a frame in words. Unlike the metric, it is not 0 for a frame without annotation."""
     annotated = ~np.isnan(observations.tracks[frame]).any(axis=1) & ~np.isnan(observations.tracks[0]).any(axis=1)
     return f"track error {MM * errors[frame]:.1f} mm" if annotated.any() else "no annotated track"
 

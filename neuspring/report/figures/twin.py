@@ -29,13 +29,13 @@ from neuspring.report.figures.views import (
     sample_note,
 )
 
-COLOURS = "viridis"
+COLORS = "viridis"
 PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
 CONTROLLER = "tab:red"
 LEAST_RATIO = 2.0
-"""Smallest ratio of the ends of a stiffness axis, so that equal values, or nearly equal ones, are not blown up."""
+"""Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it."""
 DEEPEST = 1e4
-"""Largest ratio of the ends of the colour range."""
+"""Largest ratio of the ends of the color range."""
 BINS = 41
 """Odd, so that equal values sit in the middle of a bar, under the mark of the searched one."""
 KEY, HISTOGRAM = 2.8, 3.3
@@ -43,14 +43,14 @@ KEY, HISTOGRAM = 2.8, 3.3
 
 
 def region_colours(count: int) -> np.ndarray:
-    """One colour [count, 4] per region, RGBA; none like the controllers' or the springs'."""
+    """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
     if count <= len(PALETTE):
         return to_rgba_array(PALETTE[:count])
     return np.asarray(colormaps["turbo"](np.linspace(0.05, 0.85, count)))
 
 
 def topology_figure(twin: Twin, title: str) -> Figure:
-    """Rest nodes coloured by region, springs within and between regions, controllers and their springs; two views."""
+    """Rest nodes colored by region, springs within and between regions, controllers and their springs; two views."""
     topology = twin.topology
     layout = TwoViews.of(np.concatenate([topology.nodes, topology.controllers]), twin.simulation.up)
     width, height = layout.inches
@@ -79,7 +79,7 @@ def _draw_springs(axis: Axes, view: View, topology: Topology) -> None:
     drawn[sample(len(springs))] = True
     several = bool(crossing.any())
     width = 0.7 * line_width(int(drawn.sum()))
-    for chosen, colour, name in (
+    for chosen, color, name in (
         (~held & ~crossing, "0.75", "springs within a region" if several else "springs"),
         (crossing, "0.25", "springs between regions"),
         (held, "lightcoral", "springs of controllers"),
@@ -87,22 +87,22 @@ def _draw_springs(axis: Axes, view: View, topology: Topology) -> None:
         if chosen.any():
             label = f"{name} ({int(chosen.sum())})"
             axis.add_collection(
-                LineCollection(list(flat[springs[chosen & drawn]]), colors=colour, linewidths=width, label=label, zorder=1)
+                LineCollection(list(flat[springs[chosen & drawn]]), colors=color, linewidths=width, label=label, zorder=1)
             )
 
 
 def _draw_nodes(axis: Axes, view: View, topology: Topology) -> None:
-    """Nodes in the colour of their region, near ones in front, and controllers."""
+    """Nodes in the color of their region, near ones in front, and controllers."""
     flat, order = view.project(topology.nodes), np.argsort(view.depth(topology.nodes))
     names, region = np.unique(topology.labels, return_inverse=True)
-    colours, size = region_colours(len(names)), point_size(len(flat))
-    axis.scatter(flat[order, 0], flat[order, 1], s=size, c=colours[region[order]], linewidths=0, zorder=2)
+    colors, size = region_colours(len(names)), point_size(len(flat))
+    axis.scatter(flat[order, 0], flat[order, 1], s=size, c=colors[region[order]], linewidths=0, zorder=2)
     degree = np.bincount(topology.springs.ravel(), minlength=len(flat))[: len(flat)]
     for index, name in enumerate(names):
         inside = region == index
         title = f"region {name}" if len(names) > 1 else "all"
         title += f": {int(inside.sum())} nodes, {degree[inside].mean():.1f} springs each"
-        axis.scatter([], [], s=16, color=colours[index], label=title)
+        axis.scatter([], [], s=16, color=colors[index], label=title)
     lonely = flat[degree == 0]
     if len(lonely):
         axis.scatter(
@@ -114,7 +114,7 @@ def _draw_nodes(axis: Axes, view: View, topology: Topology) -> None:
 
 
 def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
-    """Ends of a logarithmic colour range, N, for stiffness [S], N.
+    """Ends of a logarithmic color range, N, for stiffness [S], N.
 
     All but the outermost 0.5 % on either side; at least a factor of 2 and at most one of 10^4 apart; positive whatever comes in.
     """
@@ -126,7 +126,7 @@ def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
 
 
 def widened(low: float, high: float) -> tuple[float, float]:
-    """The same range, or one of a factor of 2 about its middle if it is narrower."""
+    """The same range; a range narrower than a factor of 2 is widened to that about its geometric mean."""
     if high >= LEAST_RATIO * low:
         return low, high
     middle = float(np.sqrt(low * high))
@@ -134,7 +134,7 @@ def widened(low: float, high: float) -> tuple[float, float]:
 
 
 def stiffness_figure(twin: Twin, searched: float | None, title: str) -> Figure:
-    """Object springs in frame 0 coloured by stiffness in two views, and their histogram with the searched stiffness [N] marked.
+    """Object springs in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
 
     The twin must have an object spring.
     """
@@ -148,9 +148,9 @@ def stiffness_figure(twin: Twin, searched: float | None, title: str) -> Figure:
     panels = layout.axes(figure, bottom=BOTTOM + 0.2)
     for axis, view in panels:
         lines = _draw_stiffness(axis, view, topology, stiffness, norm)
-    colours = place(figure, LEFT + width + 0.2, BOTTOM + 0.2, 0.16, height)
-    figure.colorbar(lines, cax=colours, extend=_beyond(stiffness, norm), label="stiffness [N]")
-    colours.tick_params(labelsize=8, which="both")
+    colors = place(figure, LEFT + width + 0.2, BOTTOM + 0.2, 0.16, height)
+    figure.colorbar(lines, cax=colors, extend=_beyond(stiffness, norm), label="stiffness [N]")
+    colors.tick_params(labelsize=8, which="both")
     _histogram(place(figure, LEFT + width + 1.7, BOTTOM + 0.2, HISTOGRAM, max(height, 2.4) - 0.2), stiffness, norm, searched)
     headline(figure, title, f"stiffness of {count} object springs{sample_note(count)}")
     return figure
@@ -162,15 +162,15 @@ def _draw_stiffness(axis: Axes, view: View, topology: Topology, stiffness: np.nd
     # Near springs are drawn last, so a view shows the side of the body that faces it.
     order = np.argsort(view.depth(topology.nodes)[ends].mean(axis=1), kind="stable")
     segments = view.project(topology.nodes)[ends[order]]
-    lines = LineCollection(list(segments), cmap=COLOURS, norm=norm, linewidths=line_width(len(chosen)))
-    # A stiffness of 0 has no colour on a log scale; it takes that of the lower end.
+    lines = LineCollection(list(segments), cmap=COLORS, norm=norm, linewidths=line_width(len(chosen)))
+    # A stiffness of 0 has no color on a log scale; it takes that of the lower end.
     lines.set_array(np.clip(stiffness[chosen[order]], norm.vmin, norm.vmax))
     axis.add_collection(lines)
     return lines
 
 
 def _beyond(stiffness: np.ndarray, norm: LogNorm) -> str:
-    """Which ends of the colour bar get an arrow, because values lie beyond them."""
+    """Which ends of the color bar get an arrow, because values lie beyond them."""
     below, above = bool((stiffness < norm.vmin).any()), bool((stiffness > norm.vmax).any())
     return {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[below, above]
 
@@ -183,7 +183,7 @@ def histogram_edges(stiffness: np.ndarray) -> np.ndarray:
 
 
 def floored(stiffness: np.ndarray) -> np.ndarray:
-    """Stiffness [S], N, with what lies more than a factor of 10^6 below the largest, 0 included, raised to that."""
+    """Stiffness [S], N. Values below the largest / 10^6 are raised to that."""
     raised: np.ndarray = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     return raised
 
@@ -193,12 +193,12 @@ def _newtons(value: float) -> str:
 
 
 def _histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float | None) -> None:
-    """Numbers of springs over log stiffness, in the colours of the views."""
+    """A histogram of springs over log stiffness, in the colors of the views."""
     shown = floored(stiffness)
     edges = histogram_edges(shown)
     counts, _ = np.histogram(shown, edges)
     middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
-    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[COLOURS](norm(middles)), edgecolor="0.4", lw=0.3)
+    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[COLORS](norm(middles)), edgecolor="0.4", lw=0.3)
     middle = float(np.median(stiffness))
     text = f"median {_newtons(middle)}"
     if searched:

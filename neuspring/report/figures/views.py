@@ -1,4 +1,4 @@
-"""What pictures share: projections of the world, two views drawn at one scale, sizes that suit many points, and saving."""
+"""Helpers of figures: projections of the world, two views at one scale, sizes for many points, saving."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class View:
     labels: tuple[str, str]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Picture coordinates [..., 2] of points [..., 3], metres; the second grows upwards in the picture."""
+        """Picture coordinates [..., 2] of points [..., 3], meters; the second grows upwards in the picture."""
         flat: np.ndarray = np.asarray(points, np.float64) @ np.array([self.right, self.upwards]).T
         return flat
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """Distance towards the viewer [...] of points [..., 3], metres."""
+        """Distance towards the viewer [...] of points [..., 3], meters."""
         towards: np.ndarray = np.asarray(points, np.float64) @ np.cross(self.right, self.upwards)
         return towards
 
@@ -96,7 +96,7 @@ class TwoViews:
     below: bool
     """Whether the second view lies below the first (from above) or beside it (other side)."""
     scale: float
-    """Inches per metre."""
+    """Inches per meter."""
 
     @classmethod
     def of(cls, points: np.ndarray, up: Up, width: float = 6.5, height: float = 5.2) -> TwoViews:
@@ -149,7 +149,7 @@ def place(figure: Figure, left: float, bottom: float, width: float, height: floa
 
 
 def headline(figure: Figure, title: str, text: str) -> None:
-    """A title and a line of text in the upper left corner, where they meet no legend."""
+    """A title and a line of text in the upper left corner, away from legends."""
     high = figure.get_size_inches()[1]
     figure.text(LEFT / figure.get_size_inches()[0], 1 - 0.1 / high, f"{title}\n{text}", ha="left", va="top", fontsize=10)
 
@@ -162,7 +162,7 @@ def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:
 
 
 def sample_note(count: int, most: int = MOST_SPRINGS) -> str:
-    """What a title says about springs that are left out; empty if none is."""
+    """The part of a title that says how many springs are drawn; empty if all are."""
     return "" if count <= most else f", a random {most} of them drawn"
 
 
@@ -177,7 +177,7 @@ def line_width(count: int) -> float:
 
 
 def readable(legend: Legend) -> None:
-    """Give the samples in a legend sizes that can be seen, however fine the lines and points they stand for."""
+    """Enlarge the samples in a legend, so that those of fine lines and points can be seen."""
     for handle in legend.legend_handles:
         if isinstance(handle, Line2D):
             handle.set_linewidth(1.3)

@@ -1,8 +1,8 @@
-"""Curves: what the search found, how fits went, and errors over the frames; a panel per scenario, methods over one another."""
+"""Curves of search costs, losses, and errors over time: a panel per scenario with a line per method."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,70 +15,72 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
+from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
 from neuspring.report.page import draw
-from neuspring.report.page.blocks import Block, Drawing, Fold, Grid, Legend, Section, Text
 from neuspring.report.page.sources import UNREADABLE, Material, Run
-from neuspring.scores.metrics import track_errors
+from neuspring.scores.metrics import METRICS, track_errors
 
 PENALTY = 1e3
-"""Costs above stand for candidates that could not be simulated."""
-MM = 1e3
+"""Costs above this stand for candidates that could not be simulated."""
 PANEL = (3.3, 2.1)
 FRAME = (0.16, 0.11, 0.77, 0.83)
-"""Of the axes in a panel; a layout that is computed takes most of the time."""
+"""Place of the axes in a panel. It is fixed because a computed layout takes most of the time."""
 FAINT = 0.5
 MOST_OPEN = 6
-"""Scenarios whose panels are shown at once; more are folded."""
+"""The panels of more scenarios than this are folded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """What one panel shows: name -> seed -> values; the scenario's times if its future is marked."""
+    """The lines of one panel."""
 
     by_name: Mapping[str, Mapping[int, pd.Series]]
+    """Name of the line, seed, values."""
     future: Scenario | None = None
+    """The scenario whose future is marked, if any."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """A kind of panel."""
+
+    title: str
+    about: str
+    collect: Callable[[Material, str], Curves]
+    """Reads the curves of a scenario."""
+    of_methods: bool = True
+    """Whether its lines are methods, which have the same style in all plots."""
+    open: bool = False
+    """Shown without a click, however many panels there are."""
 
 
 def section(material: Material) -> Section:
-    """Error, search, fit and training curves of the drawn methods."""
+    """Error, search, fit and training curves of the shown methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
         return Section(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
-    blocks: list[Block] = []
-    for collect, title, about in (
-        (
-            _errors,
-            "Track error over time",
-            "Track error in mm over time in s, one seed. Grey: the future, which no method has seen.",
-        ),
-        (_search, "Search: best cost", "Over candidate rollouts; thin: other seeds. Methods that share a search have one curve."),
-        (_fit, "Fit: loss", "In m², over epochs; thin: other seeds. Losses of methods with other horizons differ in height."),
-        (
-            _train,
-            "Training of baselines: loss",
-            "Over epochs or iterations; thin: other seeds. Every model has a loss of its own: heights tell nothing across models.",
-        ),
-    ):
-        found = {scenario: collect(material, scenario) for scenario in scenarios}
-        found = {scenario: curves for scenario, curves in found.items() if curves.by_name}
-        if not found:
-            continue
-        present = {name for curves in found.values() for name in curves.by_name}
-        methods = material.choice.shown
-        # A method has the same line in all drawings.
-        order = {name: methods.index(name) for name in methods} if collect is not _search else {}
-        names = sorted(present, key=lambda name: (order.get(name, 0), name))
-        styles = {name: draw.line_style(order.get(name, index)) for index, name in enumerate(names)}
-        legend = Legend(entries=[(name, colour, dash[1]) for name, (colour, dash) in styles.items()])
-        panels = [_panel(curves, styles, scenario, title) for scenario, curves in found.items()]
-        inner: list[Block] = [Text(text=about), legend, Grid(blocks=panels)]
-        blocks.append(Fold(summary=title, blocks=inner, open=len(panels) <= MOST_OPEN or collect is _errors))
+    blocks = [block for plot in PLOTS for block in _plot(material, plot, scenarios)]
     return Section(key="curves", title="Curves", about=_about(material), blocks=blocks)
 
 
+def _plot(material: Material, plot: Plot, scenarios: Iterable[str]) -> list[Block]:
+    """A panel per scenario; nothing if no scenario has such curves."""
+    panels = {scenario: plot.collect(material, scenario) for scenario in scenarios}
+    panels = {scenario: curves for scenario, curves in panels.items() if curves.by_name}
+    if not panels:
+        return []
+    order = {name: index for index, name in enumerate(material.choice.shown)} if plot.of_methods else {}
+    lines = sorted({name for curves in panels.values() for name in curves.by_name}, key=lambda name: (order.get(name, 0), name))
+    styles = {name: draw.line_style(order.get(name, index)) for index, name in enumerate(lines)}
+    legend = Legend(entries=[(name, color, dash[1]) for name, (color, dash) in styles.items()])
+    pictures = [_panel(curves, styles, scenario, plot.title) for scenario, curves in panels.items()]
+    inner: list[Block] = [Text(text=plot.about), legend, Grid(blocks=pictures)]
+    return [Fold(summary=plot.title, blocks=inner, open=plot.open or len(pictures) <= MOST_OPEN)]
+
+
 def _about(material: Material) -> str:
-    drawn, all_ = len(material.choice.shown), len(material.choice.methods)
-    return "" if drawn == all_ else f"{drawn} of {all_} methods are drawn: {', '.join(material.choice.shown)}."
+    shown, methods = material.choice.shown, material.choice.methods
+    return "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {', '.join(shown)}."
 
 
 def _search_row(run: Run) -> str:
@@ -88,12 +90,8 @@ def _search_row(run: Run) -> str:
     return parts[0].removeprefix("search-") if parts else ""
 
 
-def _own(material: Material, scenario: str, method: str) -> list[Run]:
-    return [run for run in material.runs if run.scenario == scenario and run.method == method]
-
-
 def _history(material: Material, run: Run, stage: str, metric: str) -> pd.Series | None:
-    """Values by step; None if the run has none."""
+    """Values of a metric by step; None if the run has none."""
     name = run.record.histories.get(stage)
     if not name:
         return None
@@ -108,58 +106,51 @@ def _history(material: Material, run: Run, stage: str, metric: str) -> pd.Series
 
 
 def _search(material: Material, scenario: str) -> Curves:
-    found: dict[str, dict[int, pd.Series]] = {}
-    for run in (run for method in material.choice.shown for run in _own(material, scenario, method)):
+    by_name: dict[str, dict[int, pd.Series]] = {}
+    for run in (run for method in material.choice.shown for run in material.runs_of(scenario, method)):
         name = _search_row(run)
-        if not name or run.seed in found.get(name, {}):
+        if not name or run.seed in by_name.get(name, {}):
             continue
         values = _history(material, run, "search", "best_cost")
         values = None if values is None else values[values < PENALTY]
         if values is not None and len(values):
-            found.setdefault(name, {})[run.seed] = values
-    return Curves(by_name=found)
+            by_name.setdefault(name, {})[run.seed] = values
+    return Curves(by_name=by_name)
 
 
-def _fit(material: Material, scenario: str) -> Curves:
-    return _losses(material, scenario, "fit")
+def _losses(stage: str) -> Callable[[Material, str], Curves]:
+    """Collects the losses of a stage."""
 
+    def collect(material: Material, scenario: str) -> Curves:
+        by_name: dict[str, dict[int, pd.Series]] = {}
+        for method in material.choice.shown:
+            for run in material.runs_of(scenario, method):
+                values = _history(material, run, stage, "loss")
+                if values is not None:
+                    by_name.setdefault(method, {})[run.seed] = values
+        return Curves(by_name=by_name)
 
-def _train(material: Material, scenario: str) -> Curves:
-    return _losses(material, scenario, "train")
-
-
-def _losses(material: Material, scenario: str, stage: str) -> Curves:
-    found: dict[str, dict[int, pd.Series]] = {}
-    for method in material.choice.shown:
-        for run in _own(material, scenario, method):
-            values = _history(material, run, stage, "loss")
-            if values is not None:
-                found.setdefault(method, {})[run.seed] = values
-    return Curves(by_name=found)
+    return collect
 
 
 def _errors(material: Material, scenario: str) -> Curves:
     """Track error of the first run of every method, from its trajectory."""
-    runs = {method: run for method, run in material.first_runs(scenario).items() if run.ok}
+    runs = {method: run for method, run in material.first_runs(scenario).items() if run.record.ok}
     place = material.results / scenario / "observations.npz"
     if not runs or not place.is_file():
         return Curves(by_name={})
     try:
-        facts, tracks = _tracks(place)
+        observations = Observations.load(place)
     except UNREADABLE as error:
         material.lost(place, error)
         return Curves(by_name={})
-    found: dict[str, dict[int, pd.Series]] = {}
+    facts, by_name = observations.scenario, {}
     for method, run in runs.items():
-        values = _track_error(material, run, tracks)
+        values = _track_error(material, run, observations.tracks)
         if values is not None:
-            found[method] = {run.seed: pd.Series(MM * values, index=np.arange(len(values)) / facts.frame_rate)}
-    return Curves(by_name=found, future=facts)
-
-
-def _tracks(path: Path) -> tuple[Scenario, np.ndarray]:
-    observations = Observations.load(path)
-    return observations.scenario, observations.tracks
+            values = METRICS["track_error"].factor * values
+            by_name[method] = {run.seed: pd.Series(values, index=np.arange(len(values)) / facts.frame_rate)}
+    return Curves(by_name=by_name, future=facts)
 
 
 def _track_error(material: Material, run: Run, tracks: np.ndarray) -> np.ndarray | None:
@@ -178,7 +169,34 @@ def _track_error(material: Material, run: Run, tracks: np.ndarray) -> np.ndarray
     return None if np.isnan(values).all() else values
 
 
-def _panel(curves: Curves, styles: Mapping[str, Any], scenario: str, title: str) -> Drawing:
+PLOTS = (
+    Plot(
+        title="Track error over time",
+        about="Track error in mm over time in s, one seed. Gray: the future, which no method has seen.",
+        collect=_errors,
+        open=True,
+    ),
+    Plot(
+        title="Search: best cost",
+        about="Over candidate rollouts; thin: other seeds. Methods that share a search have one curve.",
+        collect=_search,
+        of_methods=False,
+    ),
+    Plot(
+        title="Fit: loss",
+        about="In m², over epochs; thin: other seeds. Losses of methods with other horizons differ in height.",
+        collect=_losses("fit"),
+    ),
+    Plot(
+        title="Training of baselines: loss",
+        about="Over epochs or iterations; thin: other seeds. Every model has its own loss, so the heights of models "
+        "cannot be compared.",
+        collect=_losses("train"),
+    ),
+)
+
+
+def _panel(curves: Curves, styles: Mapping[str, Any], scenario: str, title: str) -> Picture:
     future = curves.future
     with draw.styled():
         figure = Figure(figsize=PANEL)
@@ -191,20 +209,19 @@ def _panel(curves: Curves, styles: Mapping[str, Any], scenario: str, title: str)
             axis.set_xlim(0, end)
         _scale(axis, log=future is None)
         axis.tick_params(length=2.5, width=0.6)
-        picture = draw.svg(figure, f"{title} {scenario}", f"{title}, {scenario}: {', '.join(curves.by_name)}")
-    return Drawing(svg=picture, caption=scenario)
+        return draw.svg(figure, scenario, f"{title}, {scenario}: {', '.join(curves.by_name)}")
 
 
-def _lines(axis: Axes, by_seed: Mapping[int, pd.Series], colour: str, dash: tuple[Any, str]) -> None:
+def _lines(axis: Axes, by_seed: Mapping[int, pd.Series], color: str, dash: tuple[Any, str]) -> None:
     for index, values in enumerate(by_seed.values()):
-        kept = list(draw.thinned(len(values)))
-        style: dict[str, Any] = {"color": colour, "ls": dash[0], "lw": 0.8 if index else 1.5, "alpha": FAINT if index else 1.0}
-        style["marker"] = "o" if len(kept) == 1 else ""
-        axis.plot(values.index[kept], values.to_numpy()[kept], ms=3, **style)
+        steps = list(draw.thinned(len(values)))
+        style: dict[str, Any] = {"color": color, "ls": dash[0], "lw": 0.8 if index else 1.5, "alpha": FAINT if index else 1.0}
+        style["marker"] = "o" if len(steps) == 1 else ""
+        axis.plot(values.index[steps], values.to_numpy()[steps], ms=3, **style)
 
 
 def _scale(axis: Axes, *, log: bool) -> None:
-    """A log axis only where values span enough to need one; else from zero."""
+    """A log axis where values span at least a factor of 2; else an axis from zero."""
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines])
     values = values[np.isfinite(values)]
     if log and len(values) and values.min() > 0 and values.max() >= 2 * values.min():

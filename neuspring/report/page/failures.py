@@ -1,4 +1,4 @@
-"""What went wrong: failed jobs and their causes, numerical failures, damaged files, runs that are missing."""
+"""What went wrong: failed jobs and their causes, numerical failures, damaged files, missing runs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 import pandas as pd
 
 from neuspring.core.job_records import JobRecord
-from neuspring.report.page.blocks import Block, Cell, Chip, Fold, Section, Table, Text
+from neuspring.report.blocks import Block, Cell, Chip, Fold, Section, Table, Text
 from neuspring.report.page.media import link
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import duration, several
 
 MOST_ROWS = 400
-"""More failures are counted, not listed."""
+"""At most so many failures of a kind are listed; the rest is counted."""
 
 
 def section(material: Material) -> Section:
-    """Everything that keeps runs out of the tables, and which runs there are."""
+    """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
     left = [job for job in material.jobs if job.last.outcome == "running"]
     runs = material.collected.runs
@@ -34,14 +34,13 @@ def section(material: Material) -> Section:
     if len(broken):
         blocks.append(_numerical(broken))
     if material.damaged:
-        rows = [[Cell(text=one.path), Cell(text=one.reason, wrap=True)] for one in material.damaged[:MOST_ROWS]]
+        rows = [[Cell(text=path), Cell(text=why, wrap=True)] for path, why in list(material.damaged.items())[:MOST_ROWS]]
         note = "Delete a damaged file and run the same command again." + _rest(len(material.damaged))
         blocks.append(Table(caption="Damaged files", header=["File", "Why"], rows=rows, note=note))
     if left:
-        about = "Running now, or their wrapper was killed before it could say more."
-        blocks.append(
-            Fold(summary=several(len(left), "job") + " without an end", blocks=[Text(text=about), _jobs("Jobs", left, material)])
-        )
+        about = Text(text="Running now, or their wrapper was killed before it could write more.")
+        summary = several(len(left), "job") + " without an end"
+        blocks.append(Fold(summary=summary, blocks=[about, _jobs("Jobs", left, material)]))
     retried = [job for job in material.jobs if not job.failed and len(job.attempts) > 1 and job.last.outcome == "ok"]
     if retried:
         summary = f"{several(len(retried), 'job')} that succeeded after another attempt"
@@ -81,27 +80,24 @@ def _retried(jobs: Sequence[JobRecord]) -> Table:
     for job in jobs[:MOST_ROWS]:
         causes = Counter(attempt.cause or attempt.outcome for attempt in job.attempts[:-1])
         rows.append([Cell(text=job.name), Cell(text=str(len(job.attempts))), Cell(text=", ".join(causes))])
-    return Table(
-        caption="Causes of earlier attempts", header=["Job", "Attempts", "Causes"], rows=rows, note=_rest(len(jobs)).strip()
-    )
+    header = ["Job", "Attempts", "Causes"]
+    return Table(caption="Causes of earlier attempts", header=header, rows=rows, note=_rest(len(jobs)).strip())
 
 
 def _numerical(broken: pd.DataFrame) -> Table:
-    found: list[Any] = list(broken.head(MOST_ROWS).itertuples())
+    runs: list[Any] = list(broken.head(MOST_ROWS).itertuples())
     rows = [
-        [Cell(text=row.scenario), Cell(text=row.method), Cell(text=str(row.seed)), Cell(text=row.reason, wrap=True)]
-        for row in found
+        [*(Cell(text=str(one)) for one in (row.scenario, row.method, row.seed)), Cell(text=row.reason, wrap=True)] for row in runs
     ]
     note = "Results, not crashes: the simulation left its physical range, or the record is damaged." + _rest(len(broken))
-    return Table(
-        caption="Failed runs", header=["Scenario", "Method", "Seed", "Reason"], rows=rows, stub=2, sortable=True, note=note
-    )
+    header = ["Scenario", "Method", "Seed", "Reason"]
+    return Table(caption="Failed runs", header=header, rows=rows, stub=2, sortable=True, note=note)
 
 
 def _matrix(runs: pd.DataFrame) -> Fold:
-    """Which runs there are: scenarios by methods, seeds counted."""
+    """A table of scenarios by methods that counts the finished seeds."""
     counts = runs.groupby(["scenario", "method", "status"]).size().to_dict()
-    begun = set(zip(runs["scenario"], runs["method"], strict=True))
+    asked = set(zip(runs["scenario"], runs["method"], strict=True))
     scenarios, methods = (list(dict.fromkeys(runs[name])) for name in ("scenario", "method"))
     seeds, rows = runs["seed"].nunique(), []
     for scenario in scenarios:
@@ -109,7 +105,7 @@ def _matrix(runs: pd.DataFrame) -> Fold:
         for method in methods:
             ok, failed = (counts.get((scenario, method, status), 0) for status in ("ok", "failed"))
             wrong = f" ✗ {failed}" if failed else ""
-            if (scenario, method) not in begun:
+            if (scenario, method) not in asked:
                 row.append(Cell(text="", value=-1))
                 continue
             text = (f"✓ {ok}" if ok == seeds else f"{ok} of {seeds}" if ok else "" if failed else "–") + wrong

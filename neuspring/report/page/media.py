@@ -1,4 +1,4 @@
-"""Pictures and videos inside the page: made smaller, and only as many as fit; the others are linked."""
+"""Pictures and videos inside the page, made smaller. Those that do not fit are linked."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from neuspring.report.page.blocks import Picture, Video
+from neuspring.report.blocks import Picture, Video
 
 QUALITY = 75
-"""Of WebP."""
+"""Quality of WebP pictures, of 100."""
 CHUNK = 32
-"""Pictures that are made smaller at once."""
+"""How many pictures are made smaller at once."""
 NO_ROOM = "not embedded, to keep this page small"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """A picture or video that a section would like to show; of all, those of the lowest rank come first."""
+    """A picture or video that a section would show. Those of the lowest rank are embedded first."""
 
     path: Path
     rank: tuple[int, ...]
     width: int = 0
-    """Pixels that it is made as wide as, at most; 0: a video."""
+    """Largest width of a picture in pixels; 0: a video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +41,12 @@ class Embedded:
 
 
 class Media:
-    """What is embedded of all that is wanted."""
+    """The files that are embedded, of all that are wanted."""
 
     def __init__(self, output: Path, wanted: Iterable[Wanted], room: int, video_room: int) -> None:
-        """`room` characters for pictures, of which videos may take what is left, up to `video_room`."""
+        """Pictures may take `room` characters, and videos what they leave, up to `video_room`."""
         self._folder = output.resolve().parent
-        self._found: dict[Path, Embedded] = {}
+        self._embedded: dict[Path, Embedded] = {}
         self.damaged: dict[Path, str] = {}
         ordered = sorted(wanted, key=lambda one: (one.rank, one.path))
         room = self._pictures([one for one in ordered if one.width], room)
@@ -55,36 +55,37 @@ class Media:
     @property
     def count(self) -> int:
         """Files that were embedded."""
-        return len(self._found)
+        return len(self._embedded)
 
     def picture(self, path: Path, caption: str, alt: str, *, wide: bool = False, paper: bool = False) -> Picture:
-        """A picture, or a link where it had no place."""
-        found = self._found.get(path)
-        if found:
-            return Picture(caption=caption, alt=alt, data=found.uri, size=found.size, wide=wide, paper=paper)
+        """A picture, or a link if it did not fit."""
+        file = self._embedded.get(path)
+        if file:
+            return Picture(caption=caption, alt=alt, data=file.uri, size=file.size, wide=wide, paper=paper)
         return Picture(caption=caption, alt=alt, link=self.link(path), reason=self.damaged.get(path, NO_ROOM))
 
     def video(self, path: Path, caption: str, *, wide: bool = False) -> Video:
-        """A video, or a link where it had no place."""
-        found = self._found.get(path)
-        if found:
-            return Video(caption=caption, data=found.uri, wide=wide)
+        """A video, or a link if it did not fit."""
+        file = self._embedded.get(path)
+        if file:
+            return Video(caption=caption, data=file.uri, wide=wide)
         return Video(caption=caption, link=self.link(path), reason=self.damaged.get(path, NO_ROOM))
 
     def link(self, path: Path) -> str:
-        """The path from the page."""
+        """A link from the page to a file."""
         return link(path, self._folder)
 
     def _pictures(self, wanted: Sequence[Wanted], room: int) -> int:
         """Embed in order until there is no room; returns what is left."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for start in range(0, len(wanted), CHUNK):
-                for one, made in zip(part := wanted[start : start + CHUNK], pool.map(_smaller, part), strict=True):
-                    if isinstance(made, str):
-                        self.damaged[one.path] = made
-                    elif len(made.uri) <= room:
-                        self._found[one.path] = made
-                        room -= len(made.uri)
+                part = wanted[start : start + CHUNK]
+                for one, smaller in zip(part, pool.map(_smaller, part), strict=True):
+                    if isinstance(smaller, str):
+                        self.damaged[one.path] = smaller
+                    elif len(smaller.uri) <= room:
+                        self._embedded[one.path] = smaller
+                        room -= len(smaller.uri)
                 if room < 20_000:
                     break
         return room
@@ -98,7 +99,7 @@ class Media:
             except OSError as error:
                 self.damaged[one.path] = str(error.strerror)
                 continue
-            self._found[one.path] = Embedded(uri=uri)
+            self._embedded[one.path] = Embedded(uri=uri)
             room -= len(uri)
 
 
@@ -108,7 +109,7 @@ def link(path: Path, folder: Path) -> str:
 
 
 def embedded_png(path: Path) -> Embedded | None:
-    """A drawing as it is, as PNG; None if it is not there."""
+    """A PNG file as it is; None if it is not there."""
     if not path.is_file():
         return None
     data = path.read_bytes()
@@ -117,7 +118,7 @@ def embedded_png(path: Path) -> Embedded | None:
 
 
 def _smaller(one: Wanted) -> Embedded | str:
-    """The picture, not wider than wanted, as WebP; in words why not, if it cannot be read."""
+    """The picture, not wider than wanted, as WebP; or the reason why it cannot be read."""
     try:
         data = np.frombuffer(one.path.read_bytes(), np.uint8)
     except OSError as error:
@@ -128,9 +129,9 @@ def _smaller(one: Wanted) -> Embedded | str:
     if picture.shape[1] > one.width:
         height = max(1, round(picture.shape[0] * one.width / picture.shape[1]))
         picture = cv2.resize(picture, (one.width, height), interpolation=cv2.INTER_AREA)
-    ok, made = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    ok, webp = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
     assert ok, "a picture can be encoded"
-    return Embedded(uri=_uri("image/webp", made.tobytes()), size=(picture.shape[1], picture.shape[0]))
+    return Embedded(uri=_uri("image/webp", webp.tobytes()), size=(picture.shape[1], picture.shape[0]))
 
 
 def _uri(kind: str, data: bytes) -> str:

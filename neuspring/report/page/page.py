@@ -7,25 +7,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import jinja2
 import pandas as pd
-from markupsafe import Markup
 
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import now
-from neuspring.report.figures.ratios import ratios_figure
-from neuspring.report.page import curves, dag, failures, pictures, prose, scores, setup, studies, work
-from neuspring.report.page.blocks import SYMBOLS, Block, Facts, Grid, Picture, Section, Text
+from neuspring.core.run_record import RUN_RECORD
+from neuspring.report.blocks import Block, Facts, Grid, Picture, Section, Text
+from neuspring.report.page import curves, failures, pictures, prose, scores, setup, studies, work
 from neuspring.report.page.media import Media, embedded_png
-from neuspring.report.page.sources import Choice, Damaged, Material, on_disk, read_jobs, read_runs, read_transfers
+from neuspring.report.page.sources import Choice, Material, Run, damaged_records, job_records, on_disk
 from neuspring.report.page.words import hours, listed, several
-from neuspring.report.tables import summary as tables
+from neuspring.report.render import html_page
+from neuspring.report.tables.summary import compared, draw_clusters, draw_ratios
 from neuspring.scores.failures import LeftOut
+from neuspring.scores.runs import collect, collect_transfers
 from neuspring.scores.studies import Study
 
-TEMPLATES = Path(__file__).parent / "templates"
 MEGABYTE = 1_000_000
 MARKUP = 400
 """Characters around an embedded picture."""
@@ -35,7 +34,7 @@ MOST_SHOWN = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the report is about; what is left empty follows the settings, else what lies in the results folder."""
+    """What the report is about. What is left empty is taken from the settings, else from what lies in the results folder."""
 
     scenarios: Sequence[str] = ()
     methods: Sequence[str] = ()
@@ -45,7 +44,7 @@ class Options:
     transfers: Sequence[str] = ()
     """Scenarios whose twins were rolled out on other recordings."""
     left_out: LeftOut = field(default_factory=dict)
-    """Method -> scenarios to which it does not apply, and where it has no runs."""
+    """Method to the scenarios to which it does not apply, so that it has no runs there."""
     shown: Sequence[str] = ()
     """Methods whose curves and pictures are shown; empty: the baseline and the first rows of the studies, six in all."""
     settings: Config | None = None
@@ -53,15 +52,15 @@ class Options:
     tables: str = "tables"
     """Folder of tables in the results folder."""
     megabytes: float = 25.0
-    """Size that pictures and videos may fill up."""
+    """Largest size of the page. Pictures and videos that do not fit are linked."""
     video_megabytes: float = 8.0
-    """Of it for videos; those without a place are linked."""
+    """Largest part of that for videos."""
 
 
 def write(results: Path, output: Path, options: Options, written: str | None = None) -> Path:
     """Write the report of a results folder as one HTML file; returns its path.
 
-    Raises InputError if there is no such folder, or a chosen method to draw or to compare with is not among the methods.
+    Raises InputError if the folder does not exist, or a method to show or to compare with is not among the methods.
     """
     results = Path(results)
     if not results.is_dir():
@@ -76,64 +75,64 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     wanted = pictures.wanted(material)
     media = Media(material.output, wanted, room - MARKUP * len(wanted), int(MEGABYTE * options.video_megabytes))
     for path, reason in media.damaged.items():
-        material.lost(path, ValueError(reason))
+        material.lost(path, reason)
     sections |= {"pictures": pictures.section(material, media)} | _last(material, cells)
     write_text(material.output, _page(material, list(sections.values()), written))
     return material.output
 
 
 def _last(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
-    """The sections that tell of damaged files, which any other may come upon."""
+    """The sections that list damaged files; they are made last, because every other section may find some."""
     verdicts = studies.verdicts(material, cells) if cells else []
     return {"failures": failures.section(material), "verdict": _summary(material, verdicts)}
 
 
 def gather(results: Path, output: Path, options: Options) -> Material:
     """Read what the report is about."""
-    damaged: list[Damaged] = []
-    jobs = read_jobs(results, damaged)
+    jobs, damaged = job_records(results)
     choice = _choice(results, options, on_disk(results, jobs))
-    collected = tables.collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    collected = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)
+    damaged |= damaged_records(collected.runs, RUN_RECORD) | damaged_records(transfers.runs, "transfer.json")
     return Material(
         results=results,
         output=output,
         choice=choice,
         tables=options.settings.tables if options.settings else options.tables,
-        collected=collected,
-        transfers=read_transfers(results, choice, damaged),
-        runs=read_runs(results, collected, damaged),
-        jobs=jobs,
         settings=options.settings,
         studies=options.studies,
+        collected=collected,
+        runs=[Run(folder=results / record.name, record=record) for record in collected.records.values()],
+        transfers=transfers,
+        jobs=jobs,
         damaged=damaged,
     )
 
 
-def _choice(results: Path, options: Options, found: tuple[list[str], list[str], list[int]]) -> Choice:
+def _choice(results: Path, options: Options, there: tuple[list[str], list[str], list[int]]) -> Choice:
     settings = options.settings or Config()
     in_studies = [method for study in options.studies.values() for method in study.rows.values()]
-    known = sorted(found[1], key=lambda name: in_studies.index(name) if name in in_studies else len(in_studies))
-    scenarios = tuple(options.scenarios or settings.scenarios or found[0])
-    methods = tuple(options.methods or settings.methods or known)
-    seeds = tuple(options.seeds or ((settings.seeds if options.settings else ()) or found[2]))
+    on_disk = sorted(there[1], key=lambda name: in_studies.index(name) if name in in_studies else len(in_studies))
+    scenarios = tuple(options.scenarios or settings.scenarios or there[0])
+    methods = tuple(options.methods or settings.methods or on_disk)
+    seeds = tuple(options.seeds or ((settings.seeds if options.settings else ()) or there[2]))
     for name in (*options.shown, *([options.baseline] if options.baseline else [])):
         if name not in methods:
             raise InputError("report", "methods that are drawn or compared with must be among the methods", name, listed(methods))
-    # Without a word on it, what a study compares with; the first method where there is none.
+    # Unless it is given: what a study compares with, else the first method.
     offered = [options.baseline or settings.compare_with, *(study.rows[study.baseline] for study in options.studies.values())]
     baseline = next((name for name in [*offered, *methods] if name in methods), "")
-    begun = {path.parts[-3] for path in results.glob("*/*/*/run.json")}
+    finished = {path.parts[-3] for path in results.glob("*/*/*/run.json")}
     ordered = dict.fromkeys([baseline, *(name for name in in_studies if name in methods), *methods])
-    shown = options.shown or [name for name in ordered if name in begun][:MOST_SHOWN]
+    shown = options.shown or [name for name in ordered if name in finished][:MOST_SHOWN]
     shown = tuple(name for name in methods if name in shown)
     transfers = tuple(options.transfers) or tuple(sorted({path.parts[-4] for path in results.glob("*/*/*/transfer.json")}))
-    kept = tuple(name for name in transfers if name in scenarios)
     return Choice(
         scenarios=scenarios,
         methods=methods,
         seeds=seeds,
         baseline=baseline,
-        transfers=kept,
+        transfers=tuple(name for name in transfers if name in scenarios),
         shown=shown,
         left_out=options.left_out,
     )
@@ -141,19 +140,16 @@ def _choice(results: Path, options: Options, found: tuple[list[str], list[str], 
 
 def _sections(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
     """All in order, by key; those that depend on the others are empty."""
-    collected = material.collected
-    usable = tables.comparable(collected) if len(collected.scores) else collected.scores
-    differences = tables.paired_differences(usable, material.choice.baseline) if len(usable) else pd.DataFrame()
+    usable, differences = compared(material.collected, material.choice.baseline)
     parts = [
         _empty("verdict"),
         studies.section(material, cells) if cells else None,
-        _with_figures(material, scores.section(material, differences), usable, differences),
+        _with_figures(material, scores.section(material, usable, differences), usable, differences),
         curves.section(material),
         _empty("pictures"),
         prose.perception(material),
         prose.tuning(material),
         work.section(material),
-        dag.section(material),
         _empty("failures"),
         setup.section(material),
     ]
@@ -166,37 +162,31 @@ def _empty(key: str) -> Section:
 
 def _summary(material: Material, verdicts: Sequence[Block]) -> Section:
     runs, choice = material.collected.runs, material.choice
+    title = "Did it reproduce?"
     if not choice.size:
         text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
-        return Section(key="verdict", title="Did it reproduce?", blocks=[Text(text=text, tone="warn")])
+        return Section(key="verdict", title=title, blocks=[Text(text=text, tone="warn")])
     status = runs["status"].value_counts().to_dict()
+    damaged = f", or of {several(len(material.damaged), 'damaged file')}" if material.damaged else ""
     failed_jobs = sum(job.failed for job in material.jobs)
     spent, source = work.gpu_hours(material)
     facts = [
         (f"{status.get('ok', 0)} of {choice.size}", "runs finished", f"{status.get('missing', 0)} missing"),
-        (
-            f"{status.get('failed', 0)}",
-            "failed runs",
-            "numerical" if not material.damaged else f"numerical, or of {several(len(material.damaged), 'damaged file')}",
-        ),
-        (
-            f"{failed_jobs}" if material.jobs else "–",
-            "failed jobs",
-            f"of {len(material.jobs)}" if material.jobs else "no job records",
-        ),
-        ("–" if spent is None else hours(3600 * spent) if spent else "0", "GPU-hours so far", source),
+        (f"{status.get('failed', 0)}", "failed runs", f"numerical{damaged}"),
+        (f"{failed_jobs}", "failed jobs", f"of {len(material.jobs)}") if material.jobs else ("–", "failed jobs", "no job records"),
+        ("–" if spent is None else hours(3600 * spent), "GPU-hours so far", source),
         (f"{len(choice.scenarios)} × {len(choice.methods)} × {len(choice.seeds)}", "scenarios × methods × seeds", ""),
     ]
     blocks: list[Block] = [*([Grid(blocks=verdicts, least=17)] if verdicts else []), Facts(facts=facts), _data(runs)]
-    return Section(key="verdict", title="Did it reproduce?", blocks=blocks)
+    return Section(key="verdict", title=title, blocks=blocks)
 
 
 def _data(runs: pd.DataFrame) -> Text:
-    """Whether the data are PhysTwin's, as far as finished runs say."""
-    known = runs[runs["source"] != ""]
-    if not len(known):
+    """Whether the data are PhysTwin's, by the sources of finished runs."""
+    finished = runs[runs["source"] != ""]
+    if not len(finished):
         return Text(text="No run has finished, so nothing is known of the data.", tone="mute")
-    counts = known.groupby("source")["scenario"].nunique().to_dict()
+    counts = finished.groupby("source")["scenario"].nunique().to_dict()
     named = ", ".join(f"{source} ({several(int(count), 'scenario')})" for source, count in counts.items())
     if set(counts) == {"phystwin"}:
         return Text(text=f"The data are PhysTwin's: {named}.", tone="good")
@@ -210,40 +200,25 @@ def _with_figures(material: Material, section: Section, usable: pd.DataFrame, di
     """The section with the pictures of ratios and of regions, as `tables` draws them."""
     if not len(usable):
         return section
-    made: list[Block] = []
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        order = list(dict.fromkeys(usable["method"]))
-        ordered = (
-            differences.sort_values("method", key=lambda names: names.map(order.index), kind="stable")
-            if len(differences)
-            else differences
-        )
-        note = f"{several(usable['scenario'].nunique(), 'scenario')}, {several(usable['seed'].nunique(), 'seed')}"
-        ratios_figure(ordered, place / "ratios.png", note)
-        tables.write_clusters(material.collected, place)
-        for name, caption in (
-            ("ratios", f"Ratio of every method's errors to those of {material.choice.baseline}"),
-            ("clusters", "Chamfer distance against the number of regions"),
-        ):
-            found = embedded_png(place / f"{name}.png")
-            if found:
-                made.append(Picture(caption=caption, alt=caption, data=found.uri, size=found.size, wide=True, paper=True))
-    return Section(key=section.key, title=section.title, about=section.about, blocks=[*made, *section.blocks])
+    size = f"{several(usable['scenario'].nunique(), 'scenario')}, {several(usable['seed'].nunique(), 'seed')}"
+    captions = {
+        "ratios.png": f"Ratio of every method's errors to those of {material.choice.baseline}",
+        "clusters.png": "Chamfer distance against the number of regions",
+    }
+    blocks: list[Block] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        draw_ratios(usable, differences, folder, size)
+        draw_clusters(material.collected, folder)
+        for file, caption in captions.items():
+            png = embedded_png(folder / file)
+            if png:
+                blocks.append(Picture(caption=caption, alt=caption, data=png.uri, size=png.size, wide=True, paper=True))
+    return Section(key=section.key, title=section.title, about=section.about, blocks=[*blocks, *section.blocks])
 
 
 def _page(material: Material, sections: Sequence[Section], written: str) -> str:
-    loader = jinja2.FileSystemLoader(TEMPLATES)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     choice = material.choice
     seeds = f"seeds {listed([str(seed) for seed in choice.seeds])}" if choice.seeds else "no seeds"
     numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"
-    return environment.get_template("report.html.j2").render(
-        title="NeuSpring: report",
-        subtitle=f"{numbers}; {material.results.resolve().name}",
-        written=written,
-        sections=sections,
-        symbols=SYMBOLS,
-        style=Markup((TEMPLATES / "style.css").read_text(encoding="utf-8")),
-        script=Markup((TEMPLATES / "page.js").read_text(encoding="utf-8")),
-    )
+    return html_page("NeuSpring: report", f"{numbers}; {material.results.resolve().name}", sections, written=written)

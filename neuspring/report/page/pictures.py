@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuspring.report.page.blocks import Block, Fold, Grid, Section, Text
+from neuspring.report.blocks import Block, Fold, Grid, Section, Text
 from neuspring.report.page.media import Media, Wanted
 from neuspring.report.page.sources import Material, Run
 from neuspring.report.page.words import several
@@ -22,7 +22,7 @@ class Kind:
     paper: bool
     """Drawn for a white page."""
     least: int = 40
-    """Least width in the page, rem: so many stand side by side."""
+    """Least width in the page, rem."""
 
 
 KINDS = (
@@ -44,18 +44,16 @@ APPEARANCE = "appearance"
 
 def wanted(material: Material) -> list[Wanted]:
     """All pictures that the section would show, the most telling first."""
-    found = []
-    for scenario, place in ((name, index) for index, name in enumerate(material.choice.scenarios)):
-        for order, run in enumerate(material.first_runs(scenario).values()):
-            for rank, kind in enumerate(KINDS):
-                path = run.file(kind.artifact, kind.stem)
-                found += [Wanted(path=path, rank=(rank, order, place), width=kind.width)] if path is not None else []
-            for rank, film in enumerate(FILMS):
-                path = run.file("images", film)
-                found += [Wanted(path=path, rank=(rank, order, place))] if path is not None else []
-        for order, learned in enumerate(_splats(material.first_runs(scenario))):
-            found.append(Wanted(path=learned, rank=(len(KINDS), order, place), width=1000))
-    return found
+    files: list[Wanted] = []
+    for place, scenario in enumerate(material.choice.scenarios):
+        runs = material.first_runs(scenario)
+        for order, run in enumerate(runs.values()):
+            paths = [(rank, run.file(kind.artifact, kind.stem), kind.width) for rank, kind in enumerate(KINDS)]
+            paths += [(rank, run.file("images", film), 0) for rank, film in enumerate(FILMS)]
+            files += [Wanted(path=path, rank=(rank, order, place), width=width) for rank, path, width in paths if path is not None]
+        for order, path in enumerate(_splats(runs)):
+            files.append(Wanted(path=path, rank=(len(KINDS), order, place), width=1000))
+    return files
 
 
 def section(material: Material, media: Media) -> Section:
@@ -77,42 +75,42 @@ def section(material: Material, media: Media) -> Section:
 def _scenario(runs: dict[str, Run], media: Media) -> list[Block]:
     blocks: list[Block] = []
     for kind in KINDS:
-        made: list[Block] = []
+        figures: list[Block] = []
         for method, run in runs.items():
             path = run.file(kind.artifact, kind.stem)
             if path is not None:
                 alt = f"{kind.title}: {run.scenario}, {method}, seed {run.seed}"
-                made.append(media.picture(path, method, alt, wide=True, paper=kind.paper))
-        if made:
+                figures.append(media.picture(path, method, alt, wide=True, paper=kind.paper))
+        if figures:
             # The first kind that there is can be seen at once.
-            blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=made, least=kind.least)], open=not blocks))
+            blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=figures, least=kind.least)], open=not blocks))
         if kind.stem == "images":
             blocks += _filmed(runs, media)
     splats = _splats(runs)
-    drawn: list[Block] = []
+    figures = []
     for path, methods in splats.items():
         of = f", {', '.join(methods)}" if len(splats) > 1 else ""
         alt = f"Splats of {runs[methods[0]].scenario} in frame 0{of}"
-        drawn.append(media.picture(path, f"Observed and drawn in frame 0{of}", alt, wide=True))
-    return [*blocks, Fold(summary="Splats of frame 0", blocks=drawn)] if drawn else blocks
+        figures.append(media.picture(path, f"Observed and drawn in frame 0{of}", alt, wide=True))
+    return [*blocks, Fold(summary="Splats of frame 0", blocks=figures)] if figures else blocks
 
 
 def _splats(runs: dict[str, Run]) -> dict[Path, list[str]]:
-    """Picture of splats -> the methods that are drawn with them: most share them, some have their own."""
-    found: dict[Path, list[str]] = {}
+    """Picture of splats to the methods that use them: most methods share splats, some have their own."""
+    methods: dict[Path, list[str]] = {}
     for method, run in runs.items():
         path = run.file("images", APPEARANCE)
         if path is not None:
-            found.setdefault(path.resolve(), []).append(method)
-    return found
+            methods.setdefault(path.resolve(), []).append(method)
+    return methods
 
 
 def _filmed(runs: dict[str, Run], media: Media) -> list[Block]:
     blocks: list[Block] = []
     for film, (title, least) in FILMS.items():
-        found = {method: run.file("images", film) for method, run in runs.items()}
+        paths = {method: run.file("images", film) for method, run in runs.items()}
         videos: list[Block] = [
-            media.video(path, method, wide=film == "video") for method, path in found.items() if path is not None
+            media.video(path, method, wide=film == "video") for method, path in paths.items() if path is not None
         ]
         if videos:
             blocks.append(Fold(summary=title, blocks=[Grid(blocks=videos, least=least)], open=film == "video"))

@@ -1,4 +1,4 @@
-"""Markdown that other commands wrote, as HTML of this page. Raw HTML in it is shown as text."""
+"""Markdown of other commands as HTML of this page. Raw HTML in it is shown as text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from neuspring.report.page.blocks import Block, Fold, Grid, Picture, Prose, Section
+from neuspring.report.blocks import Block, Fold, Grid, Picture, Prose, Section
 from neuspring.report.page.media import embedded_png, link
 from neuspring.report.page.sources import UNREADABLE, Material
 
@@ -19,7 +19,7 @@ SO_FAR = "so_far"
 
 
 def render(text: str, picture: Callable[[str], str]) -> Markup:
-    """Markdown as HTML; headings become small ones; `picture` gives the data URI of a picture that is named, or nothing."""
+    """Markdown as HTML with smaller headings. `picture` returns the data URI of a picture that the text names, or nothing."""
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")
 
     def image(_: Any, tokens: Sequence[Any], index: int, *rest: Any) -> str:
@@ -47,11 +47,11 @@ def file(material: Material, path: Path) -> tuple[Prose | None, set[Path]]:
 
     def picture(source: str) -> str:
         place = path.parent / source
-        found = embedded_png(place) if "://" not in source and place.suffix == ".png" else None
-        if found is None:
+        png = embedded_png(place) if "://" not in source and place.suffix == ".png" else None
+        if png is None:
             return ""
         shown.add(place.resolve())
-        return found.uri
+        return png.uri
 
     if not path.is_file():
         return None, shown
@@ -63,14 +63,14 @@ def file(material: Material, path: Path) -> tuple[Prose | None, set[Path]]:
 
 
 def tuning(material: Material) -> Section | None:
-    """The tuning studies under results/tune; None without any."""
+    """The sweeps under results/tune; None without any."""
     folds: list[Block] = []
     for path in sorted((material.results / "tune").glob("*/summary.md")):
         text, shown = file(material, path)
         if text is None:
             continue
         drawings = [drawing for drawing in sorted(path.parent.glob("*.png")) if drawing.resolve() not in shown]
-        pictures = [_picture(drawing, found.uri, found.size) for drawing in drawings if (found := embedded_png(drawing))]
+        pictures = [_picture(drawing, png.uri, png.size) for drawing in drawings if (png := embedded_png(drawing))]
         folds.append(Fold(summary=path.parent.name, blocks=[text, Grid(blocks=pictures, least=26)], open=not folds))
     return Section(key="tuning", title="Tuning", blocks=folds) if folds else None
 
@@ -83,12 +83,12 @@ def _picture(path: Path, uri: str, size: tuple[int, int]) -> Block:
 def files(material: Material) -> list[tuple[str, str]]:
     """Files of the tables' folder beside the report: text and link."""
     folder, here = material.results / material.tables, material.output.resolve()
-    found = (path for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.resolve() != here)
-    known = [path for path in found if path.is_file() and SO_FAR not in path.relative_to(folder).parts]
-    return [(material.relative(path), link(path, here.parent)) for path in known]
+    paths = (path for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.resolve() != here)
+    paths = (path for path in paths if path.is_file() and SO_FAR not in path.relative_to(folder).parts)
+    return [(material.relative(path), link(path, here.parent)) for path in paths]
 
 
 def perception(material: Material) -> Section | None:
-    """What perception made of synthetic captures, if that was judged; None else."""
+    """Perception against the truth of synthetic captures; None where it was not judged."""
     text, _ = file(material, material.results / material.tables / "perception.md")
     return Section(key="perception", title="Perception", blocks=[text]) if text else None

@@ -2,110 +2,116 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from neuspring.report.page import held
-from neuspring.report.page.blocks import Block, Cell, Chip, Fold, Items, Section, Table, Text
+from neuspring.report.blocks import Block, Cell, Chip, Fold, Items, Section, Table, Text
+from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
-from neuspring.report.page.words import DASH, listed, number, several, signed
-from neuspring.report.tables import summary as tables
+from neuspring.report.page.words import listed, number, several, signed
 from neuspring.report.tables.cells import LEAST_SCENARIOS
-from neuspring.report.tables.summary import Collected, comparable
-from neuspring.scores.layout import HEADINGS, IMAGE_HEADINGS, SHOWN, TRANSFER_HEADINGS
-from neuspring.scores.metrics import averages
-from neuspring.scores.paper import MEASURES
+from neuspring.report.tables.summary import compared, image_lines
+from neuspring.scores.metrics import (
+    DASH,
+    HEADINGS,
+    IMAGE_HEADINGS,
+    METRICS,
+    TRANSFER_HEADINGS,
+    Headings,
+    Metric,
+    averages,
+    headings_of,
+    present,
+)
+from neuspring.scores.runs import Collected, finished_scores, pairs
 
-Headings = Mapping[tuple[str, str], str]
 MOST_NOTES = 100
 Best = dict[tuple[str, str], float]
 
 
-def section(material: Material, differences: pd.DataFrame) -> Section:
-    """Averages and paired differences of everything, pictures and transfers, breakdowns."""
+def section(material: Material, usable: pd.DataFrame, differences: pd.DataFrame) -> Section:
+    """Averages and paired differences of the comparable scores, pictures and transfers, breakdowns."""
     collected, baseline = material.collected, material.choice.baseline
-    usable = comparable(collected) if len(collected.scores) else collected.scores
+    coverage = frozen.coverage(collected)
     if not len(usable):
-        finished = (collected.runs["status"] == "ok").any() if len(collected.runs) else False
         text = "No run has finished, so there is nothing to average."
-        text = "No pair of scenario and seed was finished by every method, so nothing can be compared." if finished else text
-        told = [Text(text=text, tone="mute"), *([Text(text=why)] if (why := held.coverage(collected)) else [])]
-        return Section(key="scores", title="Scores", blocks=[*told, *held.averages(collected)])
-    blocks: list[Block] = [Text(text=f"{_coverage(collected, usable)} {held.coverage(collected)}".rstrip())]
-    blocks += _averages("Errors, mm", usable, collected, HEADINGS)
-    blocks += held.averages(collected)
-    images = {key: text for key, text in IMAGE_HEADINGS.items() if key in _present(usable)}
+        if len(collected.runs) and (collected.runs["status"] == "ok").any():
+            text = "No pair of scenario and seed was finished by every method, so nothing can be compared."
+        reasons = [Text(text=text, tone="mute"), *([Text(text=coverage)] if coverage else [])]
+        return Section(key="scores", title="Scores", blocks=[*reasons, *frozen.averages(collected)])
+    blocks: list[Block] = [Text(text=f"{_coverage(collected, usable)} {coverage}".rstrip())]
+    blocks.append(_averages("Errors, mm", usable, collected, HEADINGS))
+    blocks += frozen.averages(collected)
+    images = {key: text for key, text in IMAGE_HEADINGS.items() if key in present(usable)}
     if images:
-        blocks += _averages("Pictures: PSNR in dB, SSIM, LPIPS, IoU", usable, collected, images)
+        blocks.append(_averages("Pictures: PSNR in dB, SSIM, LPIPS, IoU", usable, collected, images))
     if len(differences):
         blocks.append(_differences(f"Paired difference to {baseline}, mm", differences, HEADINGS))
         blocks.append(Fold(summary="Ratios", blocks=[_ratios(f"Ratio of the error to that of {baseline}", differences)]))
         if images:
             table = _differences(f"Pictures: paired difference to {baseline}", differences, images)
             blocks.append(Fold(summary="Paired differences of pictures", blocks=[table]))
-    blocks += _conditions(collected, usable, differences, baseline)
-    blocks += _transfers(material)
-    blocks += _breakdowns(collected)
+    blocks += [*_conditions(collected, usable, differences, baseline), *_transfers(material), *_breakdowns(collected)]
     about = "Means weigh scenarios equally, ± standard deviation over seeds; below, the mean weighted by frames. Best in bold."
     return Section(key="scores", title="Scores", about=about, blocks=blocks)
 
 
-def _present(scores: pd.DataFrame) -> set[tuple[str, str]]:
-    return set(zip(scores["task"], scores["metric"], strict=True))
-
-
 def _coverage(collected: Collected, usable: pd.DataFrame) -> str:
-    pairs, kept = (len(table[["scenario", "seed"]].drop_duplicates()) for table in (collected.runs, usable))
-    begun = list(dict.fromkeys(collected.runs.loc[collected.runs["status"] == "ok", "method"]))
-    left = [name for name in dict.fromkeys(collected.runs["method"]) if name not in begun]
-    text = f"Averages take {kept} of {several(pairs, 'pair')} of scenario and seed: "
-    text += f"those that each of {several(len(begun), 'method')} finished."
+    finished = list(dict.fromkeys(collected.runs.loc[collected.runs["status"] == "ok", "method"]))
+    left = [name for name in dict.fromkeys(collected.runs["method"]) if name not in finished]
+    text = f"Averages take {pairs(usable)} of {several(pairs(collected.runs), 'pair')} of scenario and seed: "
+    text += f"those that each of {several(len(finished), 'method')} finished."
     return text + (f" Without any finished run, and not counted: {listed(left)}." if left else "")
 
 
-def _averages(caption: str, scores: pd.DataFrame, collected: Collected, headings: Headings) -> list[Block]:
+def _averages(caption: str, scores: pd.DataFrame, collected: Collected, headings: Headings) -> Table:
     rows: list[Any] = list(averages(scores).itertuples())
     means = {(row.method, row.task, row.metric): row for row in rows}
     best = _best((row.task, row.metric, row.equal) for row in rows)
     lines = []
     for method in dict.fromkeys(collected.runs["method"]):
-        found = [means.get((str(method), *key)) for key in headings]
-        cells = [_average(row, scores["seed"].nunique() > 1, best) for row in found]
+        own = [means.get((str(method), *key)) for key in headings]
+        cells = [_average(row, scores["seed"].nunique() > 1, best) for row in own]
         status = collected.runs.loc[collected.runs["method"] == method, "status"].value_counts().to_dict()
         failed = [Chip(text=f"{status['failed']} failed", tone="bad", symbol="✗")] if status.get("failed") else []
         runs = Cell(text=f"{status.get('ok', 0)} of {sum(status.values())}", chips=failed, value=status.get("ok", 0))
         lines.append([Cell(text=str(method)), *cells, runs])
-    return [Table(caption=caption, header=["Method", *headings.values(), "Runs"], rows=lines, sortable=True)]
+    return Table(caption=caption, header=["Method", *headings.values(), "Runs"], rows=lines, sortable=True)
 
 
 def _average(row: Any, spread: bool, best: Best) -> Cell:
     if row is None:
         return Cell(text=DASH, value="")
-    factor, digits = SHOWN[row.metric]
-    text = number(factor * row.equal, digits) + (f" ± {number(factor * row.seed_std, digits)}" if spread else "")
+    metric = METRICS[row.metric]
+    text = _text(metric, row.equal) + (f" ± {_text(metric, row.seed_std)}" if spread else "")
     top = row.equal == best.get((row.task, row.metric))
-    return Cell(text=text, small=[f"by frames {number(factor * row.frames, digits)}"], value=row.equal, best=top, mark="best")
+    return Cell(text=text, small=[f"by frames {_text(metric, row.frames)}"], value=row.equal, best=top, mark="best")
+
+
+def _text(metric: Metric, value: float) -> str:
+    return number(metric.factor * value, metric.digits)
 
 
 def _best(means: Iterable[tuple[str, str, float]]) -> Best:
-    """(task, metric) -> the best of the means (task, metric, value), where there are at least two."""
-    found: dict[tuple[str, str], list[float]] = {}
+    """Task and metric to the best of the means (task, metric, value), where there are at least two."""
+    columns: dict[tuple[str, str], list[float]] = {}
     for task, metric, value in means:
-        found.setdefault((task, metric), []).append(value)
-    return {key: (max if MEASURES[key[1]].higher else min)(values) for key, values in found.items() if len(values) > 1}
+        columns.setdefault((task, metric), []).append(value)
+    choose = {name: max if metric.higher_is_better else min for name, metric in METRICS.items()}
+    return {key: choose[key[1]](values) for key, values in columns.items() if len(values) > 1}
 
 
 def _differences(caption: str, differences: pd.DataFrame, headings: Headings) -> Table:
     def cell(row: Any) -> Cell:
-        factor, digits = SHOWN[row.metric]
+        metric = METRICS[row.metric]
+        text, low, high = (signed(metric.factor * value, metric.digits) for value in (row.difference, row.low, row.high))
         sure = np.isfinite(row.low)
-        interval = [f"[{signed(factor * row.low, digits)}, {signed(factor * row.high, digits)}]"] if sure else []
-        relative = [f"{signed(100 * row.relative, 1)} %"] if MEASURES[row.metric].relative else []
-        chips = [_resolved(row, higher=MEASURES[row.metric].higher)] if sure else []
-        text = signed(factor * row.difference, digits)
+        interval = [f"[{low}, {high}]"] if sure else []
+        relative = [f"{signed(100 * row.relative, 1)} %"] if metric.relative else []
+        chips = [_resolved(row, higher=metric.higher_is_better)] if sure else []
         return Cell(text=text, small=[*interval, *relative], chips=chips, value=float(row.difference))
 
     note = "95 % bootstrap interval over scenarios and seeds, same scenario and seed; none for a single scenario."
@@ -131,54 +137,52 @@ def _ratios(caption: str, differences: pd.DataFrame) -> Table:
     return _by_method(caption, differences, HEADINGS, cell, note)
 
 
-def _by_method(caption: str, differences: pd.DataFrame, headings: Headings, cell: Any, note: str) -> Table:
+def _by_method(caption: str, differences: pd.DataFrame, headings: Headings, cell: Callable[[Any], Cell], note: str) -> Table:
     rows = []
     for method, part in differences.groupby("method", sort=False):
-        known = {(row.task, row.metric): row for row in part.itertuples()}
-        cells = [cell(known[key]) if key in known else Cell(text=DASH, value="") for key in headings]
+        values = {(row.task, row.metric): row for row in part.itertuples()}
+        cells = [cell(values[key]) if key in values else Cell(text=DASH, value="") for key in headings]
         rows.append([Cell(text=str(method)), *cells])
     return Table(caption=caption, header=["Method", *headings.values()], rows=rows, sortable=True, note=note)
 
 
 def _transfers(material: Material) -> list[Block]:
     """Twins on other recordings of the same object."""
-    collected = material.transfers
+    collected, baseline = material.transfers, material.choice.baseline
     if not len(collected.runs) or not len(collected.scores):
         return []
-    usable = comparable(collected)
+    usable, differences = compared(collected, baseline)
     if not len(usable):
         return []
-    blocks = _averages("Transfer to other recordings of the same object: errors, mm", usable, collected, TRANSFER_HEADINGS)
-    differences = tables.paired_differences(usable, material.choice.baseline)
+    caption = "Transfer to other recordings of the same object: errors, mm"
+    blocks: list[Block] = [_averages(caption, usable, collected, TRANSFER_HEADINGS)]
     if len(differences):
-        caption = f"Transfer: paired difference to {material.choice.baseline}, mm"
-        blocks.append(_differences(caption, differences, TRANSFER_HEADINGS))
+        blocks.append(_differences(f"Transfer: paired difference to {baseline}, mm", differences, TRANSFER_HEADINGS))
     return blocks
 
 
 def _breakdowns(collected: Collected) -> list[Block]:
     """Per category and per scenario, of all finished runs."""
-    finished = collected.scores.merge(collected.runs.loc[collected.runs["status"] == "ok", ["scenario", "method", "seed"]])
-    headings = {key: text for key, text in (HEADINGS | IMAGE_HEADINGS).items() if key in _present(finished)}
+    finished = finished_scores(collected)
+    headings = {key: text for key, text in headings_of(finished).items() if key in present(finished)}
     methods, blocks = list(dict.fromkeys(collected.runs["method"])), list[Block]()
-    for column in ("category", "scenario"):
+    for column, counted in (("category", "Scenarios"), ("scenario", "Seeds")):
         rows = []
         for name, part in finished.groupby(column, sort=True):
             means = part.groupby(["method", "task", "metric", "scenario"])["value"].mean().groupby(level=[0, 1, 2]).mean()
-            known: dict[Any, float] = {key: float(value) for key, value in means.items()}
-            best = _best((task, metric, value) for (_, task, metric), value in known.items())
-            counts = part.groupby("method")["seed" if column == "scenario" else "scenario"].nunique()
+            values: dict[Any, float] = {key: float(value) for key, value in means.items()}
+            best = _best((task, metric, value) for (_, task, metric), value in values.items())
+            counts = part.groupby("method")[counted.lower().removesuffix("s")].nunique()
             for method in [method for method in methods if method in counts.index]:
-                cells = [_mean(known.get((method, *key)), key, best.get(key)) for key in headings]
+                cells = [_mean(values.get((method, *key)), key, best.get(key)) for key in headings]
                 rows.append([Cell(text=str(name)), Cell(text=str(method)), *cells, Cell(text=str(counts[method]))])
-        last = "Seeds" if column == "scenario" else "Scenarios"
         table = Table(
             caption=f"Per {column}: errors in mm, seeds averaged",
-            header=[column.capitalize(), "Method", *headings.values(), last],
+            header=[column.capitalize(), "Method", *headings.values(), counted],
             rows=rows,
             stub=2,
             sortable=True,
-            note="All finished runs. Best of each " + column + " in bold.",
+            note=f"All finished runs. Best of each {column} in bold.",
         )
         blocks.append(Fold(summary=f"Per {column}", blocks=[table]))
     return blocks
@@ -187,14 +191,13 @@ def _breakdowns(collected: Collected) -> list[Block]:
 def _mean(value: float | None, key: tuple[str, str], best: float | None) -> Cell:
     if value is None:
         return Cell(text=DASH, value="")
-    factor, digits = SHOWN[key[1]]
-    return Cell(text=number(factor * value, digits), value=value, best=value == best, mark="best")
+    return Cell(text=_text(METRICS[key[1]], value), value=value, best=value == best, mark="best")
 
 
 def _conditions(collected: Collected, usable: pd.DataFrame, differences: pd.DataFrame, baseline: str) -> list[Block]:
-    """How pictures were scored, or why they were not, in the words of the summary; and what runs noted."""
-    told = tables.image_lines(collected, usable, differences, baseline)
-    words = [line for line in told if line and not line.startswith(("|", "Paired"))]
+    """How pictures were scored, or why they were not, in the words of the summary; and the notes of runs."""
+    lines = image_lines(collected, usable, differences, baseline)
+    words = [line for line in lines if line and not line.startswith(("|", "Paired"))]
     blocks: list[Block] = [Items(items=words)] if words else []
     noted: list[Any] = list(collected.runs[collected.runs["notes"] != ""].itertuples())
     if noted:

@@ -1,10 +1,10 @@
-"""With what: settings that differ from the defaults, methods, versions, machines."""
+"""Settings that differ from the defaults, methods, versions, machines."""
 
 from __future__ import annotations
 
 import json
 import platform
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
@@ -13,27 +13,32 @@ import yaml
 
 from neuspring import config
 from neuspring.config import Config
-from neuspring.report.page.blocks import Block, Cell, Code, Fold, Items, Link, Section, Table, Text
+from neuspring.core.run_record import flat
+from neuspring.report.blocks import Block, Cell, Code, Fold, Items, Link, Section, Table, Text
 from neuspring.report.page.prose import files
 from neuspring.report.page.sources import Material, Run
 from neuspring.report.page.words import listed, several
 from neuspring.report.page.work import machines
-from neuspring.report.tables.summary import mixed_settings
+from neuspring.scores.runs import mixed_settings
 
 PACKAGES = (
     *("torch", "warp-lang", "newton", "numpy", "scipy", "scikit-learn", "opencv-python-headless", "cma"),
     *("gsplat", "snakemake", "mlflow"),
 )
-CHOSEN = ("scenarios", "methods", "seeds", "results", "tables")
+WHAT = ("scenarios", "methods", "seeds", "results", "tables")
 """Keys that say what the benchmark is, not how it runs."""
 DIRTY = "-dirty"
 COMMON = {
-    **{"model": "Model", "search": "Search", "clusters": "Regions", "fit": "Fit", "carry_over": "Carry over"},
+    "model": "Model",
+    "search": "Search",
+    "clusters": "Regions",
+    "fit": "Fit",
+    "carry_over": "Carry over",
     "average_seeds": "Averages seeds",
 }
-"""Switches of methods, and their headings; the model only where a method has one."""
+"""Switches of methods, and their headings. The model is shown only where a method has one."""
 SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")
-"""Of the configuration, as the records of search and fit keep them."""
+"""Sections of the configuration that the records of search and fit hold."""
 
 
 def section(material: Material) -> Section:
@@ -46,18 +51,16 @@ def section(material: Material) -> Section:
     if variants is not None:
         blocks.append(variants)
     blocks += [_versions(), *_machines(material.runs)]
-    known = files(material)
-    if known:
-        links = Items(items=[Link(text=text, target=target) for text, target in known])
-        blocks.append(Fold(summary=f"{several(len(known), 'file')} with the tables' data, beside this page", blocks=[links]))
+    beside = files(material)
+    if beside:
+        links = Items(items=[Link(text=text, target=target) for text, target in beside])
+        blocks.append(Fold(summary=f"{several(len(beside), 'file')} with the tables' data, beside this page", blocks=[links]))
     return Section(key="setup", title="Configuration and versions", blocks=blocks)
 
 
 def _commits(runs: Iterable[Run]) -> Text:
-    """The code that made the runs; several states of it are pointed out."""
-    own: dict[str, int] = defaultdict(int)
-    for run in runs:
-        own[run.record.commit or "unknown"] += 1
+    """The code that made the runs, with a warning if it was not the same for all."""
+    own = Counter(run.record.commit or "unknown" for run in runs)
     names = [f"{_short(name)} ({several(count, 'run')})" for name, count in sorted(own.items())]
     if len(own) > 1:
         text = f"Runs were made by {len(own)} states of the code: {listed(names)}. Compare with care."
@@ -77,9 +80,9 @@ def _short(name: str) -> str:
 def _settings(material: Material) -> list[Block]:
     defaults = flat(config.plain(Config()))
     if material.settings is not None:
-        chosen = config.plain(material.settings)
-        changed = {key: {"": value} for key, value in flat(chosen).items() if defaults.get(key) != value and key not in CHOSEN}
-        text = yaml.safe_dump(chosen, sort_keys=False, allow_unicode=True, width=120)
+        settings = config.plain(material.settings)
+        changed = {key: {"": value} for key, value in flat(settings).items() if defaults.get(key) != value and key not in WHAT}
+        text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
         return [
             _changes("Settings that differ from the defaults", changed, defaults),
             Fold(summary="Full configuration", blocks=[Code(text=text)]),
@@ -92,26 +95,18 @@ def _settings(material: Material) -> list[Block]:
     return [Text(text=text, tone="mute"), _changes("Settings that differ from the defaults", changed, defaults)]
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings under dotted names; lists stay values."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {f"{prefix}{name}": value}
-    return found
-
-
 def _used(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
-    """Setting -> method -> value, from the records of search, fit and baselines' training."""
-    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    """Setting to method to value, from the records of search, fit and baselines' training."""
+    used: dict[str, dict[str, Any]] = defaultdict(dict)
     for run in runs:
         for stage in (run.record.settings.get(name, {}) for name in ("search", "fit")):
-            known = {name: stage[name] for name in SECTIONS if isinstance(stage.get(name), Mapping)}
-            for key, value in flat(known).items():
-                found[key].setdefault(run.method, value)
+            sections = {name: stage[name] for name in SECTIONS if isinstance(stage.get(name), Mapping)}
+            for key, value in flat(sections).items():
+                used[key].setdefault(run.method, value)
         own = {name: value for name, value in run.record.settings.get("train", {}).items() if name not in ("model", "seed")}
         for key, value in flat(own, f"baselines.{run.record.model}.").items():
-            found[key].setdefault(run.method, value)
-    return dict(found)
+            used[key].setdefault(run.method, value)
+    return dict(used)
 
 
 def _changes(caption: str, changed: Mapping[str, Mapping[str, Any]], defaults: Mapping[str, Any]) -> Block:
@@ -138,15 +133,15 @@ def _by_method(values: Mapping[str, Any]) -> str:
 
 
 def _variants(runs: Iterable[Run]) -> Table | None:
-    """What each method is, from its runs."""
-    found: dict[str, dict[str, Any]] = {}
+    """The switches of each method, as its runs record them."""
+    variants: dict[str, Mapping[str, Any]] = {}
     for run in runs:
-        found.setdefault(run.method, run.record.variant)
-    if not found:
+        variants.setdefault(run.method, run.record.variant)
+    if not variants:
         return None
-    common = {name: text for name, text in COMMON.items() if name != "model" or any("model" in own for own in found.values())}
+    common = {name: text for name, text in COMMON.items() if name != "model" or any("model" in own for own in variants.values())}
     rows = []
-    for method, variant in found.items():
+    for method, variant in variants.items():
         own = ", ".join(f"{key}: {_plain(value)}" for key, value in variant.items() if key not in common)
         cells = [Cell(text=_word(variant.get(name))) for name in common]
         rows.append([Cell(text=method), *cells, Cell(text=own, wrap=True)])
@@ -169,8 +164,6 @@ def _versions() -> Table:
 
 
 def _machines(runs: Iterable[Run]) -> list[Block]:
-    found = machines(runs)
-    if not found:
-        return []
-    rows = [[Cell(text=name), Cell(text=str(count))] for name, count in found.items()]
-    return [Table(caption="Machines of the runs", header=["Machine; device", "Runs"], rows=rows)]
+    counts = machines(runs)
+    rows = [[Cell(text=name), Cell(text=str(count))] for name, count in counts.items()]
+    return [] if not rows else [Table(caption="Machines of the runs", header=["Machine; device", "Runs"], rows=rows)]

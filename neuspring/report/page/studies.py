@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from neuspring.report.page import held
-from neuspring.report.page.blocks import Block, Cell, Chip, Fold, Section, Table, Text, Tone, Verdict
+from neuspring.report.blocks import Block, Cell, Chip, Fold, Section, Table, Text, Tone, Verdict
+from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import number, several, signed
 from neuspring.report.tables import cells as tables_cells
 from neuspring.report.tables.cells import BETTER, CONFIRMED, OPPOSITE, WITHIN, WORSE
 from neuspring.scores import paper
-from neuspring.scores.paper import MEASURES, Measure
+from neuspring.scores.metrics import DASH, IN_PAPER, Metric
 from neuspring.scores.studies import Study
 
 TASKS = {"reconstruction": "Reconstruction and resimulation", "future": "Future prediction"}
@@ -33,19 +33,19 @@ SIGNS: dict[str, tuple[Tone, str]] = {
     tables_cells.OTHER_DATA: ("", "◇"),
     tables_cells.NOT_RUN: ("mute", "○"),
 }
-"""Verdict -> tone and symbol; all others are muted."""
+"""Verdict to tone and symbol. All others are muted."""
 ANSWERED = (WITHIN, BETTER, WORSE)
 WITHOUT_DIRECTION = (tables_cells.NOT_RUN, tables_cells.NOT_COMPUTED, tables_cells.NOTHING_TO_COMPARE, tables_cells.NO_VALUE, ")")
-"""Directions that are none; those in brackets are of runs that failed."""
+"""Ends of verdicts on a change that name no direction; a bracket counts failed runs."""
 
 
 def kind(verdict: str) -> str:
-    """The verdict without how much of the data it rests on."""
+    """The verdict without the count of scenarios or failures that it depends on."""
     return re.sub(r" \(\d+ failed\)$", "", re.sub(r"^partial \([^)]*\): ", "", verdict))
 
 
 def study_cells(material: Material) -> dict[str, pd.DataFrame]:
-    """Study -> its cells (`tables_cells.cells`): a row per label, task and metric."""
+    """Study to its cells (`tables_cells.cells`): a row per label, task and metric."""
     return {
         name: tables_cells.cells(study, tables_cells.of_study(study, material.collected))
         for name, study in material.studies.items()
@@ -63,16 +63,12 @@ def _verdict(name: str, study: Study, cells: pd.DataFrame) -> Verdict:
     kinds = printed["verdict"].map(kind)
     counts = Counter(kinds)
     directions = Counter(printed.loc[printed["label"] != study.baseline, "direction"])
-    directed = {found: count for found, count in directions.most_common() if not found.endswith(WITHOUT_DIRECTION)}
-    small = (
-        [f"Change against {study.baseline}: {', '.join(f'{found} ({count})' for found, count in directed.items())}"]
-        if directed
-        else []
-    )
+    changes = [f"{name} ({count})" for name, count in directions.most_common() if not name.endswith(WITHOUT_DIRECTION)]
+    small = [f"Change against {study.baseline}: {', '.join(changes)}"] if changes else []
     if printed["verdict"].str.startswith("partial").any():
         small.append(f"Partial: fewer than the paper's {len(paper.scenarios())} scenarios are finished.")
     answer, tone = _answer(counts, len(printed))
-    chips = [_chip(found, f"{count} {found}") for found, count in counts.most_common()]
+    chips = [_chip(verdict, f"{count} {verdict}") for verdict, count in counts.most_common()]
     return Verdict(title=f"{name}: {study.title}", answer=answer, tone=tone, chips=chips, small=small, target=f"study-{name}")
 
 
@@ -95,14 +91,13 @@ def _chip(name: str, text: str = "") -> Chip:
 
 
 def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
-    """The tables of the studies; those that nothing was run of are folded."""
+    """The tables of the studies; those without any run are folded."""
     blocks: list[Block] = []
     for name, study in material.studies.items():
-        inner = [*_tables(study, cells[name]), *held.of_table(study, material.collected)]
-        begun = bool(cells[name]["ours"].notna().any()) if len(cells[name]) else False
-        blocks.append(
-            Fold(summary=f"{name}: {study.title}" + ("" if begun else " (not run)"), blocks=inner, open=begun, key=f"study-{name}")
-        )
+        inner = [*_tables(study, cells[name]), *frozen.of_table(study, material.collected)]
+        has_runs = len(cells[name]) > 0 and bool(cells[name]["ours"].notna().any())
+        summary = f"{name}: {study.title}" + ("" if has_runs else " (not run)")
+        blocks.append(Fold(summary=summary, blocks=inner, open=has_runs, key=f"study-{name}"))
     about = (
         "In every cell: ours, ± standard deviation over seeds, [95 % bootstrap interval over scenarios and seeds]; the paper's "
         "value; whether that lies within the interval. Best of ours in bold. CD and TE in m, means over scenarios; pictures "
@@ -130,20 +125,21 @@ def _tables(study: Study, cells: pd.DataFrame) -> list[Block]:
 
 
 def _values(study: Study, cells: pd.DataFrame, title: str) -> Table:
-    columns = [MEASURES[name] for name in dict.fromkeys(cells["metric"])]
-    best = {measure.name: _best(cells.loc[cells["metric"] == measure.name, "ours"], measure) for measure in columns}
+    def first(cell: Any) -> Cell:
+        return Cell(text=str(cell.label), small=(cell.method, _runs(cell)))
+
+    best = {name: _best(part["ours"], IN_PAPER[str(name)]) for name, part in cells.groupby("metric")}
+    return _table(cells, title, first, lambda cell, metric: _value(cell, metric, best[metric.name], bool(study.reference)))
+
+
+def _table(cells: pd.DataFrame, title: str, first: Callable[[Any], Cell], value: Callable[[Any, Metric], Cell]) -> Table:
+    """A line per label: its heading by `first`, then a cell per metric by `value`."""
+    metrics = [IN_PAPER[name] for name in dict.fromkeys(cells["metric"])]
     rows = []
-    for label, part in cells.groupby("label", sort=False):
-        own = {cell.metric: cell for cell in part.itertuples()}
-        first: Any = next(iter(own.values()))
-        runs = _runs(first)
-        rows.append(
-            [
-                Cell(text=str(label), small=(first.method, runs)),
-                *(_value(own[measure.name], measure, best[measure.name], bool(study.reference)) for measure in columns),
-            ]
-        )
-    return Table(caption=title, header=["Method", *(_heading(measure) for measure in columns)], rows=rows)
+    for _, part in cells.groupby("label", sort=False):
+        own: dict[Any, Any] = {cell.metric: cell for cell in part.itertuples()}
+        rows.append([first(own[metrics[0].name]), *(value(own[metric.name], metric) for metric in metrics)])
+    return Table(caption=title, header=["Method", *(metric.paper_column for metric in metrics)], rows=rows)
 
 
 def _runs(cell: Any) -> str:
@@ -154,48 +150,39 @@ def _runs(cell: Any) -> str:
     return f"{cell.ok} of {several(total, 'run')}" + (f", {', '.join(wrong)}" if wrong else "")
 
 
-def _heading(measure: Measure) -> str:
-    return f"{measure.heading} {'↑' if measure.higher else '↓'}"
-
-
-def _best(values: pd.Series, measure: Measure) -> float:
+def _best(values: pd.Series, metric: Metric) -> float:
     """The best of at least two, as far as the printed digits tell."""
-    known = values.dropna().round(measure.digits)
-    if len(known) < 2:
+    rounded = values.dropna().round(metric.paper_digits)
+    if len(rounded) < 2:
         return np.nan
-    return float(known.max() if measure.higher else known.min())
+    return float(rounded.max() if metric.higher_is_better else rounded.min())
 
 
-def _value(cell: Any, measure: Measure, best: float, referenced: bool) -> Cell:
+def _value(cell: Any, metric: Metric, best: float, referenced: bool) -> Cell:
+    digits = metric.paper_digits
     chips = [_chip(cell.verdict)] if referenced else []
     printed = [f"paper {cell.paper}"] if cell.paper else []
     if np.isnan(cell.ours):
-        return Cell(text="–", small=printed, chips=chips)
-    spread = f" ± {number(cell.spread, measure.digits)}" if np.isfinite(cell.spread) else ""
-    interval = [f"[{number(cell.low, measure.digits)}, {number(cell.high, measure.digits)}]"] if np.isfinite(cell.low) else []
-    text = f"{number(cell.ours, measure.digits)}{spread}"
-    is_best = bool(round(cell.ours, measure.digits) == best)
+        return Cell(text=DASH, small=printed, chips=chips)
+    spread = f" ± {number(cell.spread, digits)}" if np.isfinite(cell.spread) else ""
+    interval = [f"[{number(cell.low, digits)}, {number(cell.high, digits)}]"] if np.isfinite(cell.low) else []
+    text = f"{number(cell.ours, digits)}{spread}"
+    is_best = bool(round(cell.ours, digits) == best)
     return Cell(text=text, small=[*interval, *printed], chips=chips, best=is_best, mark="best of ours")
 
 
 def _changes(study: Study, cells: pd.DataFrame, title: str) -> Table:
-    columns = [MEASURES[name] for name in dict.fromkeys(cells["metric"])]
-    rows = []
-    for label, part in cells[cells["label"] != study.baseline].groupby("label", sort=False):
-        own = {cell.metric: cell for cell in part.itertuples()}
-        rows.append([Cell(text=str(label)), *(_change(own[measure.name], measure) for measure in columns)])
-    return Table(caption=title, header=["Method", *(_heading(measure) for measure in columns)], rows=rows)
+    others = cells[cells["label"] != study.baseline]
+    return _table(others, title, lambda cell: Cell(text=str(cell.label)), _change)
 
 
-def _change(cell: Any, measure: Measure) -> Cell:
-    relative = measure.relative
-    scale, digits, unit = (100.0, 1, " %") if relative else (1.0, measure.digits, f" {measure.unit}")
-    printed = cell.paper_relative if relative else cell.paper_change
-    small = [f"paper {signed(scale * printed, digits)}{unit}"] if np.isfinite(printed) else []
-    ours, low, high = (
-        (cell.relative, cell.relative_low, cell.relative_high) if relative else (cell.change, cell.change_low, cell.change_high)
-    )
-    if not np.isfinite(ours):
-        return Cell(text="–", small=small, chips=[_chip(cell.direction)])
-    interval = [f"[{signed(scale * low, digits)}, {signed(scale * high, digits)}]"] if np.isfinite(low) else []
-    return Cell(text=f"{signed(scale * ours, digits)}{unit}", small=[*interval, *small], chips=[_chip(cell.direction)])
+def _change(cell: Any, metric: Metric) -> Cell:
+    scale, digits, unit = (100.0, 1, " %") if metric.relative else (1.0, metric.paper_digits, f" {metric.paper_unit}")
+    values = (cell.relative, cell.relative_low, cell.relative_high, cell.paper_relative)
+    values = values if metric.relative else (cell.change, cell.change_low, cell.change_high, cell.paper_change)
+    ours, low, high, printed = (signed(scale * value, digits) for value in values)
+    small = [f"paper {printed}{unit}"] if np.isfinite(values[3]) else []
+    if not np.isfinite(values[0]):
+        return Cell(text=DASH, small=small, chips=[_chip(cell.direction)])
+    interval = [f"[{low}, {high}]"] if np.isfinite(values[1]) else []
+    return Cell(text=f"{ours}{unit}", small=[*interval, *small], chips=[_chip(cell.direction)])

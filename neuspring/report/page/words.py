@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-DASH = "–"
+from neuspring.scores.metrics import DASH
 
 
 def several(count: int, noun: str, plural: str = "") -> str:
@@ -14,7 +14,7 @@ def several(count: int, noun: str, plural: str = "") -> str:
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:
-    """Names in a sentence, the rest counted."""
+    """Names for a sentence. Of more than `most`, the rest is counted."""
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
@@ -31,7 +31,7 @@ def duration(seconds: float) -> str:
 
 
 def hours(seconds: float) -> str:
-    """Hours with as many digits as say something."""
+    """Hours, with fewer decimals for larger values."""
     value = seconds / 3600
     if value < 0.01:
         return "< 0.01" if value else "0"
@@ -39,18 +39,18 @@ def hours(seconds: float) -> str:
 
 
 def memory(mebibytes: float | None) -> str:
-    """Mebibytes, or gibibytes from one on."""
+    """Mebibytes; gibibytes from 1024 MiB."""
     if mebibytes is None or not math.isfinite(mebibytes):
         return DASH
     return f"{mebibytes / 1024:.1f} GiB" if mebibytes >= 1024 else f"{mebibytes:.0f} MiB"
 
 
 def signed(value: float, digits: int) -> str:
-    """With a sign, and a true minus; none for what rounds to zero."""
+    """A number with its sign, and a typographic minus. What rounds to zero has no sign."""
     text = f"{value:+.{digits}f}".replace("-", "−")
     return text if text.strip("+−0.") else text[1:]
 
 
 def number(value: float, digits: int) -> str:
-    """With a true minus; a dash for NaN."""
+    """A number with a typographic minus; a dash for NaN."""
     return DASH if not math.isfinite(value) else f"{value:.{digits}f}".replace("-", "−")

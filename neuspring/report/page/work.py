@@ -1,19 +1,17 @@
-"""Where the time went: hours by step and method, waiting, memory, retries, and which GPU did what when."""
+"""Where the time went: hours by step and by method, waiting, memory, retries."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from neuspring.core.job_records import JobRecord
-from neuspring.report.page.blocks import Block, Cell, Section, Table, Text
+from neuspring.report.blocks import Block, Cell, Section, Table, Text
 from neuspring.report.page.sources import METHOD_RULES, Material, Run
-from neuspring.report.page.timeline import timeline
-from neuspring.report.page.words import DASH, duration, hours, memory
+from neuspring.report.page.words import duration, hours, memory
+from neuspring.scores.metrics import DASH
 
 ORDER = (
     *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "train", "predict"),
@@ -23,60 +21,8 @@ ORDER = (
 
 
 def place(rule: str) -> int:
-    """Where a rule stands in the workflow; those that are not known come last."""
+    """Where a rule stands in the workflow; unknown rules come last."""
     return ORDER.index(rule) if rule in ORDER else len(ORDER)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spent:
-    """What a group of jobs cost."""
-
-    name: str
-    jobs: int
-    failed: int
-    retries: int
-    seconds: tuple[float, ...]
-    """Wall time of each job, all its attempts."""
-    gpu_seconds: float
-    cpu_seconds: float
-    waited: float
-    memory: float
-    gpu_memory: float | None
-    utilisation: float | None
-
-
-def spent(name: str, jobs: Sequence[JobRecord]) -> Spent:
-    """The cost of some jobs, their failed attempts included."""
-    attempts = [attempt for job in jobs for attempt in job.attempts]
-    on_gpu = [a for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
-    weights = [a.seconds * len(a.devices) for a in on_gpu]
-    used = [float(a.gpu_utilisation or 0.0) for a in on_gpu]
-    return Spent(
-        name=name,
-        jobs=len(jobs),
-        failed=sum(job.failed for job in jobs),
-        retries=sum(len(job.attempts) - 1 for job in jobs),
-        seconds=tuple(sum(a.seconds for a in job.attempts) for job in jobs),
-        gpu_seconds=sum(a.seconds * len(a.devices) for a in attempts),
-        cpu_seconds=sum(a.cpu_seconds for a in attempts),
-        waited=sum(a.waited for a in attempts),
-        memory=max([a.peak_memory_mb for a in attempts], default=0.0),
-        gpu_memory=max([a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None], default=None),
-        utilisation=float(np.average(used, weights=weights)) if sum(weights) else None,
-    )
-
-
-def by_rule(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """In the order of the workflow."""
-    groups = _grouped(jobs, lambda job: job.rule)
-    return [spent(name, groups[name]) for name in sorted(groups, key=lambda name: (place(name), name))]
-
-
-def by_method(jobs: Iterable[JobRecord]) -> list[Spent]:
-    """Jobs of one method each; searches and splats, which methods share, by their row."""
-    groups = _grouped(jobs, _owner)
-    groups.pop("", None)
-    return [spent(name, groups[name]) for name in sorted(groups)]
 
 
 def _grouped(jobs: Iterable[JobRecord], key: Callable[[JobRecord], str]) -> dict[str, list[JobRecord]]:
@@ -98,25 +44,25 @@ def _owner(job: JobRecord) -> str:
 
 
 def _splats(folder: str) -> str:
-    """Whose splats lie in a folder: `shared`, or those of a method."""
+    """The owner of the splats in a folder: a method, or `shared`."""
     return folder.removeprefix("appearance").removeprefix("-") or "shared"
 
 
 def gpu_hours(material: Material) -> tuple[float | None, str]:
-    """GPU-hours, from job records or else from run records, and from which; None where nothing is known."""
+    """GPU-hours (None where nothing is known), and where they are from: job records, else run records."""
     if material.jobs:
-        return sum(a.seconds * len(a.devices) for job in material.jobs for a in job.attempts) / 3600, "job records"
+        return _gpu_seconds(material.jobs) / 3600, "job records"
     if not material.runs:
         return None, "no records"
     return sum(seconds for _, _, seconds, device, _ in _stages(material.runs) if device.startswith("cuda")) / 3600, "run records"
 
 
 def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
-    """Rule, method, seconds, device and MiB of every stage; shared ones once, for `shared` or the method whose splats they are."""
+    """Rule, method, seconds, device and MiB of every stage. Shared stages count once: for `shared`, or the method of the splats."""
     seen, rows = set(), []
     for run in runs:
-        named = {(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])}
-        places = {path.stem: path for path in named}
+        paths = [(run.folder / name).resolve() for name in run.record.artifacts.get("records", [])]
+        places = {path.stem: path for path in paths}
         for stage, seconds in run.record.timings.items():
             place = places.get(stage, run.folder / stage)
             if place in seen:
@@ -133,13 +79,14 @@ def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
 
 
 def section(material: Material) -> Section:
-    """Tables of hours, and the timeline."""
+    """Tables of hours."""
+    title = "Time and hardware"
     if material.jobs:
-        return Section(key="work", title="Time and hardware", about=_about(material.jobs), blocks=_from_jobs(material.jobs))
+        return Section(key="work", title=title, about=_about(material.jobs), blocks=_from_jobs(material.jobs))
     if not material.runs:
-        return Section(key="work", title="Time and hardware", blocks=[Text(text="Nothing has been timed yet.", tone="mute")])
+        return Section(key="work", title=title, blocks=[Text(text="Nothing has been timed yet.", tone="mute")])
     note = "There are no job records: times are those of the run records, without failed attempts, waiting and steps outside runs."
-    return Section(key="work", title="Time and hardware", blocks=[Text(text=note, tone="mute"), _from_runs(material.runs)])
+    return Section(key="work", title=title, blocks=[Text(text=note, tone="mute"), _from_runs(material.runs)])
 
 
 def _about(jobs: Sequence[JobRecord]) -> str:
@@ -150,63 +97,56 @@ def _about(jobs: Sequence[JobRecord]) -> str:
 
 
 def _from_jobs(jobs: Sequence[JobRecord]) -> list[Block]:
-    blocks: list[Block] = [_costs("By step", "Step", by_rule(jobs), total=True)]
-    methods = by_method(jobs)
+    by_rule, by_method = _grouped(jobs, lambda job: job.rule), _grouped(jobs, _owner)
+    rules = sorted(by_rule, key=lambda name: (place(name), name))
+    steps = {name: by_rule[name] for name in rules} | ({"all": jobs} if len(rules) > 1 else {})
+    methods = {name: by_method[name] for name in sorted(by_method) if name}
+    blocks: list[Block] = [_costs("By step", "Step", steps, sortable=False)]
     if methods:
-        blocks.append(_costs("By method (searches and splats apart, since methods share them)", "Method", methods, total=False))
-    return [*blocks, *timeline(jobs, sorted({job.rule for job in jobs}, key=lambda rule: (place(rule), rule)))]
+        caption = "By method (searches and splats apart, since methods share them)"
+        blocks.append(_costs(caption, "Method", methods, sortable=True))
+    return blocks
 
 
-def _costs(caption: str, what: str, groups: Sequence[Spent], *, total: bool) -> Table:
-    header = [
-        what,
-        "Jobs",
-        "Failed",
-        "Retries",
-        "Median",
-        "Longest",
-        "GPU-hours",
-        "CPU-hours",
-        "Waited",
-        "Peak memory",
-        "GPU memory",
-        "GPU use",
-    ]
-    rows = [_cost(group) for group in groups]
-    if total and len(groups) > 1:
-        rows.append(
-            [
-                Cell(text="all", best=True),
-                *(_number(sum(getattr(group, name) for group in groups)) for name in ("jobs", "failed", "retries")),
-                Cell(text=""),
-                Cell(text=""),
-                *(_hours(sum(getattr(group, name) for group in groups)) for name in ("gpu_seconds", "cpu_seconds")),
-                Cell(text=duration(sum(group.waited for group in groups))),
-                Cell(text=memory(max(group.memory for group in groups))),
-                Cell(text=""),
-                Cell(text=""),
-            ]
-        )
-    note = "Waited: for a GPU. A GPU that two jobs share counts for both." if any(group.gpu_seconds for group in groups) else ""
-    return Table(caption=caption, header=header, rows=rows, sortable=not total, note=note)
+def _costs(caption: str, what: str, groups: Mapping[str, Sequence[JobRecord]], *, sortable: bool) -> Table:
+    header = [what, "Jobs", "Failed", "Retries", "Median", "Longest", "GPU-hours", "CPU-hours", "Waited", "Peak memory"]
+    header += ["GPU memory", "GPU use"]
+    rows = [_cost(name, jobs) for name, jobs in groups.items()]
+    on_gpu = any(attempt.devices for jobs in groups.values() for job in jobs for attempt in job.attempts)
+    note = "Waited: for a GPU. A GPU that two jobs share counts for both." if on_gpu else ""
+    return Table(caption=caption, header=header, rows=rows, sortable=sortable, note=note)
 
 
-def _cost(group: Spent) -> list[Cell]:
-    failed = Cell(text=str(group.failed), tone="bad" if group.failed else "", value=group.failed)
+def _cost(name: str, jobs: Sequence[JobRecord]) -> list[Cell]:
+    """The cost of some jobs, their failed attempts included."""
+    attempts = [attempt for job in jobs for attempt in job.attempts]
+    failed, retries = sum(job.failed for job in jobs), sum(len(job.attempts) - 1 for job in jobs)
+    seconds = [job.seconds for job in jobs]
+    median, longest = float(np.median(seconds)), max(seconds)
+    on_gpu, waited = _gpu_seconds(jobs), sum(a.waited for a in attempts)
+    peak = max((a.peak_memory_mb for a in attempts), default=0.0)
+    gpu_peak = max((a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None), default=None)
+    used = [(a.gpu_utilisation, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
+    weight = sum(weight for _, weight in used)
+    use = sum(percent * weight for percent, weight in used) / weight if weight else None
     return [
-        Cell(text=group.name),
-        _number(group.jobs),
-        failed,
-        _number(group.retries),
-        Cell(text=duration(float(np.median(group.seconds))), value=float(np.median(group.seconds))),
-        Cell(text=duration(max(group.seconds)), value=max(group.seconds)),
-        _hours(group.gpu_seconds),
-        _hours(group.cpu_seconds),
-        Cell(text=duration(group.waited) if group.gpu_seconds else DASH, value=group.waited),
-        Cell(text=memory(group.memory), value=group.memory),
-        Cell(text=memory(group.gpu_memory), value=group.gpu_memory or 0.0),
-        Cell(text=DASH if group.utilisation is None else f"{group.utilisation:.0f} %", value=group.utilisation or 0.0),
+        Cell(text=name),
+        _number(len(jobs)),
+        Cell(text=str(failed), tone="bad" if failed else "", value=failed),
+        _number(retries),
+        Cell(text=duration(median), value=median),
+        Cell(text=duration(longest), value=longest),
+        _hours(on_gpu),
+        _hours(sum(a.cpu_seconds for a in attempts)),
+        Cell(text=duration(waited) if on_gpu else DASH, value=waited),
+        Cell(text=memory(peak), value=peak),
+        Cell(text=memory(gpu_peak), value=gpu_peak or 0.0),
+        Cell(text=DASH if use is None else f"{use:.0f} %", value=use or 0.0),
     ]
+
+
+def _gpu_seconds(jobs: Iterable[JobRecord]) -> float:
+    return sum(attempt.seconds * len(attempt.devices) for job in jobs for attempt in job.attempts)
 
 
 def _number(value: int) -> Cell:
@@ -222,16 +162,16 @@ def _from_runs(runs: Sequence[Run]) -> Table:
     for stage, method, seconds, device, peak in _stages(runs):
         groups[stage, method].append((seconds, device, peak))
     rows = []
-    for (stage, method), found in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
-        times = [one for one, _, _ in found]
-        on_gpu = sum(one for one, device, _ in found if device.startswith("cuda"))
-        peak = max((one for _, _, one in found if np.isfinite(one)), default=np.nan)
+    for (stage, method), records in sorted(groups.items(), key=lambda item: (place(item[0][0]), item[0][1])):
+        times = [seconds for seconds, _, _ in records]
+        on_gpu = sum(seconds for seconds, device, _ in records if device.startswith("cuda"))
+        peak = max((mebibytes for _, _, mebibytes in records if np.isfinite(mebibytes)), default=np.nan)
         cells = [Cell(text=duration(v), value=v) for v in (float(np.median(times)), max(times))]
         rows.append(
             [
                 Cell(text=stage),
                 Cell(text=method),
-                _number(len(found)),
+                _number(len(records)),
                 *cells,
                 _hours(sum(times)),
                 _hours(on_gpu),
@@ -242,8 +182,8 @@ def _from_runs(runs: Sequence[Run]) -> Table:
     return Table(caption="By step and method", header=header, rows=rows, stub=2, sortable=True)
 
 
-def machines(runs: Iterable[Run]) -> dict[str, Any]:
-    """Machine and device -> number of runs."""
+def machines(runs: Iterable[Run]) -> dict[str, int]:
+    """Machine and device to the number of runs."""
     counts: dict[str, int] = defaultdict(int)
     for run in runs:
         counts[f"{run.record.machine}; {run.record.device}"] += 1

@@ -1,1 +1,1 @@
-"""Tables of a benchmark, and of the paper's studies beside the paper's values."""
+"""Tables of a benchmark (`summary`), of studies beside the paper (`cells`, `render`, `study`), and of perception."""

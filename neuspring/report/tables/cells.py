@@ -6,17 +6,18 @@ the study's baseline go where the paper's goes? That can be asked on any data. A
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from neuspring.report.tables.summary import RESAMPLES, Collected, comparable
 from neuspring.scores import paper
-from neuspring.scores.metrics import averages
-from neuspring.scores.paper import MEASURES, Measure, Printed
+from neuspring.scores.metrics import IN_PAPER, Metric, averages, present
+from neuspring.scores.paper import Printed
+from neuspring.scores.runs import Collected, comparable
+from neuspring.scores.statistics import interval, resampled_means
 from neuspring.scores.studies import Study
 
 NOT_RUN, NOT_COMPUTED, NOTHING_TO_COMPARE = "not run", "not computed", "nothing to compare"
@@ -25,10 +26,10 @@ WITHIN, BETTER, WORSE = "within", "better", "worse"
 BASELINE, CONFIRMED, OPPOSITE = "baseline", "same direction, confirmed", "opposite"
 NOT_RESOLVED, UNCHANGED, TOO_FEW = "not resolved", "no change in the paper", "too few scenarios"
 LEAST_SCENARIOS = 6
-"""For a verdict on a change. Of n scenarios all change in one direction by chance once in 2^(n-1), and the interval leaves out 0
-whenever they do."""
+"""A verdict on a change needs so many. All of n scenarios change in one direction by chance once in 2^(n-1) studies, and then the
+interval leaves out 0."""
 ROUND_OFF = 1e-9
-"""Of a value, which the comparison with half a unit of the last digit forgives."""
+"""Relative rounding error that the comparison with half a unit of the last digit allows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class Estimate:
     """Ours in one cell. NaN stands for what cannot be said: intervals of one scenario, the spread over one seed."""
 
     ours: float = np.nan
-    """In the average that the paper takes for this metric."""
+    """In the average that the paper takes of this metric."""
     other_average: float = np.nan
     spread: float = np.nan
     """Standard deviation over the seeds that have every scenario."""
@@ -63,26 +64,24 @@ Estimates = dict[tuple[str, str, str], Estimate]
 def of_study(study: Study, collected: Collected) -> Collected:
     """The scores, in the paper's units, and the runs of a study's methods."""
     methods = list(study.rows.values())
-    scores, held = (
-        table[table["method"].isin(methods) & table["metric"].isin(list(MEASURES))] for table in (collected.scores, collected.held)
-    )
     runs = collected.runs[collected.runs["method"].isin(methods)]
     left_out = {name: where for name, where in collected.left_out.items() if name in methods}
-    return Collected(_scaled(scores), runs, _scaled(held), left_out)
+    return Collected(_in_paper_units(collected.scores, methods), runs, _in_paper_units(collected.frozen, methods), left_out)
 
 
-def _scaled(scores: pd.DataFrame) -> pd.DataFrame:
-    """In the paper's units."""
-    factors = scores["metric"].map({name: measure.factor for name, measure in MEASURES.items()}).astype(float)
+def _in_paper_units(scores: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
+    """The scores of these methods in the paper's metrics and units."""
+    scores = scores[scores["method"].isin(methods) & scores["metric"].isin(list(IN_PAPER))]
+    factors = scores["metric"].map({name: metric.paper_factor for name, metric in IN_PAPER.items()}).astype(float)
     return scores.assign(value=scores["value"].astype(float) * factors)
 
 
 def counted(own: Collected) -> pd.DataFrame:
-    """The scores that averages take: of scenario and seed that every method finished, and every method has this metric of.
+    """The scores that averages take: of the pairs of scenario and seed that every method finished and has this metric of.
 
-    A method without any finished run takes no part; nor does one in a metric that it has nowhere.
+    A method without a finished run takes no part, nor does one without any value of a metric in the averages of that metric.
     """
-    scores = comparable(own) if len(own.scores) else own.scores
+    scores = comparable(own)
     if not len(scores):
         return scores
     here = scores.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
@@ -93,10 +92,10 @@ def accounted(study: Study, own: Collected) -> pd.DataFrame:
     """Every run of a study: label, its identity, status, whether it counts, and why not if it does not."""
     labels = {method: label for label, method in study.rows.items()}
     status = {(row.scenario, row.seed, row.method): str(row.status) for row in own.runs.itertuples()}
-    begun = list(dict.fromkeys(own.runs.loc[own.runs["status"] == "ok", "method"]))
+    finished = list(dict.fromkeys(own.runs.loc[own.runs["status"] == "ok", "method"]))
     rows = []
     for run in own.runs.itertuples():
-        lacking = [m for m in begun if status.get((run.scenario, run.seed, m)) != "ok"]
+        lacking = [m for m in finished if status.get((run.scenario, run.seed, m)) != "ok"]
         why = f"{run.status!s}: {run.reason!s}"
         if run.status == "ok":
             absent = {m: "does not apply" if run.scenario in own.left_out.get(m, ()) else "missing" for m in lacking}
@@ -110,22 +109,21 @@ def accounted(study: Study, own: Collected) -> pd.DataFrame:
 
 def estimates(scores: pd.DataFrame, baseline: str) -> Estimates:
     """Ours in every cell from scores that are `counted`; changes are against the method `baseline`, where it has scores."""
-    found: Estimates = {}
+    cells: Estimates = {}
     means = {(row["method"], row["task"], row["metric"]): row for row in averages(scores).to_dict("records")} if len(scores) else {}
     for key, part in scores.groupby(["task", "metric"], sort=False):
-        task, metric = map(str, key)
-        measure = MEASURES[metric]
-        resampled, spreads = _resampled_means(part, measure), _spreads(part, measure)
-        for method, draws in resampled.items():
-            mean = means[method, task, metric]
-            ours, (low, high) = float(mean[measure.average]), _quantiles(draws)
+        task, metric = str(key[0]), IN_PAPER[str(key[1])]
+        resamples, spreads = _resamples(part, metric), _spreads(part, metric)
+        for method, resampled in resamples.items():
+            mean = means[method, task, metric.name]
+            ours, (low, high) = float(mean[metric.average]), interval(resampled)
             change: dict[str, float] = {}
-            if baseline in resampled and method != baseline:
-                base = float(means[baseline, task, metric][measure.average])
-                change = _change(ours, base, draws, resampled[baseline], measure)
-            found[method, task, metric] = Estimate(
+            if baseline in resamples and method != baseline:
+                base = float(means[baseline, task, metric.name][metric.average])
+                change = _change(ours, base, resampled, resamples[baseline], metric)
+            cells[method, task, metric.name] = Estimate(
                 ours=ours,
-                other_average=float(mean[measure.other]),
+                other_average=float(mean[metric.other_average]),
                 spread=spreads[method],
                 low=low,
                 high=high,
@@ -134,34 +132,27 @@ def estimates(scores: pd.DataFrame, baseline: str) -> Estimates:
                 runs=int((part["method"] == method).sum()),
                 **change,
             )
-    return found
+    return cells
 
 
-def _change(ours: float, base: float, resampled: np.ndarray, resampled_base: np.ndarray, measure: Measure) -> dict[str, float]:
+def _change(ours: float, base: float, resampled: np.ndarray, resampled_base: np.ndarray, metric: Metric) -> dict[str, float]:
     difference = resampled - resampled_base
-    low, high = _quantiles(difference)
+    low, high = interval(difference)
     values = {"change": ours - base, "change_low": low, "change_high": high}
-    if not measure.relative or base == 0 or not np.all(resampled_base):
+    if not metric.relative or base == 0 or not np.all(resampled_base):
         return values
-    low, high = _quantiles(difference / resampled_base)
+    low, high = interval(difference / resampled_base)
     return values | {"relative": (ours - base) / base, "relative_low": low, "relative_high": high}
 
 
-def _quantiles(values: np.ndarray) -> tuple[float, float]:
-    """95 % interval, NaN for the empty array that stands for one scenario."""
-    if not len(values):
-        return np.nan, np.nan
-    low, high = np.quantile(values, [0.025, 0.975])
-    return float(low), float(high)
+def _weights(scores: pd.DataFrame, metric: Metric) -> pd.Series:
+    return scores["frames"].astype(float) if metric.average == "frames" else pd.Series(1.0, index=scores.index)
 
 
-def _weights(scores: pd.DataFrame, measure: Measure) -> pd.Series:
-    return scores["frames"].astype(float) if measure.average == "frames" else pd.Series(1.0, index=scores.index)
-
-
-def _spreads(part: pd.DataFrame, measure: Measure) -> dict[str, float]:
-    """Method -> standard deviation over seeds of the mean over scenarios, of the seeds that have every scenario."""
-    weighted = part.assign(weight=_weights(part, measure), product=_weights(part, measure) * part["value"])
+def _spreads(part: pd.DataFrame, metric: Metric) -> dict[str, float]:
+    """Method to the standard deviation over seeds of the mean over scenarios, of the seeds that have every scenario."""
+    weights = _weights(part, metric)
+    weighted = part.assign(weight=weights, product=weights * part["value"])
     per_seed = weighted.groupby(["method", "seed"]).agg(
         total=("product", "sum"), weight=("weight", "sum"), scenarios=("scenario", "nunique")
     )
@@ -170,78 +161,67 @@ def _spreads(part: pd.DataFrame, measure: Measure) -> dict[str, float]:
     return {str(method): float(spread.get(method, np.nan)) for method in part["method"].unique()}
 
 
-def _resampled_means(part: pd.DataFrame, measure: Measure) -> dict[str, np.ndarray]:
-    """Method -> its mean in every resample; empty arrays for a single scenario, which says nothing of others.
-
-    Scenarios are resampled, and within each the seeds, as in `tables.paired_differences`. All methods see the same draws, so
-    differences are paired; a weighted mean is divided by the weights that were drawn.
-    """
+def _resamples(part: pd.DataFrame, metric: Metric) -> dict[str, np.ndarray]:
+    """Method to its mean in every resample; empty arrays for a single scenario, which says nothing of others."""
     values = part.pivot(index=["scenario", "seed"], columns="method", values="value")
-    weights = part.assign(weight=_weights(part, measure)).pivot_table(index="scenario", columns="method", values="weight")
+    weights = part.assign(weight=_weights(part, metric)).pivot_table(index="scenario", columns="method", values="weight")
     runs = [rows.to_numpy().T for _, rows in values.groupby(level="scenario")]
     if len(runs) == 1:
         return {str(method): np.empty(0) for method in values.columns}
-    counts = np.array([rows.shape[1] for rows in runs])
-    padded = np.stack([np.stack([np.resize(row, counts.max()) for row in rows]) for rows in runs], axis=1)
-    weight = weights[values.columns].to_numpy().T
-    rng = np.random.default_rng(0)
-    total, drawn = np.zeros((2, len(padded), RESAMPLES))
-    for _ in runs:
-        scenario = rng.integers(len(runs), size=RESAMPLES)
-        seed = (rng.random((RESAMPLES, counts.max())) * counts[scenario, None]).astype(int)
-        used = np.arange(counts.max()) < counts[scenario, None]
-        mean = (padded[:, scenario[:, None], seed] * used).sum(axis=2) / counts[scenario]
-        total += weight[:, scenario] * mean
-        drawn += weight[:, scenario]
-    return {str(method): means for method, means in zip(values.columns, total / drawn, strict=True)}
+    means = resampled_means(runs, np.random.default_rng(0), weights[values.columns].to_numpy().T)
+    return dict(zip(map(str, values.columns), means, strict=True))
 
 
-def shown(study: Study, scores: pd.DataFrame) -> list[tuple[str, Measure]]:
-    """The columns of a study's table: the paper's; without a reference the Chamfer distance and what has scores."""
-    present = set(zip(scores["task"], scores["metric"], strict=True)) | {(task, "chamfer") for task in paper.TASKS}
-    known = {key[1:] for key in study.values} if study.reference else present
-    return [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure.name) in known]
+def columns_of(study: Study, scores: pd.DataFrame) -> list[tuple[str, Metric]]:
+    """The columns of a study's table: the paper's; without a reference the Chamfer distance and all metrics that have scores."""
+    of_paper = {key[1:] for key in study.values}
+    return in_order(of_paper if study.reference else present(scores) | {(task, "chamfer") for task in paper.TASKS})
+
+
+def in_order(columns: Collection[tuple[str, str]]) -> list[tuple[str, Metric]]:
+    """Columns in the paper's order."""
+    return [(task, metric) for task in paper.TASKS for metric in IN_PAPER.values() if (task, metric.name) in columns]
 
 
 def cells(study: Study, own: Collected) -> pd.DataFrame:
     """One row per label, task and metric: the paper's value, ours (`Estimate`), their difference, and both verdicts."""
     scores = counted(own)
-    found = estimates(scores, study.rows[study.baseline])
-    rows = [_cell(study, own, scores, found, *key) for key in _keys(study, scores)]
-    return pd.DataFrame(rows)
-
-
-def _keys(study: Study, scores: pd.DataFrame) -> Iterator[tuple[str, str, Measure]]:
-    columns = shown(study, scores)
-    return ((label, task, measure) for label in study.rows for task, measure in columns)
+    ours = estimates(scores, study.rows[study.baseline])
+    columns = columns_of(study, scores)
+    return pd.DataFrame([_cell(study, own, scores, ours, label, *column) for label in study.rows for column in columns])
 
 
 def _cell(
-    study: Study, own: Collected, scores: pd.DataFrame, found: Estimates, label: str, task: str, measure: Measure
+    study: Study, own: Collected, scores: pd.DataFrame, ours: Estimates, label: str, task: str, metric: Metric
 ) -> dict[str, Any]:
     method, base = study.rows[label], study.rows[study.baseline]
-    estimate = found.get((method, task, measure.name), Estimate())
-    printed = study.values.get((label, task, measure.name))
-    part = scores[(scores["task"] == task) & (scores["metric"] == measure.name) & (scores["method"] == method)]
+    estimate = ours.get((method, task, metric.name), Estimate())
+    printed = study.values.get((label, task, metric.name))
+    part = scores[(scores["task"] == task) & (scores["metric"] == metric.name) & (scores["method"] == method)]
     foreign = is_foreign(own.runs, part)
-    absent = _absent(own, method, measure.name) if np.isnan(estimate.ours) else ""
-    verdict = absent or _verdict(estimate, printed, measure, foreign)
+    absent = _absent(own, method, metric.name) if np.isnan(estimate.ours) else ""
+    verdict = absent or _verdict(estimate, printed, metric, foreign)
     if verdict in (WITHIN, BETTER, WORSE, NO_INTERVAL) and estimate.scenarios < len(paper.scenarios()):
         verdict = f"partial ({estimate.scenarios} of {len(paper.scenarios())}): {verdict}"
-    of_base = study.values.get((study.baseline, task, measure.name))
+    of_base = study.values.get((study.baseline, task, metric.name))
     change = printed.value - of_base.value if printed and of_base else np.nan
     lacking = absent or ("baseline not run" if np.isnan(estimate.change) else "")
     status = own.runs.loc[own.runs["method"] == method, "status"].value_counts()
     return {
-        **{"label": label, "method": method, "task": task, "metric": measure.name, "unit": measure.unit},
-        **{"average": measure.average, "paper": printed.text if printed else ""},
+        "label": label,
+        "method": method,
+        "task": task,
+        "metric": metric.name,
+        "unit": metric.paper_unit,
+        "average": metric.average,
+        "paper": printed.text if printed else "",
         **asdict(estimate),
         "difference": np.nan if foreign or not printed else estimate.ours - printed.value,
         "verdict": verdict,
         "baseline": study.baseline,
         "paper_change": change,
-        "paper_relative": change / of_base.value if of_base and measure.relative else np.nan,
-        "direction": BASELINE if method == base else lacking or _direction(estimate, change, measure),
+        "paper_relative": change / of_base.value if of_base and metric.relative else np.nan,
+        "direction": BASELINE if method == base else lacking or _direction(estimate, change, metric),
         **{name: int(status.get(name, 0)) for name in ("ok", "failed", "missing")},
     }
 
@@ -263,8 +243,8 @@ def _absent(own: Collected, method: str, metric: str) -> str:
     return NOTHING_TO_COMPARE if len(mine.merge(finished[["scenario", "seed"]])) else NOT_COMPUTED
 
 
-def _verdict(estimate: Estimate, printed: Printed | None, measure: Measure, foreign: bool) -> str:
-    """Whether ours is the paper's value, whose rounding is allowed for."""
+def _verdict(estimate: Estimate, printed: Printed | None, metric: Metric, foreign: bool) -> str:
+    """Whether ours is the paper's value, within the rounding of the latter."""
     if printed is None:
         return NO_VALUE
     if foreign:
@@ -275,18 +255,18 @@ def _verdict(estimate: Estimate, printed: Printed | None, measure: Measure, fore
         return WITHIN
     if not np.isfinite(estimate.low):
         return NO_INTERVAL
-    return BETTER if (estimate.ours > printed.value) == measure.higher else WORSE
+    return BETTER if (estimate.ours > printed.value) == metric.higher_is_better else WORSE
 
 
-def _direction(estimate: Estimate, change: float, measure: Measure) -> str:
-    """Where the change against the baseline goes: as in the paper; where that has no number, whether it is for the better."""
+def _direction(estimate: Estimate, change: float, metric: Metric) -> str:
+    """Whether the change against the baseline goes where the paper's goes; without a number of the paper, whether it is better."""
     if estimate.scenarios < LEAST_SCENARIOS:
         return TOO_FEW
     low, high = estimate.change_low, estimate.change_high
     if not (low > 0 or high < 0):
         return NOT_RESOLVED
     if np.isnan(change):
-        return BETTER if (low > 0) == measure.higher else WORSE
+        return BETTER if (low > 0) == metric.higher_is_better else WORSE
     if change == 0:
         return UNCHANGED
     return CONFIRMED if (low > 0) == (change > 0) else OPPOSITE

@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.core.records import StageRecord
-from neuspring.scores.layout import markdown
 
 COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),
@@ -46,15 +46,15 @@ def write(table: pd.DataFrame, folder: Path) -> str:
     """perception.csv and perception.md; returns the text."""
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "perception.csv", table.to_csv(index=False))
-    known = {key: value for key, value in COLUMNS.items() if key in table}
-    header = ["", "Scenes", *(heading for heading, _ in known.values())]
+    columns = {key: value for key, value in COLUMNS.items() if key in table}
+    header = ["", "Scenes", *(heading for heading, _ in columns.values())]
     groups = [(str(name), rows) for name, rows in table.groupby("category", sort=True)]
     if len(groups) > 1:
         groups.append(("all", table))
     lines = []
     for name, rows in groups:
-        means = rows[list(known)].mean()
-        cells = ["–" if pd.isna(means[key]) else format(means[key], style) for key, (_, style) in known.items()]
+        means = rows[list(columns)].mean()
+        cells = ["–" if pd.isna(means[key]) else format(means[key], style) for key, (_, style) in columns.items()]
         lines.append([name, str(len(rows)), *cells])
     sensors = ", ".join(sorted(set(table["sensor"]))) if "sensor" in table else "?"
     backends = " and ".join(f"{step}: {', '.join(sorted(set(table[step])))}" for step in ("segment", "track"))

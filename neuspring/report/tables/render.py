@@ -5,24 +5,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from neuspring.core.markdown import markdown
+from neuspring.report.tables.cells import in_order
 from neuspring.scores import paper
-from neuspring.scores.failures import DASHES, WHY
-from neuspring.scores.layout import markdown
-from neuspring.scores.paper import MEASURES, Measure
+from neuspring.scores.failures import DASHES, WHY, mean_rows
+from neuspring.scores.metrics import DASH, IN_PAPER, SHORT, Metric, present
 from neuspring.scores.studies import Study
 
 Mark = Literal["", "best", "second"]
-SHORT = {"reconstruction": "Recon.", "future": "Future"}
 LONG = {"reconstruction": "Reconstruction & Resimulation", "future": "Future Prediction"}
-DASH = "–"
 FAILED_MARK = "*"
-"""Beside the number of runs of a method of which some failed."""
+"""Stands beside the number of runs of a method if some of them failed."""
 TEX = {
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
     **{character: f"\\{character}" for character in "{}%_&#$"},
@@ -39,7 +37,7 @@ class Text(NamedTuple):
 
 
 Line = tuple[tuple[str, ...], list[Text]]
-"""Cells of the stub and of the columns; one whose first cell is empty belongs to the line above."""
+"""Cells of the stub and of the columns. A line whose first cell is empty belongs to the line above."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +49,13 @@ class Grid:
     """One paragraph."""
     stub: tuple[str, ...]
     """Headings of the columns before the metrics."""
-    columns: list[tuple[str, Measure]]
+    columns: list[tuple[str, Metric]]
     lines: list[Line]
 
-
-def number(value: float, measure: Measure, sign: str = "") -> str:
-    """Ours in the paper's unit; a dash for NaN."""
-    return DASH if np.isnan(value) else f"{value:{sign}.{measure.digits}f}"
+    @property
+    def headings(self) -> list[str]:
+        """Of the columns, with arrows that say which direction is better."""
+        return [f"{SHORT[task]} {metric.paper_column}" for task, metric in self.columns]
 
 
 def _interval(low: float, high: float, show: Callable[[float], str]) -> str:
@@ -71,12 +69,12 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
     lines: list[Line] = []
     for label, part in _rows(cells):
         printed, ours, verdicts = [], [], []
-        for task, measure in columns:
-            cell = part[task, measure.name]
-            key = (label, task, measure.name)
-            spread = f" ± {number(cell.spread, measure)}" if np.isfinite(cell.spread) else ""
+        for task, metric in columns:
+            cell = part[task, metric.name]
+            key = (label, task, metric.name)
+            spread = f" ± {metric.paper_text(cell.spread)}" if np.isfinite(cell.spread) else ""
             printed.append(Text(cell.paper or DASH, marks["paper"].get(key, "")))
-            ours.append(Text(number(cell.ours, measure) + spread, marks["ours"].get(key, "")))
+            ours.append(Text(metric.paper_text(cell.ours) + spread, marks["ours"].get(key, "")))
             verdicts.append(Text(cell.verdict))
         lines += [((label, "", "paper"), printed)] if study.reference else []
         lines.append((("" if study.reference else label, _runs(cell), "ours"), ours))
@@ -91,16 +89,16 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
 
 
 def interval_grid(cells: pd.DataFrame) -> Grid:
-    """The interval of our mean, and how far it lies from the paper's value; only what has finished."""
+    """The interval of our mean, and its distance from the paper's value, of finished rows."""
     finished = cells[cells["ours"].notna()]
     columns, lines = _columns(finished), list[Line]()
     compared = bool(finished["difference"].notna().any())
     for label, part in _rows(finished):
-        here = [(part.get((task, measure.name)), measure) for task, measure in columns]
-        intervals = [_interval(cell.low, cell.high, partial(number, measure=measure)) if cell else "" for cell, measure in here]
+        here = [(part.get((task, metric.name)), metric) for task, metric in columns]
+        intervals = [_interval(cell.low, cell.high, metric.paper_text) if cell else "" for cell, metric in here]
         lines.append(((label, "95 %"), [Text(text or DASH) for text in intervals]))
         if compared:
-            distances = [number(cell.difference, measure, "+") if cell else DASH for cell, measure in here]
+            distances = [metric.paper_text(cell.difference, "+") if cell else DASH for cell, metric in here]
             lines.append((("", "ours - paper"), [Text(text) for text in distances]))
     note = f"95 % bootstrap interval of our mean, over scenarios and seeds{'; ours minus the value of the paper' * compared}."
     return Grid(title="Intervals", note=note, stub=("Method", ""), columns=columns, lines=lines)
@@ -112,13 +110,13 @@ def change_grid(study: Study, cells: pd.DataFrame) -> Grid:
     for label, part in _rows(cells):
         if label == study.baseline:
             continue
-        here = [(part[task, measure.name], measure) for task, measure in columns]
+        here = [(part[task, metric.name], metric) for task, metric in columns]
         if any(np.isfinite(cell.paper_change) for cell, _ in here):
-            lines.append(((label, "paper"), [Text(paper_change(cell, measure)) for cell, measure in here]))
+            lines.append(((label, "paper"), [Text(paper_change(cell, metric)) for cell, metric in here]))
         first = label if not lines or lines[-1][0][0] != label else ""
-        lines.append(((first, "ours"), [Text(our_change(cell, measure)) for cell, measure in here]))
+        lines.append(((first, "ours"), [Text(our_change(cell, metric)) for cell, metric in here]))
         lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
-    in_db = " (PSNR: in dB)" if any(not measure.relative for _, measure in columns) else ""
+    in_db = " (PSNR: in dB)" if any(not metric.relative for _, metric in columns) else ""
     note = (
         f"Change against {study.baseline} on the same scenarios and seeds, in per cent of its mean{in_db}, with the paired 95 % "
         "bootstrap interval."
@@ -133,67 +131,64 @@ def other_grid(cells: pd.DataFrame) -> Grid:
     return values_grid("The other average", note, ("Method",), table, ["label"])
 
 
-def held_grid(study: Study, means: pd.DataFrame) -> Grid:
-    """The rows whose method failed somewhere: both averages (`tables_held.both_averages`), in the average that the paper takes."""
+def failures_grid(study: Study, means: pd.DataFrame) -> Grid:
+    """Rows whose method failed somewhere: both averages (`failures.both_averages`), weighted as the paper does."""
     table = means[means["succeeded"] < means["attempted"]].dropna(subset="metric")
-    columns, lines = _columns(table), list[Line]()
-    columns = [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure) in columns]
+    columns, lines = in_order(present(table)), list[Line]()
     for label, method in study.rows.items():
         part = means[means["method"] == method]
-        known = {(row.task, row.metric): row for row in part.itertuples()}
         if not len(part) or part.iloc[0]["succeeded"] == part.iloc[0]["attempted"]:
             continue
-        count = f"{part.iloc[0]['succeeded']}/{part.iloc[0]['attempted']}"
-        for stub, name in (((label, count, "its successes"), "own"), (("", "", "all, failures held"), "all")):
-            here = [(known.get((task, measure.name)), measure) for task, measure in columns]
-            lines.append((stub, [Text(_held_number(row, name, measure)) for row, measure in here]))
+        rows = {(row.task, row.metric): row for row in part.itertuples()}
+        stub = (label, f"{part.iloc[0]['succeeded']}/{part.iloc[0]['attempted']}")
+        for over, name in mean_rows(part):
+            texts = [Text(_mean(rows.get((task, metric.name)), name, metric)) for task, metric in columns]
+            lines.append(((*stub, over), texts))
+            stub = ("", "")
     note = f"Rows marked {FAILED_MARK} above. {WHY} {DASHES}"
     return Grid(title="Failures", note=note, stub=("Method", "Succeeded", "Mean over"), columns=columns, lines=lines)
 
 
-def _held_number(row: Any, name: str, measure: Measure) -> str:
+def _mean(row: Any, name: str, metric: Metric) -> str:
     if row is None:
         return DASH
-    return number(float(getattr(row, name if measure.average == "equal" else f"{name}_frames")), measure)
+    return metric.paper_text(float(getattr(row, name if metric.average == "equal" else f"{name}_frames")))
 
 
 def values_grid(title: str, note: str, stub: tuple[str, ...], table: pd.DataFrame, keys: list[str]) -> Grid:
     """Any table of ours in long form (task, metric, value and `keys`), one line per combination of keys."""
-    present = set(zip(table["task"], table["metric"], strict=True)) if len(table) else set()
-    columns = [(task, measure) for task in paper.TASKS for measure in MEASURES.values() if (task, measure.name) in present]
-    lines: list[Line] = []
+    columns, lines = in_order(present(table)), list[Line]()
     for names, part in table.groupby(keys, sort=False):
         values = part.set_index(["task", "metric"])["value"].to_dict()
-        texts = [Text(number(values.get((task, measure.name), np.nan), measure)) for task, measure in columns]
+        texts = [Text(metric.paper_text(values.get((task, metric.name), np.nan))) for task, metric in columns]
         lines.append((tuple(map(str, names)), texts))
     return Grid(title=title, note=note, stub=stub, columns=columns, lines=lines)
 
 
-def our_change(cell: Any, measure: Measure) -> str:
+def our_change(cell: Any, metric: Metric) -> str:
     """The change against the baseline and its interval, in per cent where that means something."""
-    if measure.relative and np.isfinite(cell.relative):
-        found = (cell.relative, cell.relative_low, cell.relative_high)
-        return f"{_percent(found[0])} % {_interval(*found[1:], _percent)}".rstrip()
+    if metric.relative and np.isfinite(cell.relative):
+        return f"{_percent(cell.relative)} % {_interval(cell.relative_low, cell.relative_high, _percent)}".rstrip()
     if np.isnan(cell.change):
         return DASH
-    interval = _interval(cell.change_low, cell.change_high, partial(number, measure=measure, sign="+"))
-    return f"{number(cell.change, measure, '+')} {interval}".rstrip()
+    interval = _interval(cell.change_low, cell.change_high, lambda value: metric.paper_text(value, "+"))
+    return f"{metric.paper_text(cell.change, '+')} {interval}".rstrip()
 
 
-def paper_change(cell: Any, measure: Measure) -> str:
+def paper_change(cell: Any, metric: Metric) -> str:
     """The change against the baseline that the paper prints, rounded as it is."""
     if np.isnan(cell.paper_change):
         return DASH
-    return number(cell.paper_change, measure, "+") if not measure.relative else f"{_percent(cell.paper_relative)} %"
+    return f"{_percent(cell.paper_relative)} %" if metric.relative else metric.paper_text(cell.paper_change, "+")
 
 
 def _percent(value: float) -> str:
     return f"{100 * value:+.1f}"
 
 
-def _columns(cells: pd.DataFrame) -> list[tuple[str, Measure]]:
+def _columns(cells: pd.DataFrame) -> list[tuple[str, Metric]]:
     pairs = dict.fromkeys(zip(cells["task"], cells["metric"], strict=True))
-    return [(str(task), MEASURES[str(metric)]) for task, metric in pairs]
+    return [(str(task), IN_PAPER[str(metric)]) for task, metric in pairs]
 
 
 def _rows(cells: pd.DataFrame) -> Iterable[tuple[str, dict[tuple[str, str], Any]]]:
@@ -208,44 +203,40 @@ def _runs(cell: Any) -> str:
     return f"{cell.ok}/{total}" + (f" ({wrong})" if wrong else "") + mark if total else DASH
 
 
-def _units(columns: list[tuple[str, Measure]]) -> str:
+def _units(columns: list[tuple[str, Metric]]) -> str:
     text = "CD (single-directional L1 Chamfer distance) and TE (track error) in m"
-    return f"{text}, PSNR in dB." if any(measure.name == "psnr" for _, measure in columns) else f"{text}."
+    return f"{text}, PSNR in dB." if any(metric.name == "psnr" for _, metric in columns) else f"{text}."
 
 
-def _conventions(columns: list[tuple[str, Measure]]) -> str:
-    if not any(measure.average == "frames" for _, measure in columns):
+def _conventions(columns: list[tuple[str, Metric]]) -> str:
+    if not any(metric.average == "frames" for _, metric in columns):
         return ""
     return "; as the paper does, CD and TE weigh scenarios equally, scores of pictures weigh them by their frames"
 
 
-def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Measure]], source: str) -> dict[tuple[str, str, str], Mark]:
+def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Metric]], source: str) -> dict[tuple[str, str, str], Mark]:
     """Best and, where the paper marks it, second best of every column, as far as the printed digits tell."""
-    found: dict[tuple[str, str, str], Mark] = {}
-    for task, measure in columns:
-        part = cells[(cells["task"] == task) & (cells["metric"] == measure.name)]
-        values = pd.to_numeric(part[source]).round(measure.digits)
-        ranked = sorted(values.dropna().unique(), reverse=measure.higher)
+    marks: dict[tuple[str, str, str], Mark] = {}
+    for task, metric in columns:
+        part = cells[(cells["task"] == task) & (cells["metric"] == metric.name)]
+        values = pd.to_numeric(part[source]).round(metric.paper_digits)
+        ranked = sorted(values.dropna().unique(), reverse=metric.higher_is_better)
         if values.notna().sum() < 2:
             continue
         names: tuple[Mark, ...] = ("best", "second") if study.reference in paper.UNDERLINED else ("best",)
         for label, value in zip(part["label"], values, strict=True):
             mark = dict(zip(ranked, names, strict=False)).get(value)
             if mark:
-                found[label, task, measure.name] = mark
-    return found
+                marks[label, task, metric.name] = mark
+    return marks
 
 
 def as_markdown(grid: Grid, level: str = "##") -> str:
-    """Heading, note and table."""
-    header = [*grid.stub, *(f"{SHORT[task]} {_heading(measure)}" for task, measure in grid.columns)]
+    """Heading, note and table in Markdown."""
+    header = [*grid.stub, *grid.headings]
     rows = [[*map(_plain, stub), *map(_marked, texts)] for stub, texts in grid.lines]
     parts = [f"{level} {grid.title}"] * bool(grid.title) + [grid.note] * bool(grid.note)
     return "\n\n".join([*parts, "\n".join(markdown(header, rows))]) + "\n"
-
-
-def _heading(measure: Measure) -> str:
-    return f"{measure.heading} {'↑' if measure.higher else '↓'}"
 
 
 def _plain(text: str) -> str:
@@ -272,7 +263,7 @@ def as_latex(grid: Grid, label: str, title: str) -> str:
         "\\toprule",
         _tex_row(["Task", *[""] * (stub - 1), *spans]),
         " ".join(rules),
-        _tex_row([*map(tex, grid.stub), *(tex(_heading(measure)) for _, measure in grid.columns)]),
+        _tex_row([*map(tex, grid.stub), *(tex(metric.paper_column) for _, metric in grid.columns)]),
         "\\midrule",
     ]
     grouped = any(not names[0] for names, _ in grid.lines)

@@ -13,6 +13,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,9 +21,9 @@ import pandas as pd
 from neuspring.config import parse
 from neuspring.config.types import STRICT, Name
 from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
 from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
-from neuspring.report.tables import summary as tables
 from neuspring.report.tables.cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
 from neuspring.report.tables.render import (
     PREAMBLE,
@@ -30,22 +31,20 @@ from neuspring.report.tables.render import (
     as_latex,
     as_markdown,
     change_grid,
-    held_grid,
+    failures_grid,
     interval_grid,
     main_grid,
-    number,
     other_grid,
     values_grid,
 )
-from neuspring.report.tables.summary import Collected, collect
 from neuspring.scores import paper
 from neuspring.scores.failures import NOTHING, LeftOut, both_averages, left_out_lines, removed_lines, unknown_lines
-from neuspring.scores.metrics import averages
-from neuspring.scores.paper import MEASURES
+from neuspring.scores.metrics import DASH, IN_PAPER, Metric, averages
+from neuspring.scores.runs import Collected, collect, mixed_settings, pairs
 from neuspring.scores.studies import Study
 
 RELEASED_METHODS = ("phystwin", "baseline")
-"""Our rows for the method whose scores per scenario are released."""
+"""Our methods that stand for the released PhysTwin."""
 VERDICTS = (
     "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
     "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
@@ -57,19 +56,19 @@ DIRECTIONS = (
     "which too often change in one direction by chance."
 )
 NAMED = 6
-"""As many runs of one kind are named in a list; <study>_runs.csv has all."""
+"""At most so many runs with the same reason are named. <study>_runs.csv has all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """What a study's table was made of."""
+    """The runs that a study's table was made of."""
 
     __pydantic_config__ = STRICT
     name: Name
     study: Study
     scenarios: tuple[Name, ...]
     methods: tuple[Name, ...]
-    """Those of the study that the benchmark has."""
+    """The methods of the study that the benchmark has."""
     seeds: tuple[int, ...]
     left_out: dict[Name, tuple[Name, ...]] = field(default_factory=dict)
     """Method to the scenarios to which it does not apply."""
@@ -81,7 +80,7 @@ class Made:
 
     @classmethod
     def load(cls, path: Path) -> Made:
-        """Raises InputError."""
+        """Read <name>.json. Raises InputError."""
         return parse(cls, read_json(path, RECORD_FORMAT), str(path))
 
 
@@ -97,32 +96,31 @@ def write_study(
 ) -> str:
     """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run".
 
-    `left_out`: method to the scenarios to which it does not apply.
+    `left_out` maps a method to the scenarios to which it does not apply.
     """
-    known = set(known_methods)
-    methods = [method for method in study.rows.values() if method in known]
+    benchmark = set(known_methods)
+    methods = [method for method in study.rows.values() if method in benchmark]
     return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder)
 
 
 def write_collected(name: str, study: Study, collected: Collected, folder: Path) -> str:
-    """As `write_study`, from runs that `collect` has read; methods of other studies among them are passed over."""
+    """As `write_study`, from runs that are read already. Methods of other studies are ignored."""
     own = of_study(study, collected)
     scores, table, runs = counted(own), cells(study, own), accounted(study, own)
     scenarios, categories = by_scenario(study, own, runs), by_category(study, scores)
-    written = {"": table.assign(study=name), "_runs": runs, "_scenarios": scenarios, "_categories": categories}
-    for suffix, rows in written.items():
+    means = both_averages(own.scores, own.runs, own.frozen)
+    files = {"": table.assign(study=name), "_runs": runs, "_scenarios": scenarios, "_categories": categories, "_failures": means}
+    for suffix, rows in files.items():
         write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
     names = {column: tuple(dict.fromkeys(own.runs[column].tolist())) for column in ("scenario", "method", "seed")}
     absent = {method: tuple(where) for method, where in own.left_out.items()}
     methods = tuple(dict.fromkeys([*names["method"], *absent]))
     Made(name=name, study=study, scenarios=names["scenario"], methods=methods, seeds=names["seed"], left_out=absent).save(folder)
-    means = both_averages(own.scores, own.runs, own.held)
-    write_text(folder / f"{name}_failures.csv", means.to_csv(index=False))
     grids = _captioned(study, own, scores, table, means)
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
     write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
-    warning = tables.mixed_settings(own.runs)
+    warning = mixed_settings(own.runs)
     parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
     parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
     parts.append(_left_out(runs, study, name, own))
@@ -159,7 +157,7 @@ def by_category(study: Study, scores: pd.DataFrame) -> pd.DataFrame:
     if not len(scores):
         return pd.DataFrame(columns=[*columns, "unit"])
     table = averages(scores, by=("category", "method", "task", "metric"))
-    frames = table["metric"].map({name: measure.average == "frames" for name, measure in MEASURES.items()})
+    frames = table["metric"].map({name: metric.average == "frames" for name, metric in IN_PAPER.items()})
     table = table.assign(label=table["method"].map(labels), value=np.where(frames, table["frames"], table["equal"]))
     return _in_order(study, table[columns])
 
@@ -176,19 +174,21 @@ def released_comparison(own: Collected, method: str) -> pd.DataFrame:
 
 
 def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
-    """With units, rows of one scenario or category in the study's order, groups as they first appear."""
+    """The table with units. Scenarios or categories keep their order; their rows are in the order of the study."""
     first = table.columns[0]
     ranks = {first: list(dict.fromkeys(table[first])), "label": list(study.rows)}
-    ranks |= {"task": list(paper.TASKS), "metric": list(MEASURES)}
+    ranks |= {"task": list(paper.TASKS), "metric": list(IN_PAPER)}
     place = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
     order = pd.DataFrame(place).sort_values(list(place)).index
-    return table.assign(unit=table["metric"].map({name: m.unit for name, m in MEASURES.items()})).loc[order].reset_index(drop=True)
+    units = table["metric"].map({name: metric.paper_unit for name, metric in IN_PAPER.items()})
+    return table.assign(unit=units).loc[order].reset_index(drop=True)
 
 
 def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.DataFrame, means: pd.DataFrame) -> list[Grid]:
-    """The blocks of the table that have lines; the note of the first says what every reader must know."""
-    pairs, kept = (len(table[["scenario", "seed"]].drop_duplicates()) for table in (own.runs, scores))
-    which = f"Averages take the {kept} of {pairs} pairs of scenario and seed that every method with a finished run has finished."
+    """The grids that have lines. The note of the first one explains averages and verdicts."""
+    kept = pairs(scores)
+    which = f"Averages take the {kept} of {pairs(own.runs)} pairs of scenario and seed "
+    which += "that every method with a finished run has finished."
     main, change = main_grid(study, table), change_grid(study, table)
     labels = _labels(study)
     removed = " ".join(removed_lines(own.runs, own.left_out, labels))
@@ -198,7 +198,7 @@ def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.Dat
     notes += [paper.CLUSTER_CLAIM] if cluster_methods(study.rows.values()) else []
     main = dataclasses.replace(main, note=" ".join(note for note in notes if note))
     change = dataclasses.replace(change, note=f"{change.note} {DIRECTIONS}")
-    failures = held_grid(study, means)
+    failures = failures_grid(study, means)
     unknown = unknown_lines(means, labels)
     failures = dataclasses.replace(failures, note=" ".join([failures.note, *unknown]))
     return [grid for grid in (main, failures, interval_grid(table), change, other_grid(table)) if grid.lines]
@@ -210,7 +210,7 @@ def _labels(study: Study) -> dict[str, str]:
 
 
 def _pictures(own: Collected) -> str:
-    """Of how pictures were scored, what moves them against the paper's."""
+    """How pictures were scored, as far as it changes their scores against the paper's."""
     facts = [json.loads(text) for text in own.runs["images"].dropna()]
     scored = [fact for fact in facts if fact and "failed" not in fact]
     if not scored:
@@ -222,7 +222,7 @@ def _pictures(own: Collected) -> str:
 
 
 def _curve(study: Study, scores: pd.DataFrame, path: Path) -> str:
-    """The picture of the number of regions, for a study of it."""
+    """The section with the picture of the number of regions, in a study of that number."""
     if len(cluster_methods(study.rows.values())) < 2 or not len(scores) or clusters_figure(scores, path) is None:
         path.unlink(missing_ok=True)
         return ""
@@ -230,12 +230,12 @@ def _curve(study: Study, scores: pd.DataFrame, path: Path) -> str:
 
 
 def _left_out(runs: pd.DataFrame, study: Study, name: str, own: Collected) -> str:
-    """The runs that averages do not take: failures one by one, others by their reason; and the rows without a method."""
-    begun = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
+    """The runs that averages leave out, failures one by one and others by their reason, and the rows without a method."""
+    asked = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
     lines = [
         f"- {label}: {method} is not among the methods of this benchmark"
         for label, method in study.rows.items()
-        if label not in begun
+        if label not in asked
     ]
     left = runs[~runs["counted"].astype(bool)]
     for (label, status, why), part in left.groupby(["label", "status", "why"], sort=False):
@@ -261,23 +261,26 @@ def _write_released(name: str, study: Study, own: Collected, folder: Path) -> st
     rows = []
     for (task, metric), part in table.groupby(["task", "metric"], sort=True):
         both = part.dropna(subset="ours")
-        lines = [[str(row.scenario), *_released_cells(row, MEASURES[str(metric)])] for row in part.itertuples()]
+        of_paper = IN_PAPER[str(metric)]
+        lines = [[str(row.scenario), *_released_cells(row, of_paper)] for row in part.itertuples()]
         if len(both):
             mean = both[["released", "ours", "difference"]].mean()
             mean["ratio"], mean["spread"] = mean["ours"] / mean["released"], np.nan
-            lines.append([f"mean of {len(both)}", *_released_cells(mean, MEASURES[str(metric)])])
-        heading = f"## {str(task).capitalize()}, {MEASURES[str(metric)].heading}\n"
-        rows += [heading, "\n".join(tables.markdown(["Scenario", "Released", "Ours", "Difference", "Ratio"], lines)) + "\n"]
+            lines.append([f"mean of {len(both)}", *_released_cells(mean, of_paper)])
+        heading = f"## {str(task).capitalize()}, {of_paper.paper_heading}\n"
+        rows += [heading, "\n".join(markdown(["Scenario", "Released", "Ours", "Difference", "Ratio"], lines)) + "\n"]
     write_text(folder / f"{stem}.md", "\n".join([head, note, *rows]))
-    found = int(table.loc[table["ours"].notna(), "scenario"].nunique())
-    where = f"{found} of {len(paper.scenarios())} scenarios have finished" if found else "nothing has finished on its scenarios"
+    count = int(table.loc[table["ours"].notna(), "scenario"].nunique())
+    where = f"{count} of {len(paper.scenarios())} scenarios have finished" if count else "nothing has finished on its scenarios"
     return f"## Beside the released PhysTwin\n\n[Per scenario]({stem}.md): {where}.\n"
 
 
-def _released_cells(row: object, measure: paper.Measure) -> list[str]:
-    released, ours, spread, difference, ratio = (
-        float(getattr(row, name)) for name in ("released", "ours", "spread", "difference", "ratio")
-    )
-    around = f" ± {number(spread, measure)}" if np.isfinite(spread) else ""
-    ratio_text = f"{ratio:.3f}" if np.isfinite(ratio) else number(np.nan, measure)
-    return [number(released, measure), number(ours, measure) + around, number(difference, measure, "+"), ratio_text]
+def _released_cells(row: Any, metric: Metric) -> list[str]:
+    around = f" ± {metric.paper_text(row.spread)}" if np.isfinite(row.spread) else ""
+    ratio = f"{row.ratio:.3f}" if np.isfinite(row.ratio) else DASH
+    return [
+        metric.paper_text(row.released),
+        metric.paper_text(row.ours) + around,
+        metric.paper_text(row.difference, "+"),
+        ratio,
+    ]

@@ -15,7 +15,7 @@ import pandas as pd
 from neuspring.core.errors import InputError
 from neuspring.data.cases import released_cases
 from neuspring.scores.lpips import Lpips
-from neuspring.scores.metrics import TASKS, UNITS, averages
+from neuspring.scores.metrics import METRICS, TASKS, UNITS, averages
 
 Outcome = Literal["passed", "failed", "measured", "skipped"]
 """measured: there is no published number to compare with."""
@@ -25,11 +25,6 @@ SCORES = "released_phystwin_scores.csv"
 PUBLISHED_NAMES = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
 MEANS = ("MEAN22_REEVAL", "MEAN22_PAPER")
 """Rows of means over the 22 scenarios: evaluated again with more digits, as printed in the paper."""
-TOLERANCES = {"chamfer": 1e-6, "track_error": 1e-6, "psnr": 0.02, "ssim": 5e-4, "lpips": 5e-4, "iou": 2e-3}
-"""m for distances: single precision and its order of summation. Pictures of the stand-in agree within 1e-6 dB with another drawing
-in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterisers lie between, none was at hand."""
-FRAME_WEIGHTED = ("psnr", "ssim", "lpips", "iou")
-"""The published means of pictures weigh frames equally, those of distances scenarios."""
 
 
 class Absent(Exception):
@@ -161,7 +156,7 @@ def of_scores(
 def _judged(score: Finding, reference: Reference | None) -> Finding:
     if reference is None:
         return score
-    return score.against(reference.value, max(TOLERANCES[score.quantity], reference.half_digit))
+    return score.against(reference.value, max(METRICS[score.quantity].tolerance, reference.half_digit))
 
 
 def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]:
@@ -184,7 +179,7 @@ def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]
 
 def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) -> Finding:
     """The mean of one metric in one task; `row` is its average, `scores` are the scores of the scenarios."""
-    weighted = row["metric"] in FRAME_WEIGHTED
+    weighted = METRICS[row["metric"]].average == "frames"
     references = published.means(row["task"], row["metric"])
     whole = frozenset(scores["scenario"]) == published.scenarios
     note = f"{'frame' if weighted else 'scenario'}-weighted over {len(scores)} scenarios"

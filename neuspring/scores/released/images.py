@@ -25,9 +25,9 @@ from neuspring.data.released import (
     read_prediction,
     visible_pixels,
 )
-from neuspring.scores import images as image_metrics
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
+from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.scores.released.findings import Absent, Finding, Tools, of_scores, require
 from neuspring.splats.draw import COVERED, moved, picture, view_of
 from neuspring.splats.model import Splats
@@ -117,12 +117,5 @@ def _scores(
     observed = read_picture(case.colours / name, camera)
     mask = read_picture(case.object_masks / name, camera, gray=True)
     human = read_picture(case.human_masks / name, camera, gray=True)
-    truth, prediction = image_metrics.masked_pair(observed, mask, rendered, human)
-    scores = {
-        "psnr": float(image_metrics.psnr(prediction, truth)),
-        "ssim": float(image_metrics.ssim(prediction, truth)),
-        "iou": image_metrics.iou(*image_metrics.silhouettes(mask, rendered, human, 1 if quirks.any_alpha else COVERED)),
-    }
-    if not isinstance(lpips, str):
-        scores["lpips"] = float(lpips(prediction, truth, released_range=quirks.unit_lpips))
-    return scores
+    pair = Pair.of(observed, rendered, mask, human, 1 if quirks.any_alpha else COVERED)
+    return picture_scores(pair, lpips, unit_lpips=quirks.unit_lpips)

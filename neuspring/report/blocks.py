@@ -1,4 +1,4 @@
-"""What a page is made of. Blocks hold data and text; the template turns them into HTML, and escapes every text."""
+"""The parts of a page. Blocks hold data and text. The template turns them into HTML and escapes every text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "�
 
 @dataclass(frozen=True, kw_only=True)
 class Chip:
-    """A word on a coloured ground, with a symbol, so that colour says nothing alone."""
+    """A word on a colored ground, with a symbol, so that nothing is said by color alone."""
 
     text: str
     tone: Tone = ""
@@ -30,10 +30,10 @@ class Cell:
     chips: Sequence[Chip] = ()
     best: bool = False
     mark: str = ""
-    """Words for `best` that are read aloud."""
+    """Words for `best`, for screen readers."""
     tone: Tone = ""
     value: float | str | None = None
-    """What the column is sorted by; None: the text."""
+    """Key by which the column is sorted; None: the text."""
     wrap: bool = False
     """May take several lines."""
     link: str = ""
@@ -104,16 +104,17 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An embedded picture, or, without `data`, a link to the file and why."""
+    """A picture; without `data`, a link to the file and why it is not shown."""
 
     kind: ClassVar[str] = "picture"
     caption: str
     alt: str
     data: str = ""
+    """Its source: a data URI, or the path of a file on a page that is not self-contained."""
     link: str = ""
     reason: str = ""
     wide: bool = False
-    """Keeps a width that can be read, and scrolls on small screens."""
+    """Keeps a readable width, and scrolls on small screens."""
     paper: bool = False
     """Drawn for a white page."""
     size: tuple[int, int] = (0, 0)
@@ -121,7 +122,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Video:
-    """An embedded video, or a link to the file and why."""
+    """A video, as `Picture`."""
 
     kind: ClassVar[str] = "video"
     caption: str
@@ -132,18 +133,8 @@ class Video:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawing:
-    """SVG that we drew."""
-
-    kind: ClassVar[str] = "drawing"
-    svg: Markup
-    caption: str
-    wide: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Legend:
-    """Samples of lines: name, colour, dash pattern (SVG)."""
+    """Samples of lines: name, color, dash pattern (SVG)."""
 
     kind: ClassVar[str] = "legend"
     entries: Sequence[tuple[str, str, str]]
@@ -159,7 +150,7 @@ class Prose:
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """Text as it is."""
+    """Preformatted text."""
 
     kind: ClassVar[str] = "code"
     text: str
@@ -177,7 +168,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """Blocks that are shown on demand."""
+    """Blocks that are shown on a click."""
 
     kind: ClassVar[str] = "fold"
     summary: str
@@ -186,7 +177,7 @@ class Fold:
     key: str = ""
 
 
-Block = Table | Text | Items | Facts | Verdict | Picture | Video | Drawing | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Facts | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,99 @@
+"""Predicted pictures beside observed ones: which cameras are compared and how, a pair of pictures, and the scores of a pair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from neuspring.config.images import Images
+from neuspring.core.errors import InputError
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.perception.results import Masks
+from neuspring.scores.images import iou, masked_pair, psnr, silhouettes, ssim
+from neuspring.scores.lpips import Lpips
+from neuspring.splats.draw import COVERED, picture, view_of
+from neuspring.splats.model import Gaussians
+from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.view import View
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What was observed and what is predicted, in one frame of one camera."""
+
+    observed: np.ndarray
+    """[H, W, 3] uint8."""
+    rendered: np.ndarray
+    """[H, W, 4] uint8, over black."""
+    truth: torch.Tensor
+    """[3, H, W], masked as for metrics."""
+    prediction: torch.Tensor
+    """[3, H, W], masked as for metrics."""
+    silhouettes: tuple[np.ndarray, np.ndarray]
+    """Observed and predicted [H, W] bool."""
+    hands: np.ndarray
+    """[H, W] bool."""
+
+    @classmethod
+    def of(cls, observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray, hands: np.ndarray, covered: int) -> Pair:
+        """From bytes, as `images.masked_pair` takes them; `covered` is the least coverage, of 255, that counts as object."""
+        truth, prediction = masked_pair(observed, mask, rendered, hands)
+        return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, covered), hands > 0)
+
+
+def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[str, float]:
+    """PSNR [dB], SSIM, IoU and LPIPS of a pair.
+
+    `lpips` is the metric, or a text that says why there is none; then it is left out. `unit_lpips`: `released_range`
+    of `Lpips`.
+    """
+    truth, prediction = pair.truth, pair.prediction
+    values = {
+        "psnr": float(psnr(prediction, truth)),
+        "ssim": float(ssim(prediction, truth)),
+        "iou": iou(*pair.silhouettes),
+    }
+    if not isinstance(lpips, str):
+        values["lpips"] = float(lpips(prediction, truth, released_range=unit_lpips))
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """What predictions are compared with: cameras, their masks, and how."""
+
+    capture: Capture
+    masks: Mapping[str, np.ndarray]
+    """Perceived labels [T, H, W] by camera; empty where the capture has masks of its own."""
+    masks_from: str
+    views: Mapping[str, View]
+    backend: Backend
+    covered: int
+    """Least coverage, of 255, that counts as object."""
+
+    @classmethod
+    def of(cls, capture: Capture, perceived: Mapping[str, Masks], images: Images, device: str) -> Scored:
+        """The cameras that `images.views` asks for. Raises InputError if a second camera is asked for and there is none."""
+        quirks, cameras = images.released_quirks, list(capture.cameras.values())
+        if quirks.second_camera_intrinsics and len(cameras) < 2:
+            rule = "images.released_quirks.second_camera_intrinsics needs a second camera"
+            raise InputError(capture.folder / CAPTURE, rule, f"{len(cameras)} camera")
+        borrowed = cameras[1] if quirks.second_camera_intrinsics else None
+        scored = cameras[: 1 if images.views == "first" else None]
+        views = {camera.name: view_of(camera, images, device, borrowed) for camera in scored}
+        # Scores should not depend on the segmentation under test, where the capture comes with masks of its own.
+        own = capture.description.masks
+        labels = {} if own else {name: perceived[name].labels for name in views}
+        source = "given" if own else next(iter(perceived.values())).backend
+        covered = 1 if quirks.any_alpha else COVERED
+        return cls(capture, labels, source, views, choose_backend(images.backend, device), covered)
+
+    def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:
+        """Observed and predicted picture of one camera in one frame."""
+        labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
+        mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        rendered = picture(gaussians, self.views[name], self.backend)
+        return Pair.of(self.capture.colour(name, frame), rendered, mask, hands, self.covered)

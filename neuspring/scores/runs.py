@@ -1,0 +1,206 @@
+"""Runs as tables: the scores and records of a benchmark, read from a results folder or from a scores.csv.
+
+Only files are read (run.json and scores.parquet beside it), never MLflow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.scores.failures import NOTHING, LeftOut, applying
+from neuspring.scores.metrics import COLUMNS
+
+RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
+DAMAGED = "damaged record: "
+"""How the reason of a run begins whose files cannot be read."""
+Key = tuple[str, str, int]
+"""Scenario, method, seed."""
+
+
+def stacked(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """One table of scores. Empty tables carry no column types and are left out."""
+    filled = [table for table in tables if len(table)]
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Scores of all runs that have them, and one row per run with its status (ok, failed or missing)."""
+
+    scores: pd.DataFrame
+    runs: pd.DataFrame
+    frozen: pd.DataFrame = field(default_factory=lambda: stacked([]))
+    """Scores of failed runs whose prediction stays at its last finite frame. Runs of older records have none."""
+    left_out: LeftOut = field(default_factory=dict)
+    """Method to the scenarios to which it does not apply, so that it has no runs there."""
+    records: Mapping[Key, RunRecord] = field(default_factory=dict)
+    """The records that could be read."""
+
+
+def collect(
+    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], left_out: LeftOut = NOTHING
+) -> Collected:
+    """Read the records of every (scenario, method, seed).
+
+    A run without a record is missing, one with a damaged record failed. Where `left_out` says that a method does not apply to a
+    scenario, there is no run.
+    """
+    scenarios, methods = tuple(scenarios), tuple(methods)
+    absent = applying(left_out, scenarios, methods)
+    scores, frozen, rows, records = [], [], [], {}
+    for identity, path in _paths(results, scenarios, methods, seeds, RUN_RECORD):
+        if identity["scenario"] in absent.get(identity["method"], ()):
+            continue
+        if not path.is_file():
+            rows.append(identity | {"status": "missing", "reason": "no run.json: the run has not finished"})
+            continue
+        try:
+            record = RunRecord.load(path)
+            tables = [_read_table(path, name) for name in _score_files(record)]
+        except (OSError, ValueError, KeyError) as error:
+            rows.append(identity | {"status": "failed", "reason": f"{DAMAGED}{one_line(error)}"})
+            continue
+        records[tuple(identity.values())] = record
+        scores.append(tables[0])
+        frozen.append(tables[1])
+        rows.append(identity | _facts(record))
+    columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
+    runs = pd.DataFrame(rows, columns=list(columns))
+    runs = runs.fillna(dict.fromkeys(("notes", "source", "run_key"), ""))
+    return Collected(stacked(scores), runs, stacked(frozen), absent, records)
+
+
+def _paths(
+    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], name: str
+) -> Iterator[tuple[dict[str, Any], Path]]:
+    """(scenario, method and seed; path of its record `name`) for every combination."""
+    for scenario, method, seed in product(scenarios, methods, seeds):
+        yield {"scenario": scenario, "method": method, "seed": seed}, Path(results) / scenario / method / str(seed) / name
+
+
+def one_line(error: Exception) -> str:
+    """The error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _score_files(record: RunRecord) -> tuple[str | None, str | None]:
+    """The files of scores, and of those with the last frame frozen."""
+    return record.scores_file, None if record.ok else record.held_file
+
+
+def _read_table(path: Path, name: str | None) -> pd.DataFrame:
+    return pd.read_parquet(path.parent / name)[list(COLUMNS)] if name else stacked([])
+
+
+def _facts(record: RunRecord) -> dict[str, Any]:
+    """What tables need of a record."""
+    facts = {name: getattr(record, name) for name in ("status", "reason", "source", "run_key")}
+    facts["notes"] = "; ".join(record.notes)
+    facts |= {f"seconds_{name}": value for name, value in record.timings.items()}
+    facts |= {f"memory_mb_{name}": value for name, value in record.peak_memory_mb.items()}
+    facts |= {"averaged": record.params.get("rollout.result.averaged", 1), "images": json.dumps(record.images)}
+    facts["settings"] = json.dumps({name: _digest(values) for name, values in record.settings.items()})
+    return facts
+
+
+def _digest(settings: Mapping[str, Any]) -> str:
+    """SHA-256 of a stage's settings without its seed, shortened."""
+    values = {name: value for name, value in settings.items() if name != "seed"}
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def read_scores(path: Path) -> Collected:
+    """The runs of a scores.csv of a folder of tables; the runs.csv beside it says how they ended. Raises InputError.
+
+    Without runs.csv a run counts as finished if it has a Chamfer distance of every task that any run has. A diverged run has fewer.
+    """
+    try:
+        scores = pd.read_csv(path)
+        scores = scores[list(COLUMNS)].astype({"value": float, "seed": int})
+    except (OSError, ValueError, KeyError) as error:
+        rule = f"must be a scores.csv with the columns {', '.join(COLUMNS)}"
+        raise InputError(path, rule, one_line(error), "Take the file from a folder of tables.") from error
+    runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
+    beside = path.with_name("runs.csv")
+    if beside.is_file():
+        table = pd.read_csv(beside).reindex(columns=[*RUN_COLUMNS, "averaged"])
+        return Collected(scores, table.fillna(dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"averaged": 1}))
+    errors = scores[scores["metric"] == "chamfer"]
+    tasks = runs.merge(errors.groupby(["scenario", "method", "seed"])["task"].nunique().reset_index(), how="left")["task"]
+    finished = tasks == errors["task"].nunique()
+    runs["status"] = np.where(finished, "ok", "failed")
+    runs["reason"] = np.where(finished, "", "its scores are not complete")
+    nothing = {"notes": "", "images": "null", "run_key": ""}
+    return Collected(scores, runs.assign(source=path.name, averaged=1, **nothing))
+
+
+def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
+    """Transferred twins as runs: `scenario` is the source, and its score the mean over its targets."""
+    tables, rows = [], []
+    for identity, path in _paths(results, sources, methods, seeds, "transfer.json"):
+        if not path.is_file():
+            continue
+        try:
+            record = StageRecord.load(path)
+            table = pd.read_parquet(record.file("scores", path))
+        except (OSError, ValueError, KeyError) as error:
+            rows.append(identity | {"status": "failed", "reason": f"{DAMAGED}{one_line(error)}", "notes": ""})
+            continue
+        diverged = record.facts.get("diverged", [])
+        reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
+        status = "ok" if record.status == "ok" and not diverged else "failed"
+        rows.append(identity | {"status": status, "reason": reason, "notes": ""})
+        keys = ["category", "method", "seed", "task", "metric", "unit"]
+        mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
+        tables.append(mean.assign(scenario=identity["scenario"])[list(COLUMNS)])
+    return Collected(stacked(tables), pd.DataFrame(rows))
+
+
+def pairs(table: pd.DataFrame) -> int:
+    """How many pairs of scenario and seed a table has."""
+    return len(table[["scenario", "seed"]].drop_duplicates())
+
+
+def finished_scores(collected: Collected) -> pd.DataFrame:
+    """Scores of the runs that have a result."""
+    return collected.scores.merge(collected.runs.loc[collected.runs["status"] == "ok", ["scenario", "method", "seed"]])
+
+
+def comparable(collected: Collected) -> pd.DataFrame:
+    """Scores of the pairs of scenario and seed that every method finished, so that averages compare like with like.
+
+    A method that finished no run takes no part. `failures.removed_lines` says why pairs are missing.
+    """
+    if not len(collected.scores):
+        return collected.scores
+    good = collected.runs[collected.runs["status"] == "ok"]
+    methods = good["method"].nunique()
+    complete = good.groupby(["scenario", "seed"])["method"].nunique()
+    common = complete[complete == methods].index
+    keep = pd.MultiIndex.from_frame(collected.scores[["scenario", "seed"]]).isin(common)
+    return collected.scores[keep & collected.scores["method"].isin(good["method"])]
+
+
+def mixed_settings(runs: pd.DataFrame) -> str:
+    """A warning if finished runs of one method were made with different settings; empty if not."""
+    if "settings" not in runs:
+        return ""
+    mixed: dict[str, list[str]] = {}
+    for method, part in runs[runs["status"] == "ok"].groupby("method", sort=False):
+        stages = pd.DataFrame([json.loads(text) for text in part["settings"].dropna() if text])
+        for stage in (name for name in stages if stages[name].nunique() > 1):
+            mixed.setdefault(str(stage), []).append(str(method))
+    where = "; ".join(f"{stage} of {', '.join(methods)}" for stage, methods in mixed.items())
+    return f"Runs were made with different settings ({where}): make the older ones again before they are compared." if mixed else ""
