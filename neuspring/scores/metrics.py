@@ -54,8 +54,8 @@ class Metric:
     tolerance: float
     """Largest difference, in the stored unit, from a published value of the same data that conformance checks allow.
 
-    Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another drawing
-    in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie between, none was at hand.
+    Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another
+    drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie between.
     """
     paper_name: str
     """In paper_tables.csv."""

@@ -14,12 +14,14 @@ import gc
 import importlib
 import json
 import os
+import runpy
 import selectors
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -238,17 +240,16 @@ class _Server:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """The command's exit status, as the interpreter would have it."""
-    from neuspring.cli.main import main as command
-
+    """`python -m neuspring`; its exit status, as the interpreter would have it."""
     sys.argv = ["neuspring", *arguments]
     try:
-        return command(list(arguments))
+        runpy.run_module("neuspring", run_name="__main__")
     except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(bool(end.code))
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:
-        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+        traceback.print_exc()
         return 1
+    return 0
 
 
 if __name__ == "__main__":
