@@ -25,7 +25,8 @@ from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.autograd import ELASTICITY_RANGE, FRICTION_RANGE, pack, twin_tensors
+from neuspring.physics import contact
+from neuspring.physics.autograd import pack, twin_tensors
 from neuspring.physics.solver import Parameters
 from neuspring.twin.field import SpringField, midpoints
 
@@ -182,10 +183,9 @@ class TwinParameters(nn.Module):
         """`twin` with the present values, clamped as they are used."""
         with torch.no_grad():
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
-        limits = {"elasticity": ELASTICITY_RANGE, "friction": FRICTION_RANGE}
-        contact: dict[str, Any] = {n: float(np.clip(values[n], *limits[n.rpartition("_")[2]])) for n in CONTACT_SCALARS}
-        contact["drag"] = float(values["drag"])
-        material = replace(twin.material, stiffness=values["stiffness"], dashpot=values["dashpot"], **contact)
+        scalars: dict[str, Any] = {n: float(np.clip(values[n], *contact.RANGES[n.rpartition("_")[2]])) for n in CONTACT_SCALARS}
+        scalars["drag"] = float(values["drag"])
+        material = replace(twin.material, stiffness=values["stiffness"], dashpot=values["dashpot"], **scalars)
         topology = twin.topology
         if self.settings.rest_length_bound:
             topology = replace(topology, rest_lengths=values["rest_lengths"])

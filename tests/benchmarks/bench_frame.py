@@ -84,11 +84,10 @@ def bench(name: str, device: str, repeats: int) -> dict[str, float]:
         after.square().sum().backward()
 
     def relaunched() -> None:
-        kept._record_forward()
-        for adjoint in (b for name, b in kept._buffers.items() if name.startswith("adj_")):
-            adjoint.zero_()
-        kept._buffers["adj_x"][: len(x)].copy_(x)
-        kept._record_backward()
+        kept.launch_forward()
+        kept.clear_adjoints()
+        kept.buffers.tensors["adj_x"][: len(x)].copy_(x)
+        kept.launch_backward()
 
     start = time.perf_counter()
     free.forward(x, v, begin, end)
@@ -98,7 +97,7 @@ def bench(name: str, device: str, repeats: int) -> dict[str, float]:
     print(f"    first forward + backward:             {time.perf_counter() - start:.2f} s")
     rows = {
         "forward only, captured": lambda: free.forward(x, v, begin, end),
-        "forward only, launched": free._record_forward,
+        "forward only, launched": free.launch_forward,
         "forward + backward, captured": learn,
         "forward + backward, launched": relaunched,
     }

@@ -35,11 +35,11 @@ def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") ->
     made = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
     solver = solver_for(made, 0, device)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
-    solver._views["partners"].fill_(-1)
+    solver.buffers.partners.fill_(-1)
     for _ in range(frames):
         after, _ = solver.forward(state, 0 * state, nobody, nobody)
         np.testing.assert_array_equal(after.cpu().numpy(), x)
-    partners, count = solver._views["partners"].numpy(), solver._views["count"].numpy()
+    partners, count = solver.buffers.partners.numpy(), solver.buffers.count.numpy()
     assert partners.shape == (len(x), capacity)
     assert (count <= capacity).all()
     # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.

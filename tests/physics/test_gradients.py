@@ -13,7 +13,7 @@ import warp as wp
 
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import start_warp
-from neuspring.physics import contact, integrate, reference, springs
+from neuspring.physics import collision, contact, ground, integrate, reference, springs
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.solver import FrameSolver
 from tests.support.scenes import packed, random_scene, scene, solver_for, tensors, with_values
@@ -89,11 +89,11 @@ def test_spring_kernel(dashpot: float) -> None:
 
     def total(values: Arrays) -> float:
         force = vectors(np.zeros((4, 3)))
-        launch(force_kernel, 4, vectors(values["x"][None]), vectors(values["v"][None]), 0, index, vectors(columns(values)), force)
+        launch(force_kernel, 4, index, vectors(columns(values)), vectors(values["x"][None]), vectors(values["v"][None]), 0, force)
         return float((force.numpy() * weight).sum())
 
     adj_x, adj_v, adj_p = (vectors(np.zeros((4, 3))) for _ in range(3))
-    state = vectors(at["x"][None]), vectors(at["v"][None]), 0, index, vectors(columns(at))
+    state = index, vectors(columns(at)), vectors(at["x"][None]), vectors(at["v"][None]), 0
     launch(adjoint_kernel, 4, *state, vectors(weight), adj_x, adj_v, adj_p)
     p = adj_p.numpy()
     # The kernel leaves out the factor Y of the second column; d(1/l0) = -d(l0) / l0^2.
@@ -106,7 +106,7 @@ def test_spring_adjoint_accumulates() -> None:
     """Adjoints add to what is there: substeps share the buffers."""
     rng, pairs = np.random.default_rng(1), wp.array(np.array([[0, 1]], np.int32), dtype=wp.vec2i, device="cpu")
     start_warp()
-    state = vectors(rng.random((1, 2, 3))), vectors(rng.random((1, 2, 3))), 0, pairs, vectors(np.array([[2.0, 3.0, 0.5]]))
+    state = pairs, vectors(np.array([[2.0, 3.0, 0.5]])), vectors(rng.random((1, 2, 3))), vectors(rng.random((1, 2, 3))), 0
     weight, adjoints = vectors(rng.random((2, 3))), [vectors(np.zeros((n, 3))) for n in (2, 2, 1)]
     launch(springs.kernels(wp.float64)[1], 1, *state, weight, *adjoints)
     once = [a.numpy().copy() for a in adjoints]
@@ -124,12 +124,12 @@ def test_velocity_kernel() -> None:
     def after(values: Arrays) -> np.ndarray:
         result = vectors(np.zeros((1, count, 3)))
         force, gravity = vectors(values["force"]), VEC3(0.0, 0.0, -9.8)
-        launch(terms.velocity, count, vectors(values["v"][None]), 0, force, gravity, dt, reals(values["decay"]), result, 0)
+        launch(terms.velocity, count, gravity, dt, reals(values["decay"]), vectors(values["v"][None]), 0, force, result, 0)
         assert not force.numpy().any(), "the force is cleared for the next substep"
         return result.numpy()[0]
 
     adj_v, adj_force, adj_decay = vectors(np.zeros((count, 3))), vectors(np.zeros((count, 3))), reals(np.zeros(count))
-    state = vectors(after(at)[None]), 0, dt, reals(at["decay"]), vectors(weight)
+    state = dt, reals(at["decay"]), vectors(after(at)[None]), 0, vectors(weight)
     launch(terms.velocity_adjoint, count, *state, adj_v, adj_force, adj_decay)
     got = {"v": adj_v.numpy(), "force": adj_force.numpy(), "decay": adj_decay.numpy().sum(keepdims=True)}
     assert_gradients(got, differences(lambda values: float((after(values) * weight).sum()), at), KERNEL)
@@ -140,7 +140,7 @@ def test_advance_kernel() -> None:
     rng, dt = np.random.default_rng(3), 0.01
     wx, wv = rng.standard_normal((2, 4, 3))
     adj_x, adj_v = vectors(wx), vectors(wv)
-    launch(integrate.kernels(wp.float64).advance_adjoint, 4, adj_x, adj_v, dt)
+    launch(integrate.kernels(wp.float64).advance_adjoint, 4, dt, adj_x, adj_v)
     np.testing.assert_allclose(adj_x.numpy(), wx)
     np.testing.assert_allclose(adj_v.numpy(), wv + dt * wx)
 
@@ -161,7 +161,7 @@ GROUND_CASES = {
 def test_ground_kernel(case: str, up: float) -> None:
     """x, v, elasticity and friction, in contact and out, sliding and sticking."""
     position, speed, friction = GROUND_CASES[case]
-    rng, dt, hits = np.random.default_rng(4), 0.01, contact.kernels(wp.float64)
+    rng, dt, (motion, adjoint) = np.random.default_rng(4), 0.01, ground.kernels(wp.float64)
     flip = np.array([1.0, 1.0, up])
     weight_x, weight_v = rng.standard_normal((2, 1, 3))
     at = {"x": (np.array(position) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
@@ -169,13 +169,13 @@ def test_ground_kernel(case: str, up: float) -> None:
     def total(values: Arrays) -> float:
         x, v = vectors(np.stack([values["x"]] * 2)), vectors(np.zeros((2, 1, 3)))
         response = reals([values["e"], values["mu"]])
-        launch(hits.ground, 1, x, v, 0, 1, vectors(values["v"][None]), 0, dt, up, response)
+        launch(motion, 1, dt, up, response, vectors(values["v"][None]), 0, 0, 1, x, v)
         return float((x.numpy()[1] * weight_x + v.numpy()[1] * weight_v).sum())
 
     adj_x, adj_v, adj_e, adj_mu = vectors(weight_x), vectors(weight_v), reals(0.0), reals(0.0)
     response = reals([at["e"], at["mu"]])
     adjoints = adj_x, adj_v, adj_e, adj_mu
-    launch(hits.ground_adjoint, 1, vectors(at["x"][None]), 0, vectors(at["v"][None]), dt, up, response, *adjoints)
+    launch(adjoint, 1, dt, up, response, vectors(at["x"][None]), 0, vectors(at["v"][None]), *adjoints)
     got = {"x": adj_x.numpy(), "v": adj_v.numpy(), "e": adj_e.numpy()[0], "mu": adj_mu.numpy()[0]}
     wanted = differences(total, at)
     if case == "falling straight":
@@ -202,7 +202,7 @@ def crowd(friction: float) -> tuple[Arrays, np.ndarray, np.ndarray]:
 def test_collision_kernel(friction: float) -> None:
     """x, v, elasticity and friction for Jacobi impulses of nodes with several partners each."""
     at, partners, count = crowd(friction)
-    distance, hits = 0.02, contact.kernels(wp.float64)
+    distance, hits = 0.02, collision.kernels(wp.float64)
     weight = np.random.default_rng(12).standard_normal((6, 3))
     start_warp()
     lists = wp.array(partners, dtype=int, device="cpu"), wp.array(count, dtype=int, device="cpu")
@@ -210,12 +210,12 @@ def test_collision_kernel(friction: float) -> None:
     def total(values: Arrays) -> float:
         after = vectors(np.zeros((1, 6, 3)))
         state = vectors(values["x"][None]), 0, vectors(values["v"][None]), 0
-        launch(hits.collide, 6, *state, reals(distance), reals([values["e"], values["mu"]]), *lists, after)
+        launch(hits.collide, 6, reals(distance), reals([values["e"], values["mu"]]), *lists, *state, after)
         return float((after.numpy()[0] * weight).sum())
 
     adj_v, adj_x, adj_e, adj_mu = vectors(np.zeros((6, 3))), vectors(np.zeros((6, 3))), reals(np.zeros(6)), reals(np.zeros(6))
-    state = vectors(at["x"][None]), 0, vectors(at["v"][None]), reals(distance), reals([at["e"], at["mu"]])
-    launch(hits.collide_adjoint, 6, *state, *lists, vectors(weight), adj_v, adj_x, adj_e, adj_mu)
+    model, state = (reals(distance), reals([at["e"], at["mu"]]), *lists), (vectors(at["x"][None]), 0, vectors(at["v"][None]))
+    launch(hits.collide_adjoint, 6, *model, *state, vectors(weight), adj_v, adj_x, adj_e, adj_mu)
     got = {"x": adj_x.numpy(), "v": adj_v.numpy(), "e": adj_e.numpy().sum(), "mu": adj_mu.numpy().sum()}
     # Lengths here are 0.01 m, so third derivatives in x are 1e4 times those of the other kernels: a smaller step.
     assert_gradients(got, differences(total, at, x=1e-7), KERNEL)
@@ -374,7 +374,7 @@ def test_no_gradient_beyond_the_clamps(name: str, value: float) -> None:
     assert loss_gradient(moved, x, v, hands, weights(4, 6))[name] == 0.0
     low, high = (0.0, 1.0) if name.endswith("elasticity") else (0.0, 2.0)
     bound = with_values(made, {name: low if value < low else high})
-    for got, wanted in zip(packed(moved).tensors(), packed(bound).tensors(), strict=True):
+    for got, wanted in zip(packed(moved), packed(bound), strict=True):
         assert torch.equal(got, wanted)
 
 

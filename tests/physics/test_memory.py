@@ -44,22 +44,22 @@ def test_a_further_frame_keeps_its_start_only(substeps: int) -> None:
 
 
 def buffer_bytes(solver: FrameSolver) -> int:
-    arrays = [view for name, view in solver._views.items() if name not in solver._buffers]
-    return sum(b.untyped_storage().nbytes() for b in solver._buffers.values()) + sum(a.capacity for a in arrays)
+    sizes = {view.ptr: view.capacity for view in solver.buffers.views.values()}
+    return sum((sizes | {t.data_ptr(): t.untyped_storage().nbytes() for t in solver.buffers.tensors.values()}).values())
 
 
 def test_buffers_do_not_grow_with_frames() -> None:
     made, x, v, hands = random_scene(32, frames=12, self_collision=True)
     for differentiable in (True, False):
         solver = solver_for(made, hands.shape[1], differentiable=differentiable)
-        before, addresses = buffer_bytes(solver), {name: b.data_ptr() for name, b in solver._buffers.items()}
+        before, addresses = buffer_bytes(solver), {name: b.data_ptr() for name, b in solver.buffers.tensors.items()}
         state = torch.tensor(x), torch.tensor(v)
         for k in range(12):
             state = solver.forward(*state, torch.tensor(hands[k]), torch.tensor(hands[k + 1]))
             if differentiable:
                 solver.backward(*state)
         assert buffer_bytes(solver) == before
-        assert {name: b.data_ptr() for name, b in solver._buffers.items()} == addresses
+        assert {name: b.data_ptr() for name, b in solver.buffers.tensors.items()} == addresses
 
 
 def test_forward_only_keeps_two_substeps() -> None:
