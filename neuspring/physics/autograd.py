@@ -17,39 +17,35 @@ from neuspring.physics import collision, ground, integrate, springs
 from neuspring.physics.solver import FrameSolver, Parameters
 
 
-class _Frame(torch.autograd.Function):
+class Frame(torch.autograd.Function):
+    """A frame of any solver that has the three members used here.
+
+    `run(begin, end, x, v, *packed)` simulates a frame and returns (x, v). `backward(adj_x, adj_v)` returns the adjoints of
+    (x, v, *packed) in the last frame. `frame_token` counts the frames.
+    """
+
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        solver: FrameSolver,
-        begin: torch.Tensor,
-        end: torch.Tensor,
-        x: torch.Tensor,
-        v: torch.Tensor,
-        *packed: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        solver.set_parameters(Parameters(*packed))
-        result = solver.forward(x, v, begin, end)
+    def forward(ctx: Any, solver: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+        """(x, v) after the frame, from (begin, end, x, v, *packed)."""
+        state: tuple[torch.Tensor, torch.Tensor] = solver.run(*inputs)
         ctx.solver, ctx.token = solver, solver.frame_token
-        ctx.save_for_backward(begin, end, x, v, *packed)
-        return result
+        ctx.save_for_backward(*inputs)
+        return state
 
     @staticmethod
     def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
-        solver: FrameSolver = ctx.solver
-        if solver.frame_token != ctx.token:
-            begin, end, x, v, *packed = ctx.saved_tensors
-            solver.set_parameters(Parameters(*packed))
-            solver.forward(x, v, begin, end)
-        return (None, None, None, *solver.backward(adj_x, adj_v), None)
+        """Adjoints of the inputs; none of the controllers' path."""
+        if ctx.solver.frame_token != ctx.token:
+            ctx.solver.run(*ctx.saved_tensors)
+        return (None, None, None, *ctx.solver.backward(adj_x, adj_v))
 
 
 def simulate_frame(
     solver: FrameSolver, parameters: Parameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`."""
-    result: tuple[torch.Tensor, torch.Tensor] = _Frame.apply(solver, begin, end, x, v, *parameters)  # type: ignore[no-untyped-call]
-    return result
+    state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, begin, end, x, v, *parameters)  # type: ignore[no-untyped-call]
+    return state
 
 
 def pack(*, substep: float, **values: torch.Tensor) -> Parameters:

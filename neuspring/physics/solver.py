@@ -78,18 +78,22 @@ class FrameSolver:
         last = self.buffers.slot(self.simulation.substeps)
         return t["x"][last, :n].clone(), t["v"][last, :n].clone()
 
-    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Adjoints of the last forward frame.
+    def run(
+        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """`forward` with these `Parameters`."""
+        self.set_parameters(Parameters(*packed))
+        return self.forward(x, v, begin, end)
 
-        Returns dL/d(x, v, springs [S, 3], decay [1], ground [2], contact [2]).
-        """
+    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for the contact distance."""
         t, n = self.buffers.tensors, self.nodes
         self.clear_adjoints()
         t["adj_x"][:n].copy_(adj_x)
         t["adj_v"][:n].copy_(adj_v)
         self._graphs.run("backward", self._kernels(), self.launch_backward)
         gradients = [term.gradient(self.buffers) for term in (springs, integrate, ground, collision)]
-        return t["adj_x"][:n].clone(), t["adj_v"][:n].clone(), *gradients
+        return t["adj_x"][:n].clone(), t["adj_v"][:n].clone(), *gradients, None
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""
