@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ from neuspring.physics.solver import Parameters
 from neuspring.twin.field import SpringField, midpoints
 
 CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
+UNTRAINED = ("contact_distance",)
+"""It only selects pairs, so it has no gradient."""
 LOWEST_STIFFNESS = 1e-3
 """Stiffness below this is raised to it before taking the logarithm, N."""
 
@@ -183,10 +185,12 @@ class TwinParameters(nn.Module):
         """`twin` with the present values, clamped as they are used."""
         with torch.no_grad():
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
-        scalars: dict[str, Any] = {n: float(np.clip(values[n], *contact.RANGES[n.rpartition("_")[2]])) for n in CONTACT_SCALARS}
-        scalars["drag"] = float(values["drag"])
-        material = replace(twin.material, stiffness=values["stiffness"], dashpot=values["dashpot"], **scalars)
+        material: dict[str, Any] = {}
+        for name in (f.name for f in fields(twin.material) if f.name not in UNTRAINED):
+            limits = contact.RANGES.get(name.rpartition("_")[2], (-np.inf, np.inf))
+            value = np.clip(values[name], *limits)
+            material[name] = value if value.ndim else float(value)
         topology = twin.topology
         if self.settings.rest_length_bound:
             topology = replace(topology, rest_lengths=values["rest_lengths"])
-        return replace(twin, material=material, topology=topology)
+        return replace(twin, material=replace(twin.material, **material), topology=topology)

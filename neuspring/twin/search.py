@@ -25,7 +25,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
-from neuspring.twin.losses import FrameLoss, acceleration
+from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.rollout import Diverged, frames, solver_for
 from neuspring.twin.topology import isolated, piecewise_topology, regions
@@ -155,17 +155,14 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     lonely = isolated(len(topology.nodes), topology.springs)
     if rule == "penalise" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
-    material = Material(
-        stiffness=np.full(count, values["stiffness"]),
-        dashpot=np.full(count, values["dashpot"]),
-        drag=values["drag"],
-        ground_elasticity=values["ground_elasticity"],
-        ground_friction=values["ground_friction"],
-        contact_elasticity=values["contact_elasticity"],
-        contact_friction=values["contact_friction"],
-        contact_distance=values["contact_distance"],
-    )
+    material = homogeneous(values, count)
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
+
+
+def homogeneous(values: dict[str, float], springs: int) -> Material:
+    """A material that is the same everywhere; `values` has a number for every field of `Material`."""
+    names = {f.name: "shape" in f.metadata for f in fields(Material)}
+    return Material(**{name: np.full(springs, values[name]) if each else values[name] for name, each in names.items()})  # type: ignore[arg-type]
 
 
 def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, int]:
@@ -174,17 +171,9 @@ def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, in
     Raises Diverged.
     """
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    before = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    previous: torch.Tensor | None = None
-    total = 0.0
+    start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
     solver = solver_for(twin, problem.device)
-    for frame, x, v in frames(twin, solver, hands, problem.velocity):
-        total += float(loss(frame, x))
-        change = v - before
-        if previous is not None:
-            total += problem.losses.acceleration * float(acceleration(change, previous))
-        before, previous = v, change
-    return total / (len(hands) - 1), solver.collision_overflow
+    return loss.of_rollout(frames(twin, solver, hands, problem.velocity), start), solver.collision_overflow
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool) 
         scalars = [values[scalar].requires_grad_() for scalar in CONTACT_SCALARS]
         parameters = pack(**values, substep=c.twin.simulation.substep)
         after, speed = simulate_frame(solver, parameters, x, v, hands[k - 1], hands[k])
-        near, moved = loss.terms(k, after)
+        near, moved = loss.terms(k, after).values()
         smooth = near.new_zeros(()) if change is None else c.weights.acceleration * acceleration(speed - v, change)
         total = near + moved + smooth
         total.backward()

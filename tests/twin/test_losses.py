@@ -119,10 +119,10 @@ def frame_loss(*, frozen: bool = False, weights: Losses | None = None) -> tuple[
 
 def test_frames_use_their_visibility_and_the_motion_before() -> None:
     loss, nodes = frame_loss()
-    near, moved = loss.terms(1, nodes)
+    near, moved = loss.terms(1, nodes).values()
     assert near.item() == pytest.approx(0.01)
     assert moved.item() == pytest.approx(2 * 0.005 / 6)
-    near, moved = loss.terms(2, nodes)
+    near, moved = loss.terms(2, nodes).values()
     # Only point 1 is visible, and node 2, which would be nearer, is not surface; only its motion 1 -> 2 is valid.
     assert near.item() == pytest.approx(0.04)
     assert moved.item() == pytest.approx(0.02 / 3)
@@ -134,12 +134,12 @@ def test_frozen_counts_divide_by_frame_one() -> None:
     plain, nodes = frame_loss()
     frozen, _ = frame_loss(frozen=True)
     assert torch.equal(frozen(1, nodes), plain(1, nodes))
-    for got, wanted in zip(frozen.terms(2, nodes), plain.terms(2, nodes), strict=True):
+    for got, wanted in zip(frozen.terms(2, nodes).values(), plain.terms(2, nodes).values(), strict=True):
         assert got.item() == pytest.approx(wanted.item() / 2)
 
 
 def test_weights() -> None:
     plain, nodes = frame_loss()
     weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))
-    near, moved = plain.terms(1, nodes)
+    near, moved = plain.terms(1, nodes).values()
     assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())
