@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from neuspring.core.artifacts import Twin
-from neuspring.physics import collision, ground, integrate, springs
+from neuspring.physics import contact, springs, velocity
 from neuspring.physics.solver import FrameSolver, Parameters
 
 
@@ -55,9 +55,9 @@ def pack(*, substep: float, **values: torch.Tensor) -> Parameters:
     """
     return Parameters(
         springs=springs.pack(values),
-        decay=integrate.pack(values, substep),
-        ground=ground.pack(values),
-        contact=collision.pack(values),
+        decay=velocity.pack(values, substep),
+        ground=contact.pack(values, "ground"),
+        contact=contact.pack(values, "contact"),
         distance=values["contact_distance"].reshape(1),
     )
 

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load, start_warp
+
+
+class ArrayTypes(NamedTuple):
+    """Types of kernel arguments for one scalar type."""
+
+    vec3: Any
+    numbers: Any
+    vectors: Any
+    states: Any
+    """[slots, points] of vectors."""
+
+
+def array_types(real: Any) -> ArrayTypes:
+    """Argument types for the scalar type `real`, wp.float32 or wp.float64."""
+    vec3 = wp.types.vector(3, real)
+    return ArrayTypes(vec3, wp.array(dtype=real), wp.array(dtype=vec3), wp.array2d(dtype=vec3))
 
 
 class Buffers:
@@ -31,35 +47,22 @@ class Buffers:
         self.vec3 = wp.types.vector(3, self.real)
         self.tensors: dict[str, torch.Tensor] = {}
         self.views: dict[str, Any] = {}
-        slots, total = simulation.substeps + 1 if differentiable else 2, nodes + controllers
         self.history = simulation.substeps if differentiable else 1
-        self.add_vectors(x=(slots, total), v=(slots, total), force=(total,), after=(self.history, nodes))
-        self.add_vectors(begin=(controllers,), end=(controllers,))
-        self.add_adjoints(adj_x=(total, 3), adj_v=(total, 3), adj_force=(total, 3))
+        slots, total = self.history + 1, nodes + controllers
+        self.add(x=(slots, total, 3), v=(slots, total, 3), after=(self.history, nodes, 3), force=(total, 3))
+        self.add(begin=(controllers, 3), end=(controllers, 3), adj_x=(total, 3), adj_v=(total, 3), adj_force=(total, 3))
         # Without self-collision nothing changes velocities between the forces and the motion.
         self.views |= {"moving": self.after} | ({"adj_after": self.adj_v} if differentiable else {})
 
-    def add_vectors(self, **shapes: tuple[int, ...]) -> None:
-        """Arrays of 3-vectors, zero at first."""
+    def add(self, **shapes: tuple[int, ...]) -> None:
+        """Add arrays of numbers [n] or of 3-vectors [.., 3], zero at first. Only a differentiable solver has adjoints (adj_...)."""
         for name, shape in shapes.items():
-            self._add(name, (*shape, 3))
-
-    def add_scalars(self, **sizes: int) -> None:
-        """Arrays of numbers, zero at first."""
-        for name, size in sizes.items():
-            self._add(name, (size,))
-
-    def add_adjoints(self, **shapes: tuple[int, ...]) -> None:
-        """Arrays that only a differentiable solver needs; those of two dimensions hold 3-vectors."""
-        for name, shape in shapes.items() if self.differentiable else ():
-            self._add(name, shape)
-
-    def _add(self, name: str, shape: tuple[int, ...]) -> None:
-        self.tensors[name] = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        self.views[name] = wp.from_torch(self.tensors[name], dtype=self.vec3 if len(shape) > 1 else self.real)
+            if self.differentiable or not name.startswith("adj_"):
+                self.tensors[name] = torch.zeros(shape, dtype=self.dtype, device=self.device)
+                self.views[name] = wp.from_torch(self.tensors[name], dtype=self.vec3 if len(shape) > 1 else self.real)
 
     def add_integers(self, **shapes: tuple[int, ...]) -> None:
-        """Arrays of integers, which torch does not see."""
+        """Add arrays of integers, which torch does not see."""
         for name, shape in shapes.items():
             self.views[name] = wp.zeros(shape, dtype=int, device=self.device)
 
@@ -73,13 +76,13 @@ class Buffers:
         """Where x and v before substep `step` lie."""
         return step if self.differentiable else step % 2
 
-    def kept(self, step: int) -> int:
+    def inner_slot(self, step: int) -> int:
         """Where the velocities within substep `step` lie."""
         return step if self.differentiable else 0
 
     def launch(self, kernel: Any, size: int, *arguments: Any) -> None:
         """Run a kernel on `size` threads."""
-        wp.launch(kernel, size, list(arguments), device=self.device)
+        wp.launch(kernel, size, [*arguments], device=self.device)
 
 
 class Graphs:

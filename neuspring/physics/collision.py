@@ -6,14 +6,12 @@ of contact.py. Partners are listed once per frame, those with the lowest indices
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import torch
 import warp as wp
 
 from neuspring.physics import contact
-from neuspring.physics.buffers import Buffers
+from neuspring.physics.buffers import Buffers, array_types
 
 
 class Kernels(NamedTuple):
@@ -24,30 +22,27 @@ class Kernels(NamedTuple):
     collide_adjoint: Any
 
 
-def pack(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """The response (e, mu) [2] between nodes."""
-    return contact.pack(values["contact_elasticity"], values["contact_friction"])
-
-
 def allocate(b: Buffers) -> None:
     """Response and distance; with self-collision also the lists of partners and the velocities after collisions."""
-    b.add_scalars(contact=2, distance=1)
-    b.add_adjoints(adj_contact_e=(b.nodes,), adj_contact_mu=(b.nodes,))
+    b.add(contact=(2,), distance=(1,), adj_contact_e=(b.nodes,), adj_contact_mu=(b.nodes,))
     if b.simulation.self_collision:
         b.add_integers(partners=(b.nodes, b.simulation.collision_capacity), count=(b.nodes,), overflow=(b.nodes,))
-        b.add_vectors(moving=(b.history, b.nodes))
-        b.add_adjoints(adj_after=(b.nodes, 3))
+        b.add(moving=(b.history, b.nodes, 3), adj_after=(b.nodes, 3))
 
 
 def find_candidates(b: Buffers) -> None:
-    """List the partners of every node at the start of the frame, in node order."""
+    """List the partners of every node at the start of the frame, in node order.
+
+    All pairs are looked at: once per frame this costs less than building a hash grid up to about 300 nodes, and 8 % of a frame of
+    667 substeps at 2,000 nodes, on one CPU core.
+    """
     model = (b.nodes, b.distance, b.simulation.collision_capacity)
     b.launch(kernels(b.real).candidates, b.nodes, *model, b.x, b.partners, b.count, b.overflow)
 
 
 def collide(b: Buffers, step: int) -> None:
     """Velocities after the impulses."""
-    model, state = (b.distance, b.contact, b.partners, b.count), (b.x, b.slot(step), b.after, b.kept(step))
+    model, state = (b.distance, b.contact, b.partners, b.count), (b.x, b.slot(step), b.after, b.inner_slot(step))
     b.launch(kernels(b.real).collide, b.nodes, *model, *state, b.moving)
 
 
@@ -58,29 +53,17 @@ def collide_adjoint(b: Buffers, step: int) -> None:
     b.launch(kernels(b.real).collide_adjoint, b.nodes, *model, *state, b.adj_after, b.adj_x, b.adj_contact_e, b.adj_contact_mu)
 
 
-def gradient(b: Buffers) -> torch.Tensor:
-    """dL/d(e, mu) [2]."""
-    return torch.stack([b.tensors["adj_contact_e"].sum(), b.tensors["adj_contact_mu"].sum()])
-
-
 @functools.cache
 def kernels(real: Any) -> Kernels:
     """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
-    vec3 = wp.types.vector(3, real)
+    vec3, numbers, vectors, states = array_types(real)
+    integers: Any = wp.array(dtype=int)
+    table: Any = wp.array2d(dtype=int)
     zero, half, one = wp.constant(real(0.0)), wp.constant(real(0.5)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
 
     def find_candidates(
-        # model
-        nodes: int,
-        distance: wp.array(dtype=real),
-        capacity: int,
-        # state
-        x: wp.array2d(dtype=vec3),
-        # out
-        partners: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        overflow: wp.array(dtype=int),
+        nodes: int, distance: numbers, capacity: int, x: states, partners: table, count: integers, overflow: integers
     ):
         i = wp.tid()
         # wp.int32(0), not 0: Warp takes a bare literal for a constant, which a loop may not change.
@@ -99,18 +82,15 @@ def kernels(real: Any) -> Kernels:
         overflow[i] = overflow[i] + wp.max(found - capacity, 0)
 
     def collide(
-        # model
-        distance: wp.array(dtype=real),
-        response: wp.array(dtype=real),
-        partners: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        # state
-        x: wp.array2d(dtype=vec3),
+        distance: numbers,
+        response: numbers,
+        partners: table,
+        count: integers,
+        x: states,
         slot: int,
-        v: wp.array2d(dtype=vec3),
+        v: states,
         v_slot: int,
-        # out
-        after: wp.array2d(dtype=vec3),
+        after: states,
     ):
         i = wp.tid()
         e = response[0]
@@ -135,21 +115,18 @@ def kernels(real: Any) -> Kernels:
             after[v_slot, i] = v[v_slot, i]
 
     def collide_adjoint(
-        # model
-        distance: wp.array(dtype=real),
-        response: wp.array(dtype=real),
-        partners: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        # state
-        x: wp.array2d(dtype=vec3),
+        distance: numbers,
+        response: numbers,
+        partners: table,
+        count: integers,
+        x: states,
         slot: int,
-        v: wp.array2d(dtype=vec3),
-        adj_after: wp.array(dtype=vec3),
-        # out
-        adj_v: wp.array(dtype=vec3),
-        adj_x: wp.array(dtype=vec3),
-        adj_e: wp.array(dtype=real),
-        adj_mu: wp.array(dtype=real),
+        v: states,
+        adj_after: vectors,
+        adj_v: vectors,
+        adj_x: vectors,
+        adj_e: numbers,
+        adj_mu: numbers,
     ):
         i = wp.tid()
         e = response[0]

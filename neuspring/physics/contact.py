@@ -7,7 +7,11 @@ A relative velocity u = u_n + u_t (normal, tangential) becomes
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+
+from neuspring.physics.buffers import Buffers
 
 APPROACH = 1e-4
 """Slower approaches do not collide (m/s for the ground; m^2/s, distance times speed, for pairs)."""
@@ -17,6 +21,11 @@ RANGES = {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}
 """Values beyond are clamped on use, as in the released simulator."""
 
 
-def pack(elasticity: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
-    """The response (e, mu) [2], clamped to its ranges."""
-    return torch.stack([elasticity.clamp(*RANGES["elasticity"]), friction.clamp(*RANGES["friction"])])
+def pack(values: Mapping[str, torch.Tensor], kind: str) -> torch.Tensor:
+    """The response (e, mu) [2] of a kind, "ground" or "contact" (between nodes), clamped to its ranges."""
+    return torch.stack([values[f"{kind}_{name}"].clamp(*limits) for name, limits in RANGES.items()])
+
+
+def gradient(b: Buffers, kind: str) -> torch.Tensor:
+    """dL/d(e, mu) [2] of a kind, summed over nodes."""
+    return torch.stack([b.tensors[f"adj_{kind}_{name}"].sum() for name in ("e", "mu")])

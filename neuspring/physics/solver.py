@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Simulation
-from neuspring.physics import collision, ground, integrate, springs
+from neuspring.physics import collision, contact, position, springs, velocity
 from neuspring.physics.buffers import Buffers, Graphs
 
 
@@ -53,7 +53,7 @@ class FrameSolver:
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulation, device, dtype
         self.buffers = Buffers(nodes, controllers, simulation, device, dtype, differentiable)
         springs.allocate(self.buffers, spring_pairs)
-        for term in (integrate, collision, ground):
+        for term in (velocity, collision, position):
             term.allocate(self.buffers)
         self._graphs = Graphs(device)
         self.frame_token = 0
@@ -92,8 +92,9 @@ class FrameSolver:
         t["adj_x"][:n].copy_(adj_x)
         t["adj_v"][:n].copy_(adj_v)
         self._graphs.run("backward", self._kernels(), self.launch_backward)
-        gradients = [term.gradient(self.buffers) for term in (springs, integrate, ground, collision)]
-        return t["adj_x"][:n].clone(), t["adj_v"][:n].clone(), *gradients, None
+        own = (springs.gradient(self.buffers), velocity.gradient(self.buffers))
+        contacts = (contact.gradient(self.buffers, kind) for kind in ("ground", "contact"))
+        return t["adj_x"][:n].clone(), t["adj_v"][:n].clone(), *own, *contacts, None
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""
@@ -108,35 +109,28 @@ class FrameSolver:
 
     def _kernels(self) -> Iterator[Any]:
         """What a graph may launch."""
-        real = self.buffers.real
-        yield from springs.kernels(real)
-        yield from integrate.kernels(real)
-        if self.simulation.self_collision:
-            yield from collision.kernels(real)
-        if self.simulation.ground:
-            yield from ground.kernels(real)
+        for term in (springs, velocity, position, *([collision] if self.simulation.self_collision else [])):
+            yield from term.kernels(self.buffers.real)
 
     def launch_forward(self) -> None:
         """The substeps of a frame. Numbers in brackets are the paper's equations; n substeps, step k."""
         b, sim = self.buffers, self.simulation
-        motion = ground if sim.ground else integrate
         for step in range(sim.substeps):
-            integrate.move_controllers(b, step)  # x_c = begin + (end - begin) (k + 1) / n
+            velocity.move_controllers(b, step)  #      x_c = begin + (end - begin) (k + 1) / n
             if sim.self_collision and step == 0:
-                collision.find_candidates(b)  # pairs with |x_j - x_i| < contact distance
-            springs.add_forces(b, step)  # (1, 2, 3)  F_i = sum_j (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
-            integrate.update_velocity(b, step)  # (4)  v' = delta (v + dt (F + g))
+                collision.find_candidates(b)  #        pairs with |x_j - x_i| < contact distance
+            springs.add_forces(b, step)  #      (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
+            velocity.update_velocity(b, step)  #  (4)  v' = delta (v + dt (F + g))
             if sim.self_collision:
-                collision.collide(b, step)  # v'' = v' + mean impulse of the partners that are hit
-            motion.advance(b, step)  # (4)  x' = x + dt v', reflected at the ground
+                collision.collide(b, step)  #          v' += mean impulse from the partners that are hit
+            position.advance(b, step)  #          (4)  x' = x + dt v', reflected at the ground
 
     def launch_backward(self) -> None:
         """The adjoints of `launch_forward`, last line first."""
         b, sim = self.buffers, self.simulation
-        motion = ground if sim.ground else integrate
         for step in reversed(range(sim.substeps)):
-            motion.advance_adjoint(b, step)
+            position.advance_adjoint(b, step)
             if sim.self_collision:
                 collision.collide_adjoint(b, step)
-            integrate.update_velocity_adjoint(b, step)
+            velocity.update_velocity_adjoint(b, step)
             springs.add_forces_adjoint(b, step)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from neuspring.physics.buffers import Buffers
+from neuspring.physics.buffers import Buffers, array_types
 
 MIN_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
@@ -32,8 +32,7 @@ def pack(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
 def allocate(b: Buffers, pairs: np.ndarray) -> None:
     """Springs between `pairs` [S, 2] of points; i >= N means controller i - N."""
     b.views["pairs"] = wp.array(np.ascontiguousarray(pairs, np.int32), dtype=wp.vec2i, device=b.device)
-    b.add_vectors(springs=(len(pairs),))
-    b.add_adjoints(adj_springs=(len(pairs), 3))
+    b.add(springs=(len(pairs), 3), adj_springs=(len(pairs), 3))
 
 
 def add_forces(b: Buffers, step: int) -> None:
@@ -59,21 +58,12 @@ def gradient(b: Buffers) -> torch.Tensor:
 @functools.cache
 def kernels(real: Any) -> tuple[Any, Any]:
     """(force, adjoint) kernels for the scalar type `real`, wp.float32 or wp.float64."""
-    vec3 = wp.types.vector(3, real)
+    vec3, _, vectors, states = array_types(real)
+    pairs: Any = wp.array(dtype=wp.vec2i)
     floor = wp.constant(real(MIN_LENGTH))
     one = wp.constant(real(1.0))
 
-    def spring_force(
-        # model
-        springs: wp.array(dtype=wp.vec2i),
-        parameters: wp.array(dtype=vec3),
-        # state
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        slot: int,
-        # out
-        force: wp.array(dtype=vec3),
-    ):
+    def spring_force(springs: pairs, parameters: vectors, x: states, v: states, slot: int, force: vectors):
         e = wp.tid()
         i = springs[e][0]
         j = springs[e][1]
@@ -87,18 +77,15 @@ def kernels(real: Any) -> tuple[Any, Any]:
         wp.atomic_sub(force, j, f)
 
     def spring_force_adjoint(
-        # model
-        springs: wp.array(dtype=wp.vec2i),
-        parameters: wp.array(dtype=vec3),
-        # state
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        springs: pairs,
+        parameters: vectors,
+        x: states,
+        v: states,
         slot: int,
-        adj_force: wp.array(dtype=vec3),
-        # out
-        adj_x: wp.array(dtype=vec3),
-        adj_v: wp.array(dtype=vec3),
-        adj_parameters: wp.array(dtype=vec3),
+        adj_force: vectors,
+        adj_x: vectors,
+        adj_v: vectors,
+        adj_parameters: vectors,
     ):
         e = wp.tid()
         i = springs[e][0]

@@ -13,7 +13,7 @@ import warp as wp
 
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import start_warp
-from neuspring.physics import collision, contact, ground, integrate, reference, springs
+from neuspring.physics import collision, contact, position, reference, springs, velocity
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.solver import FrameSolver
 from tests.support.scenes import packed, random_scene, scene, solver_for, tensors, with_values
@@ -118,7 +118,7 @@ def test_spring_adjoint_accumulates() -> None:
 def test_velocity_kernel() -> None:
     """v, force and the decay factor."""
     rng, dt, count = np.random.default_rng(2), 0.01, 5
-    terms, weight = integrate.kernels(wp.float64), rng.standard_normal((count, 3))
+    terms, weight = velocity.kernels(wp.float64), rng.standard_normal((count, 3))
     at = {"v": rng.standard_normal((count, 3)), "force": rng.standard_normal((count, 3)) * 50, "decay": np.array([0.93])}
 
     def after(values: Arrays) -> np.ndarray:
@@ -135,12 +135,18 @@ def test_velocity_kernel() -> None:
     assert_gradients(got, differences(lambda values: float((after(values) * weight).sum()), at), KERNEL)
 
 
-def test_advance_kernel() -> None:
-    """x' = x + dt v', v' unchanged."""
+def test_position_kernel_without_ground() -> None:
+    """x' = x + dt v', v' unchanged, also for nodes below z = 0."""
     rng, dt = np.random.default_rng(3), 0.01
-    wx, wv = rng.standard_normal((2, 4, 3))
-    adj_x, adj_v = vectors(wx), vectors(wv)
-    launch(integrate.kernels(wp.float64).advance_adjoint, 4, dt, adj_x, adj_v)
+    wx, wv, x, v = rng.standard_normal((4, 4, 3))
+    after_x, after_v, response = vectors(np.stack([x, x])), vectors(np.stack([v, v])), reals([0.5, 0.3])
+    forward, adjoint = position.kernels(wp.float64)
+    launch(forward, 4, dt, 0.0, response, vectors(v[None]), 0, 0, 1, after_x, after_v)
+    np.testing.assert_allclose(after_x.numpy()[1], x + dt * v)
+    np.testing.assert_array_equal(after_v.numpy()[1], v)
+    adj_x, adj_v, scalars = vectors(wx), vectors(wv), (reals(np.zeros(4)), reals(np.zeros(4)))
+    launch(adjoint, 4, dt, 0.0, response, vectors(x[None]), 0, vectors(v[None]), adj_x, adj_v, *scalars)
+    assert not any(scalar.numpy().any() for scalar in scalars)
     np.testing.assert_allclose(adj_x.numpy(), wx)
     np.testing.assert_allclose(adj_v.numpy(), wv + dt * wx)
 
@@ -161,7 +167,7 @@ GROUND_CASES = {
 def test_ground_kernel(case: str, up: float) -> None:
     """x, v, elasticity and friction, in contact and out, sliding and sticking."""
     position, speed, friction = GROUND_CASES[case]
-    rng, dt, (motion, adjoint) = np.random.default_rng(4), 0.01, ground.kernels(wp.float64)
+    rng, dt, (forward, adjoint) = np.random.default_rng(4), 0.01, position.kernels(wp.float64)
     flip = np.array([1.0, 1.0, up])
     weight_x, weight_v = rng.standard_normal((2, 1, 3))
     at = {"x": (np.array(position) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
@@ -169,7 +175,7 @@ def test_ground_kernel(case: str, up: float) -> None:
     def total(values: Arrays) -> float:
         x, v = vectors(np.stack([values["x"]] * 2)), vectors(np.zeros((2, 1, 3)))
         response = reals([values["e"], values["mu"]])
-        launch(motion, 1, dt, up, response, vectors(values["v"][None]), 0, 0, 1, x, v)
+        launch(forward, 1, dt, up, response, vectors(values["v"][None]), 0, 0, 1, x, v)
         return float((x.numpy()[1] * weight_x + v.numpy()[1] * weight_v).sum())
 
     adj_x, adj_v, adj_e, adj_mu = vectors(weight_x), vectors(weight_v), reals(0.0), reals(0.0)

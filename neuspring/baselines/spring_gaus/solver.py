@@ -11,9 +11,7 @@ import warp as wp
 
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.kernels import substep_kernels
-from neuspring.core.device import start_warp
-from neuspring.physics.autograd import Frame
-from neuspring.physics.buffers import Graphs
+from neuspring.core.device import load, start_warp
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class AnchorSolver:
         for name, size in scalars.items():
             for each in (name, f"adj_{name}"):
                 self._buffer(each, (size,), self._real)
-        self._graphs = Graphs(device)
+        self._graphs: dict[bool, Any] = {}
         self.frame_token = 0
 
     def _table(self, values: np.ndarray) -> Any:
@@ -93,14 +91,12 @@ class AnchorSolver:
         self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(x, v) [N, 3] one frame later, differentiable in x, v and parameters; controllers [C, 3] go from `begin` to `end`."""
-        result: tuple[torch.Tensor, torch.Tensor] = Frame.apply(self, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
+        result: tuple[torch.Tensor, torch.Tensor] = _Frame.apply(self, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
         return result
 
-    def run(
-        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """State after a frame; `packed` are the kernel's (stiffness, soft, scalars)."""
-        b = self._buffers
+    def forward(self, state: tuple[torch.Tensor, ...], packed: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        """State after a frame, from (begin, end, x, v) and the kernel's (stiffness, soft, scalars)."""
+        b, (begin, end, x, v) = self._buffers, state
         for name, value in zip(("stiffness", "soft", "scalars"), packed, strict=True):
             b[name].copy_(value)
         # Controllers after the last that holds an anchor do not matter.
@@ -122,13 +118,15 @@ class AnchorSolver:
         return b["adj_x"][0].clone(), b["adj_v"][0].clone(), *own
 
     def _launch(self, *, backward: bool) -> None:
-        kernel, steps = substep_kernels(self._real)[backward], range(self.substeps)
-
-        def record() -> None:
-            for substep in reversed(steps) if backward else steps:
-                wp.launch(kernel, self.count, self._arguments(substep, backward), device=self.device)
-
-        self._graphs.run("backward" if backward else "forward", [kernel], record)
+        if backward not in self._graphs:
+            kernel = load(substep_kernels(self._real)[backward], self.device)
+            with wp.ScopedCapture(device=self.device) as capture:
+                for substep in reversed(range(self.substeps)) if backward else range(self.substeps):
+                    wp.launch(kernel, self.count, self._arguments(substep, backward), device=self.device)
+            self._graphs[backward] = capture.graph
+        # Torch orders its own work on its current stream, so the graph must run there too.
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device != "cpu" else None
+        wp.capture_launch(self._graphs[backward], stream=stream)
 
     def _arguments(self, substep: int, backward: bool) -> list[Any]:
         w, real, physics = self._views, self._real, self.physics
@@ -147,3 +145,28 @@ class AnchorSolver:
             int(physics.ground),
         ]
         return forward + [w[f"adj_{name}"] for name in ("x", "v", "stiffness", "soft", "scalars") if backward]
+
+
+class _Frame(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        solver: AnchorSolver,
+        begin: torch.Tensor,
+        end: torch.Tensor,
+        x: torch.Tensor,
+        v: torch.Tensor,
+        *packed: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        result = solver.forward((begin, end, x, v), packed)
+        ctx.solver, ctx.token = solver, solver.frame_token
+        ctx.save_for_backward(begin, end, x, v, *packed)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+        solver: AnchorSolver = ctx.solver
+        if solver.frame_token != ctx.token:
+            begin, end, x, v, *packed = ctx.saved_tensors
+            solver.forward((begin, end, x, v), tuple(packed))
+        return (None, None, None, *solver.backward(adj_x, adj_v))

@@ -1,71 +1,50 @@
-"""Motion above a ground plane z = 0, and its adjoint.
+"""Motion, with or without a ground plane z = 0, and its adjoint.
 
-A node that would be below at the end of the substep and moves down is reflected at its time of impact toi = -z / v_z:
-x' = x + v toi + v' (dt - toi), with v' by the response of contact.py. Others move freely.
+x' = x + dt v (the paper's equation 4). With ground, a node that would be below at the end of the substep and moves down is
+reflected at its time of impact toi = -z / v_z: x' = x + v toi + v' (dt - toi), with v' by the response of contact.py.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from collections.abc import Mapping
 from typing import Any
 
-import torch
 import warp as wp
 
 from neuspring.physics import contact
-from neuspring.physics.buffers import Buffers
-
-
-def pack(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """The response (e, mu) [2] of the ground."""
-    return contact.pack(values["ground_elasticity"], values["ground_friction"])
+from neuspring.physics.buffers import Buffers, array_types
 
 
 def allocate(b: Buffers) -> None:
     """The response, and its adjoints per node."""
-    b.add_scalars(ground=2)
-    b.add_adjoints(adj_ground_e=(b.nodes,), adj_ground_mu=(b.nodes,))
+    b.add(ground=(2,), adj_ground_e=(b.nodes,), adj_ground_mu=(b.nodes,))
 
 
 def advance(b: Buffers, step: int) -> None:
-    """x' and v' with ground."""
-    sim = b.simulation
-    state = (b.moving, b.kept(step), b.slot(step), b.slot(step + 1))
-    b.launch(kernels(b.real)[0], b.nodes, sim.substep, sim.up_sign, b.ground, *state, b.x, b.v)
+    """x' and v'."""
+    state = (b.moving, b.inner_slot(step), b.slot(step), b.slot(step + 1))
+    b.launch(kernels(b.real)[0], b.nodes, b.simulation.substep, _up(b), b.ground, *state, b.x, b.v)
 
 
 def advance_adjoint(b: Buffers, step: int) -> None:
     """From dL/d(x', v') to dL/d(x, v, e, mu)."""
-    sim = b.simulation
-    adjoints = (b.adj_x, b.adj_v, b.adj_ground_e, b.adj_ground_mu)
-    b.launch(kernels(b.real)[1], b.nodes, sim.substep, sim.up_sign, b.ground, b.x, b.slot(step), b.moving, *adjoints)
+    state, adjoints = (b.x, b.slot(step), b.moving), (b.adj_x, b.adj_v, b.adj_ground_e, b.adj_ground_mu)
+    b.launch(kernels(b.real)[1], b.nodes, b.simulation.substep, _up(b), b.ground, *state, *adjoints)
 
 
-def gradient(b: Buffers) -> torch.Tensor:
-    """dL/d(e, mu) [2]."""
-    return torch.stack([b.tensors["adj_ground_e"].sum(), b.tensors["adj_ground_mu"].sum()])
+def _up(b: Buffers) -> float:
+    """The sign of up; 0, below which no node can be, without ground."""
+    return b.simulation.up_sign if b.simulation.ground else 0.0
 
 
 @functools.cache
 def kernels(real: Any) -> tuple[Any, Any]:
     """(motion, adjoint) kernels for the scalar type `real`, wp.float32 or wp.float64."""
-    vec3 = wp.types.vector(3, real)
+    vec3, numbers, vectors, states = array_types(real)
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
 
     def ground(
-        # model
-        dt: real,
-        up: real,
-        response: wp.array(dtype=real),
-        # state
-        moving: wp.array2d(dtype=vec3),
-        moving_slot: int,
-        slot: int,
-        target: int,
-        # out
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        dt: real, up: real, response: numbers, moving: states, moving_slot: int, slot: int, target: int, x: states, v: states
     ):
         i = wp.tid()
         p = x[slot, i]
@@ -83,19 +62,16 @@ def kernels(real: Any) -> tuple[Any, Any]:
             v[target, i] = w
 
     def ground_adjoint(
-        # model
         dt: real,
         up: real,
-        response: wp.array(dtype=real),
-        # state
-        x: wp.array2d(dtype=vec3),
+        response: numbers,
+        x: states,
         slot: int,
-        moving: wp.array2d(dtype=vec3),
-        # out
-        adj_x: wp.array(dtype=vec3),
-        adj_v: wp.array(dtype=vec3),
-        adj_e: wp.array(dtype=real),
-        adj_mu: wp.array(dtype=real),
+        moving: states,
+        adj_x: vectors,
+        adj_v: vectors,
+        adj_e: numbers,
+        adj_mu: numbers,
     ):
         i = wp.tid()
         p = x[slot, i]

@@ -1,7 +1,6 @@
-"""Controller motion, velocity update (force, gravity, drag) and free motion (the paper's equation 4), and their adjoints.
+"""Controller motion, and the velocity update by force, gravity and drag (the paper's equation 4) with its adjoint.
 
-v' = (v + dt (f + g)) delta,   delta = exp(-dt drag),   unit mass          (velocity)
-x' = x + dt v'                                                              (advance; ground.py has the version with ground)
+v' = (v + dt (f + g)) delta,   delta = exp(-dt drag),   unit mass. Positions follow in position.py.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from neuspring.physics.buffers import Buffers
+from neuspring.physics.buffers import Buffers, array_types
 
 
 class Kernels(NamedTuple):
@@ -21,8 +20,6 @@ class Kernels(NamedTuple):
     controllers: Any
     velocity: Any
     velocity_adjoint: Any
-    advance: Any
-    advance_adjoint: Any
 
 
 def pack(values: Mapping[str, torch.Tensor], substep: float) -> torch.Tensor:
@@ -32,8 +29,7 @@ def pack(values: Mapping[str, torch.Tensor], substep: float) -> torch.Tensor:
 
 def allocate(b: Buffers) -> None:
     """The drag's factor."""
-    b.add_scalars(decay=1)
-    b.add_adjoints(adj_decay=(b.nodes,))
+    b.add(decay=(1,), adj_decay=(b.nodes,))
 
 
 def move_controllers(b: Buffers, step: int) -> None:
@@ -49,25 +45,14 @@ def update_velocity(b: Buffers, step: int) -> None:
     sim = b.simulation
     gravity = b.vec3(0.0, 0.0, -sim.gravity * sim.up_sign)
     state = (b.v, b.slot(step), b.force)
-    b.launch(kernels(b.real).velocity, b.nodes, gravity, sim.substep, b.decay, *state, b.after, b.kept(step))
+    b.launch(kernels(b.real).velocity, b.nodes, gravity, sim.substep, b.decay, *state, b.after, b.inner_slot(step))
 
 
 def update_velocity_adjoint(b: Buffers, step: int) -> None:
     """From dL/dv' to dL/d(v, force, delta)."""
-    state = (b.after, b.kept(step), b.adj_after)
+    state = (b.after, b.inner_slot(step), b.adj_after)
     adjoints = (b.adj_v, b.adj_force, b.adj_decay)
     b.launch(kernels(b.real).velocity_adjoint, b.nodes, b.simulation.substep, b.decay, *state, *adjoints)
-
-
-def advance(b: Buffers, step: int) -> None:
-    """x' without ground."""
-    state = (b.moving, b.kept(step), b.slot(step), b.slot(step + 1))
-    b.launch(kernels(b.real).advance, b.nodes, b.simulation.substep, *state, b.x, b.v)
-
-
-def advance_adjoint(b: Buffers, step: int) -> None:
-    """dL/dv' += dt dL/dx'."""
-    b.launch(kernels(b.real).advance_adjoint, b.nodes, b.simulation.substep, b.adj_x, b.adj_v)
 
 
 def gradient(b: Buffers) -> torch.Tensor:
@@ -78,21 +63,19 @@ def gradient(b: Buffers) -> torch.Tensor:
 @functools.cache
 def kernels(real: Any) -> Kernels:
     """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
-    vec3 = wp.types.vector(3, real)
+    vec3, numbers, vectors, states = array_types(real)
     zero = wp.constant(real(0.0))
 
     def move_controllers(
-        # model
-        begin: wp.array(dtype=vec3),
-        end: wp.array(dtype=vec3),
+        begin: vectors,
+        end: vectors,
         fraction: real,
         inverse_time: real,
         nodes: int,
-        # out
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        x: states,
+        v: states,
         slot: int,
-        force: wp.array(dtype=vec3),
+        force: vectors,
     ):
         c = wp.tid()
         travel = end[c] - begin[c]
@@ -101,34 +84,21 @@ def kernels(real: Any) -> Kernels:
         force[nodes + c] = vec3(zero, zero, zero)
 
     def update_velocity(
-        # model
-        gravity: vec3,
-        dt: real,
-        decay: wp.array(dtype=real),
-        # state
-        v: wp.array2d(dtype=vec3),
-        slot: int,
-        force: wp.array(dtype=vec3),
-        # out
-        after: wp.array2d(dtype=vec3),
-        after_slot: int,
+        gravity: vec3, dt: real, decay: numbers, v: states, slot: int, force: vectors, after: states, after_slot: int
     ):
         i = wp.tid()
         after[after_slot, i] = (v[slot, i] + (force[i] + gravity) * dt) * decay[0]
         force[i] = vec3(zero, zero, zero)
 
     def update_velocity_adjoint(
-        # model
         dt: real,
-        decay: wp.array(dtype=real),
-        # state
-        after: wp.array2d(dtype=vec3),
+        decay: numbers,
+        after: states,
         slot: int,
-        adj_after: wp.array(dtype=vec3),
-        # out
-        adj_v: wp.array(dtype=vec3),
-        adj_force: wp.array(dtype=vec3),
-        adj_decay: wp.array(dtype=real),
+        adj_after: vectors,
+        adj_v: vectors,
+        adj_force: vectors,
+        adj_decay: numbers,
     ):
         i = wp.tid()
         h = adj_after[i]
@@ -137,28 +107,5 @@ def kernels(real: Any) -> Kernels:
         adj_v[i] = h
         adj_force[i] = h * dt
 
-    def advance(
-        # model
-        dt: real,
-        # state
-        moving: wp.array2d(dtype=vec3),
-        moving_slot: int,
-        slot: int,
-        target: int,
-        # out
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-    ):
-        i = wp.tid()
-        w = moving[moving_slot, i]
-        x[target, i] = x[slot, i] + w * dt
-        v[target, i] = w
-
-    def advance_adjoint(dt: real, adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3)):
-        i = wp.tid()
-        adj_v[i] = adj_v[i] + adj_x[i] * dt
-
     unique = wp.kernel(module="unique", enable_backward=False)
-    return Kernels(
-        unique(move_controllers), unique(update_velocity), unique(update_velocity_adjoint), unique(advance), unique(advance_adjoint)
-    )
+    return Kernels(unique(move_controllers), unique(update_velocity), unique(update_velocity_adjoint))
