@@ -33,8 +33,8 @@ def allocate(b: Buffers) -> None:
 def find_candidates(b: Buffers) -> None:
     """List the partners of every node at the start of the frame, in node order.
 
-    All pairs are looked at: once per frame this costs less than building a hash grid up to about 300 nodes, and 8 % of a frame of
-    667 substeps at 2,000 nodes, on one CPU core.
+    All pairs are looked at. A hash grid is slower for a few hundred nodes, and saves 7 % of a frame of 667 substeps at 2,000 nodes
+    (one CPU thread, see the README).
     """
     model = (b.nodes, b.distance, b.simulation.collision_capacity)
     b.launch(kernels(b.real).candidates, b.nodes, *model, b.x, b.partners, b.count, b.overflow)

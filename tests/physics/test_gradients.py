@@ -166,11 +166,11 @@ GROUND_CASES = {
 @pytest.mark.parametrize("case", GROUND_CASES)
 def test_ground_kernel(case: str, up: float) -> None:
     """x, v, elasticity and friction, in contact and out, sliding and sticking."""
-    position, speed, friction = GROUND_CASES[case]
+    place, speed, friction = GROUND_CASES[case]
     rng, dt, (forward, adjoint) = np.random.default_rng(4), 0.01, position.kernels(wp.float64)
     flip = np.array([1.0, 1.0, up])
     weight_x, weight_v = rng.standard_normal((2, 1, 3))
-    at = {"x": (np.array(position) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
+    at = {"x": (np.array(place) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
 
     def total(values: Arrays) -> float:
         x, v = vectors(np.stack([values["x"]] * 2)), vectors(np.zeros((2, 1, 3)))
