@@ -62,6 +62,14 @@ def pack(*, substep: float, **values: torch.Tensor) -> Parameters:
     )
 
 
+def solver_for(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True) -> FrameSolver:
+    """A solver of a twin, with its parameters set."""
+    t, options = twin.topology, {"device": device, "dtype": dtype, "differentiable": differentiable}
+    solver = FrameSolver(t.springs, len(t.nodes), len(t.controllers), twin.simulation, **options)  # type: ignore[arg-type]
+    solver.set_parameters(pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep))
+    return solver
+
+
 def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
     """A twin's physical parameters as tensors, with the keyword names of `pack`."""
     values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)} | {"rest_lengths": twin.topology.rest_lengths}

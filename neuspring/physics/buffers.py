@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import warp as wp
@@ -12,20 +12,10 @@ from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load, start_warp
 
 
-class ArrayTypes(NamedTuple):
-    """Types of kernel arguments for one scalar type."""
-
-    vec3: Any
-    numbers: Any
-    vectors: Any
-    states: Any
-    """[slots, points] of vectors."""
-
-
-def array_types(real: Any) -> ArrayTypes:
-    """Argument types for the scalar type `real`, wp.float32 or wp.float64."""
+def array_types(real: Any) -> tuple[Any, Any, Any, Any]:
+    """Types of kernel arguments for a scalar type: a 3-vector; arrays of numbers, of vectors, of vectors [slots, points]."""
     vec3 = wp.types.vector(3, real)
-    return ArrayTypes(vec3, wp.array(dtype=real), wp.array(dtype=vec3), wp.array2d(dtype=vec3))
+    return vec3, wp.array(dtype=real), wp.array(dtype=vec3), wp.array2d(dtype=vec3)
 
 
 class Buffers:

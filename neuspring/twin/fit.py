@@ -28,7 +28,7 @@ from neuspring.core.checkpoint import Checkpoint
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
-from neuspring.physics.autograd import simulate_frame
+from neuspring.physics.autograd import simulate_frame, solver_for
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
@@ -155,11 +155,9 @@ class TwinFit:
         return self.horizon >= self.head_end - 1
 
     def solver(self) -> FrameSolver:
-        """The solver for the present number of substeps."""
+        """The solver for the current number of substeps."""
         if self._solver is None:
-            topology = self.twin.topology
-            counts = (len(topology.nodes), len(topology.controllers))
-            self._solver = FrameSolver(topology.springs, *counts, self.twin.simulation, device=self.problem.device)
+            self._solver = solver_for(self.twin, self.problem.device)
         return self._solver
 
     @property

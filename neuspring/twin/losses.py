@@ -35,12 +35,12 @@ def chamfer(
 
     `count` replaces the number of visible points as divisor (released quirk 4).
     """
-    seen = target[visible]
-    if len(seen) == 0:
+    points = target[visible]
+    if len(points) == 0:
         return nodes.sum() * 0.0
     with torch.no_grad():
-        index = nearest(seen, nodes[:surface])
-    return (nodes[index] - seen).square().sum() / (len(seen) if count is None else max(count, 1))
+        index = nearest(points, nodes[:surface])
+    return (nodes[index] - points).square().sum() / (len(points) if count is None else max(count, 1))
 
 
 def track(nodes: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, count: int | None = None) -> torch.Tensor:

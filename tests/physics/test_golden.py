@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neuspring.physics import reference, stability
-from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
+from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.losses import acceleration
@@ -54,25 +54,14 @@ class Frame(NamedTuple):
 
 
 @cache
-def solver_for(name: str, device: str, dtype: torch.dtype, differentiable: bool) -> FrameSolver:
-    topology = clip(name).twin.topology
-    solver = FrameSolver(
-        topology.springs,
-        len(topology.nodes),
-        len(topology.controllers),
-        clip(name).twin.simulation,
-        device=device,
-        dtype=dtype,
-        differentiable=differentiable,
-    )
-    solver.set_parameters(pack(**twin_tensors(clip(name).twin, device, dtype), substep=clip(name).twin.simulation.substep))
-    return solver
+def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool) -> FrameSolver:
+    return solver_for(clip(name).twin, device, dtype, differentiable=differentiable)
 
 
 @cache
 def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, restart: bool) -> tuple[np.ndarray, np.ndarray]:
     """States x, v [F, N, 3] at frame ends; `restart` starts every frame from the record."""
-    c, solver = clip(name), solver_for(name, device, dtype, differentiable)
+    c, solver = clip(name), solver_of(name, device, dtype, differentiable)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -88,7 +77,7 @@ def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, re
 @cache
 def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool) -> list[Frame]:
     """Every frame as in the released first-order stage: state detached between frames, gradient of the frame's loss."""
-    c, solver, frames = clip(name), solver_for(name, device, dtype, True), []
+    c, solver, frames = clip(name), solver_of(name, device, dtype, True), []
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
