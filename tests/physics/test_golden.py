@@ -139,8 +139,8 @@ def test_cloth_follows_the_record_frame_by_frame(dtype: torch.dtype, device: str
 @pytest.mark.parametrize("name", NAMES)
 def test_forward_only_equals_differentiable(name: str, device: str) -> None:
     """Two substep slots or all of them: the same numbers, bit for bit (on CUDA up to the order of atomic sums)."""
-    kept, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
-    for a, b in zip(kept, free, strict=True):
+    differentiable, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
+    for a, b in zip(differentiable, free, strict=True):
         if device == "cpu":
             np.testing.assert_array_equal(a, b)
         elif name in DRAWN:
@@ -160,8 +160,8 @@ def test_losses_and_gradients_of_the_quiet_cloth_frame(device: str) -> None:
     check_frames(clip(name), optimised_frames(name, device, torch.float32, True), range(QUIET_FRAME, QUIET_FRAME + 1))
 
 
-def check_frames(c: Clip, frames: list[Frame], chosen: range) -> None:
-    for k in chosen:
+def check_frames(c: Clip, frames: list[Frame], numbers: range) -> None:
+    for k in numbers:
         got, losses, gradient, collide = frames[k - 1], c.losses[k - 1], c.grad_log_stiffness[k - 1], c.grad_collide[k - 1]
         np.testing.assert_allclose(got.losses, losses, rtol=FRAME_LOSS, err_msg=f"losses of frame {k}")
         assert cosine(got.grad_log_stiffness, gradient) > COSINE, k

@@ -57,9 +57,9 @@ def test_the_future_is_not_read():
     visible[end:] ^= True
     valid[end - 1 :] ^= True
     blind = replace(seen, object_points=points, object_visibility=visible, object_motion_valid=valid, tracks=seen.tracks + 1.0)
-    found, facts = carry_over(trajectory, twin, blind, velocity)
+    result, facts = carry_over(trajectory, twin, blind, velocity)
     expected, expected_facts = carry_over(trajectory, twin, seen, velocity)
-    np.testing.assert_array_equal(found.positions, expected.positions)
+    np.testing.assert_array_equal(result.positions, expected.positions)
     assert facts == expected_facts
 
 
@@ -79,10 +79,10 @@ def test_hidden_points_do_not_speak():
     visible[last, ::2] = False
     lost = points.copy()
     lost[last, ::2] += 1.0
-    found = [
+    results = [
         carry_over(trajectory, twin, replace(seen, object_visibility=visible, object_points=p), velocity)[0] for p in (points, lost)
     ]
-    np.testing.assert_array_equal(found[0].positions, found[1].positions)
+    np.testing.assert_array_equal(results[0].positions, results[1].positions)
 
 
 def test_a_continuation_that_diverges_is_not_used(monkeypatch):

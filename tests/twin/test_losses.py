@@ -91,7 +91,7 @@ def test_ties_go_to_the_lowest_index() -> None:
     assert losses.nearest(torch.zeros(1, 3), nodes.flip(0)).tolist() == [0]
 
 
-def test_the_track_loss_is_linear_beyond_one_metre() -> None:
+def test_the_track_loss_is_linear_beyond_one_meter() -> None:
     nodes = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True)
     value = losses.track(nodes, torch.zeros(1, 3), torch.tensor([True]))
     assert value.item() == pytest.approx((0.5**2 / 2 + 1.5) / 3)
