@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -143,3 +144,15 @@ def test_weights() -> None:
     weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))
     near, moved = plain.terms(1, nodes).values()
     assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())
+
+
+def test_every_term_has_a_weight_of_its_name() -> None:
+    """A weight of 0 removes its term alone."""
+    rng = np.random.default_rng(0)
+    points = torch.tensor(rng.random((3, 5, 3)), dtype=torch.float32)
+    nodes, seen = torch.tensor(rng.random((6, 3)), dtype=torch.float32), torch.ones(3, 5, dtype=torch.bool)
+    full = FrameLoss(points, seen, seen, 6, Losses()).terms(1, nodes)
+    assert set(full) == {"chamfer", "track"}
+    for name in full:
+        terms = FrameLoss(points, seen, seen, 6, replace(Losses(), **{name: 0.0})).terms(1, nodes)
+        assert {other: float(value) for other, value in terms.items()} == {o: float(v) * (o != name) for o, v in full.items()}
