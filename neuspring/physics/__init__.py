@@ -1,5 +1,9 @@
-"""Spring-mass simulation: one term = one kernel, its adjoint and its launcher, in Warp; the float64 reference in NumPy.
+"""The spring-mass simulator in Warp, its adjoint, and its float64 specification in NumPy.
 
-Order of operations in a substep (that of the released PhysTwin code): spring and dashpot forces, gravity and drag on the velocity,
-self-collision impulses, ground contact and position update (symplectic Euler).
+springs, velocity, collision, position: one term each, a file with its kernels, their adjoints and their launchers; contact: the
+response that collision and position share. solver: the frame, which launches the terms in order. autograd: a frame as a
+differentiable function of torch tensors. buffers: arrays and captured graphs. reference: the specification. stability: whether the
+substep is small enough. Kernels take their arguments as model, state, out.
+
+For others: solver.FrameSolver and Parameters; autograd.simulate_frame, pack and twin_tensors; reference; stability.
 """

@@ -7,83 +7,70 @@ buffers is simulated again from its start before its backward pass.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import torch
 
-from neuspring.core.artifacts import SCALARS, Twin
+from neuspring.core.artifacts import Twin
+from neuspring.physics import contact, springs, velocity
 from neuspring.physics.solver import FrameSolver, Parameters
 
-ELASTICITY_RANGE = (0.0, 1.0)
-FRICTION_RANGE = (0.0, 2.0)
 
+class Frame(torch.autograd.Function):
+    """A frame of any solver that has the three members used here.
 
-class _Frame(torch.autograd.Function):
+    `run(begin, end, x, v, *packed)` simulates a frame and returns (x, v). `backward(adj_x, adj_v)` returns the adjoints of
+    (x, v, *packed) in the last frame. `frame_token` counts the frames.
+    """
+
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        solver: FrameSolver,
-        begin: torch.Tensor,
-        end: torch.Tensor,
-        x: torch.Tensor,
-        v: torch.Tensor,
-        *packed: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        solver.set_parameters(Parameters(*packed))
-        result = solver.forward(x, v, begin, end)
+    def forward(ctx: Any, solver: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+        """(x, v) after the frame, from (begin, end, x, v, *packed)."""
+        state: tuple[torch.Tensor, torch.Tensor] = solver.run(*inputs)
         ctx.solver, ctx.token = solver, solver.frame_token
-        ctx.save_for_backward(begin, end, x, v, *packed)
-        return result
+        ctx.save_for_backward(*inputs)
+        return state
 
     @staticmethod
     def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
-        solver: FrameSolver = ctx.solver
-        if solver.frame_token != ctx.token:
-            begin, end, x, v, *packed = ctx.saved_tensors
-            solver.set_parameters(Parameters(*packed))
-            solver.forward(x, v, begin, end)
-        return (None, None, None, *solver.backward(adj_x, adj_v), None)
+        """Adjoints of the inputs; none of the controllers' path."""
+        if ctx.solver.frame_token != ctx.token:
+            ctx.solver.run(*ctx.saved_tensors)
+        return (None, None, None, *ctx.solver.backward(adj_x, adj_v))
 
 
 def simulate_frame(
     solver: FrameSolver, parameters: Parameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`."""
-    result: tuple[torch.Tensor, torch.Tensor] = _Frame.apply(solver, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
-    return result
+    state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, begin, end, x, v, *parameters)  # type: ignore[no-untyped-call]
+    return state
 
 
-def pack(
-    *,
-    stiffness: torch.Tensor,
-    rest_lengths: torch.Tensor,
-    dashpot: torch.Tensor,
-    drag: torch.Tensor,
-    ground_elasticity: torch.Tensor,
-    ground_friction: torch.Tensor,
-    contact_elasticity: torch.Tensor,
-    contact_friction: torch.Tensor,
-    contact_distance: torch.Tensor,
-    substep: float,
-) -> Parameters:
-    """Pack physical parameters, differentiably. stiffness, rest_lengths, dashpot are [S]; the rest are scalars.
+def pack(*, substep: float, **values: torch.Tensor) -> Parameters:
+    """Pack physical parameters, differentiably, for a substep in s.
 
-    Elasticities and frictions are clamped to [0, 1] and [0, 2] on use, as in the released simulator.
+    `values` are the fields of `Material` and rest_lengths [S], m; dashpot may be one number for all springs.
     """
     return Parameters(
-        springs=torch.stack([stiffness, 1.0 / rest_lengths, dashpot.expand_as(stiffness)], dim=1),
-        decay=torch.exp(-substep * drag).reshape(1),
-        ground=torch.stack([ground_elasticity.clamp(*ELASTICITY_RANGE), ground_friction.clamp(*FRICTION_RANGE)]),
-        contact=torch.stack([contact_elasticity.clamp(*ELASTICITY_RANGE), contact_friction.clamp(*FRICTION_RANGE)]),
-        distance=contact_distance.reshape(1),
+        springs=springs.pack(values),
+        decay=velocity.pack(values, substep),
+        ground=contact.pack(values, "ground"),
+        contact=contact.pack(values, "contact"),
+        distance=values["contact_distance"].reshape(1),
     )
+
+
+def solver_for(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True) -> FrameSolver:
+    """A solver of a twin, with its parameters set."""
+    t, options = twin.topology, {"device": device, "dtype": dtype, "differentiable": differentiable}
+    solver = FrameSolver(t.springs, len(t.nodes), len(t.controllers), twin.simulation, **options)  # type: ignore[arg-type]
+    solver.set_parameters(pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep))
+    return solver
 
 
 def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
     """A twin's physical parameters as tensors, with the keyword names of `pack`."""
-    as_tensor = {"dtype": dtype, "device": device}
-    values = {name: torch.tensor(getattr(twin.material, name), **as_tensor) for name in SCALARS}  # type: ignore[arg-type]
-    values["stiffness"] = torch.tensor(twin.material.stiffness, **as_tensor)  # type: ignore[arg-type]
-    values["dashpot"] = torch.tensor(twin.material.dashpot, **as_tensor)  # type: ignore[arg-type]
-    values["rest_lengths"] = torch.tensor(twin.topology.rest_lengths, **as_tensor)  # type: ignore[arg-type]
-    return values
+    values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)} | {"rest_lengths": twin.topology.rest_lengths}
+    return {name: torch.tensor(value, dtype=dtype, device=device) for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""Spring and dashpot forces, and their adjoint.
+"""Spring and dashpot forces (the paper's equations 2 and 3), and their adjoint.
 
 With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing speed w = (v_j - v_i) . d, spring e = (i, j) adds
 
@@ -10,29 +10,60 @@ accumulates (dL/dY, (1/Y) dL/d(1/l0), dL/dgamma) the same way.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+import torch
 import warp as wp
+
+from neuspring.physics.buffers import Buffers, array_types
 
 MIN_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
 
 
+def pack(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Parameters [S, 3] of springs."""
+    stiffness = values["stiffness"]
+    return torch.stack([stiffness, 1.0 / values["rest_lengths"], values["dashpot"].expand_as(stiffness)], dim=1)
+
+
+def allocate(b: Buffers, pairs: np.ndarray) -> None:
+    """Springs between `pairs` [S, 2] of points; i >= N means controller i - N."""
+    b.views["pairs"] = wp.array(np.ascontiguousarray(pairs, np.int32), dtype=wp.vec2i, device=b.device)
+    b.add(springs=(len(pairs), 3), adj_springs=(len(pairs), 3))
+
+
+def add_forces(b: Buffers, step: int) -> None:
+    """Add every spring's force to its two ends."""
+    force, _ = kernels(b.real)
+    b.launch(force, len(b.pairs), b.pairs, b.springs, b.x, b.v, b.slot(step), b.force)
+
+
+def add_forces_adjoint(b: Buffers, step: int) -> None:
+    """From dL/d(force) to dL/d(x, v, parameters)."""
+    _, adjoint = kernels(b.real)
+    state = (b.x, b.v, b.slot(step), b.adj_force)
+    b.launch(adjoint, len(b.pairs), b.pairs, b.springs, *state, b.adj_x, b.adj_v, b.adj_springs)
+
+
+def gradient(b: Buffers) -> torch.Tensor:
+    """dL/d(packed parameters) [S, 3]."""
+    result = b.tensors["adj_springs"].clone()
+    result[:, 1] *= b.tensors["springs"][:, 0]
+    return result
+
+
 @functools.cache
 def kernels(real: Any) -> tuple[Any, Any]:
     """(force, adjoint) kernels for the scalar type `real`, wp.float32 or wp.float64."""
-    vec3 = wp.types.vector(3, real)
+    vec3, _, vectors, states = array_types(real)
+    pairs: Any = wp.array(dtype=wp.vec2i)
     floor = wp.constant(real(MIN_LENGTH))
     one = wp.constant(real(1.0))
 
-    def spring_force(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        slot: int,
-        springs: wp.array(dtype=wp.vec2i),
-        parameters: wp.array(dtype=vec3),
-        force: wp.array(dtype=vec3),
-    ):
+    def spring_force(springs: pairs, parameters: vectors, x: states, v: states, slot: int, force: vectors):
         e = wp.tid()
         i = springs[e][0]
         j = springs[e][1]
@@ -46,15 +77,15 @@ def kernels(real: Any) -> tuple[Any, Any]:
         wp.atomic_sub(force, j, f)
 
     def spring_force_adjoint(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
+        springs: pairs,
+        parameters: vectors,
+        x: states,
+        v: states,
         slot: int,
-        springs: wp.array(dtype=wp.vec2i),
-        parameters: wp.array(dtype=vec3),
-        adj_force: wp.array(dtype=vec3),
-        adj_x: wp.array(dtype=vec3),
-        adj_v: wp.array(dtype=vec3),
-        adj_parameters: wp.array(dtype=vec3),
+        adj_force: vectors,
+        adj_x: vectors,
+        adj_v: vectors,
+        adj_parameters: vectors,
     ):
         e = wp.tid()
         i = springs[e][0]

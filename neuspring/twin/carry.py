@@ -1,9 +1,9 @@
-"""Carry what was observed at the end of the training frames into the prediction, where training frames say that it helps.
+"""Correct the state at the end of the training frames by what was observed there, if that helps on training frames.
 
-At the last training frame s the tracked points are known, so the state of the rollout is corrected there and the simulation
-goes on from it: x(s) + R and v(s) + R', where R is the residual observed - predicted of the tracked points and R' that of their
-velocities, (3 x(s) - 4 x(s-1) + x(s-2)) / (2 dt), both spread over all nodes; controllers are where they should be. Whether to
-do so is decided on training frames alone: earlier frames take the role of s, later training frames that of the future.
+The tracked points are observed at the last training frame s. The state is corrected there, to x(s) + R and v(s) + R', and the
+simulation goes on from it. R is the residual (observed - predicted) of the tracked points, R' that of their velocities, (3 x(s) -
+4 x(s-1) + x(s-2)) / (2 dt); both are spread over all nodes, with no residual at the controllers. Training frames alone decide
+whether to do so: earlier frames take the role of s, later training frames that of the future.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.physics.autograd import solver_for
 from neuspring.twin.motion import recent_velocity, spread
-from neuspring.twin.rollout import Diverged, frames, solver_for
+from neuspring.twin.rollout import Diverged, frames
 
 ORIGINS = 12
 """Training frames that take the role of the last one."""
 LEAST_GAIN = 0.02
-"""The guard: nothing is carried unless it lowers the error of training frames by this fraction."""
+"""The state is corrected only if that lowers the error of training frames by this fraction."""
 
 State = tuple[np.ndarray, np.ndarray]
 """Positions, m, and velocities, m/s, of all nodes, [N, 3] each."""
@@ -29,10 +30,10 @@ State = tuple[np.ndarray, np.ndarray]
 def carry_over(
     trajectory: Trajectory, twin: Twin, observations: Observations, velocity: np.ndarray, device: str = "cpu"
 ) -> tuple[Trajectory, dict[str, float]]:
-    """The corrected trajectory of a twin, and facts: `gain` on training frames, and `carried` (0 or 1).
+    """The corrected trajectory of a twin, the `gain` on training frames, and `carried`: 1 if it was corrected, else 0.
 
-    `trajectory` is the twin's rollout from `velocity` [N, 3], m/s. Its frames before the split stay as they are. One that
-    diverged, or that would diverge from the corrected state, is returned unchanged.
+    `trajectory` is the twin's rollout from `velocity` [N, 3], m/s. Frames before the split stay as they are. A trajectory that
+    diverged, or would diverge from the corrected state, is returned unchanged.
     """
     scenario = observations.scenario
     last = scenario.train_end - 1
@@ -53,7 +54,7 @@ class _Continuation:
 
     def __init__(self, twin: Twin, observations: Observations, device: str) -> None:
         self.twin, self.observations, self.device = twin, observations, device
-        self._solver = solver_for(twin, device)
+        self._solver = solver_for(twin, device, differentiable=False)
         self._hands = torch.tensor(observations.controller_points, device=device)
         nodes, points = len(observations.nodes), observations.object_points.shape[1]
         self._nodes, self._points = observations.canonical[:nodes], observations.canonical[:points]
@@ -67,12 +68,13 @@ class _Continuation:
 
     def corrected(self, frame: int, state: State, stop: int) -> np.ndarray | None:
         """Positions [stop - frame - 1, N, 3], m, of the frames after `frame`, from its corrected state. None: it diverged."""
-        seen = self.observations
+        observations = self.observations
         x, v = (values.astype(np.float64) for values in state)
         points = len(self._points)
-        shown = np.where(seen.object_visibility[frame][:, None], seen.object_points[frame].astype(np.float64), np.nan)
-        x += self._spread(shown - x[:points])
-        v += self._spread(recent_velocity(seen, frame) - v[:points])
+        visible = observations.object_visibility[frame][:, None]
+        targets = np.where(visible, observations.object_points[frame].astype(np.float64), np.nan)
+        x += self._spread(targets - x[:points])
+        v += self._spread(recent_velocity(observations, frame) - v[:points])
         try:
             later = frames(self.twin, self._solver, self._hands[frame:stop], v, positions=x)
             return np.array([x.cpu().numpy() for _, x, _ in later]).reshape(-1, *x.shape)
@@ -81,15 +83,15 @@ class _Continuation:
 
     def _spread(self, residual: np.ndarray) -> np.ndarray:
         """Residuals of tracked points [No, 3], NaN where unknown, on all nodes [N, 3]; none at the controllers."""
-        known = ~np.isnan(residual).any(axis=1)
-        if not known.any():
+        finite = ~np.isnan(residual).any(axis=1)
+        if not finite.any():
             return np.zeros((len(self._nodes), 3))
-        anchors = np.concatenate([self._points[known], self._controllers])
-        return spread(anchors, np.concatenate([residual[known], np.zeros((len(self._controllers), 3))]), self._nodes)
+        anchors = np.concatenate([self._points[finite], self._controllers])
+        return spread(anchors, np.concatenate([residual[finite], np.zeros((len(self._controllers), 3))]), self._nodes)
 
 
 def training_gain(run: _Continuation, states: list[State], future: int) -> float:
-    """By which fraction corrections lower the mean error of training frames; 0 where there are too few to say.
+    """The fraction by which corrections lower the mean error of training frames; 0 where there are too few frames.
 
     Origins lie in the second half of the training frames; from each, up to `future` later training frames count. A
     continuation that diverges counts as twice the error: -1.
@@ -104,16 +106,16 @@ def training_gain(run: _Continuation, states: list[State], future: int) -> float
             return -1.0
         without.append(_error(np.array([x for x, _ in states[origin + 1 : stop]]), run.observations, origin + 1))
         corrected.append(_error(positions, run.observations, origin + 1))
-    known = ~np.isnan(without)
-    if not known.any():
+    finite = ~np.isnan(without)
+    if not finite.any():
         return 0.0
-    return float(1 - np.mean(np.array(corrected)[known]) / max(float(np.mean(np.array(without)[known])), 1e-12))
+    return float(1 - np.mean(np.array(corrected)[finite]) / max(float(np.mean(np.array(without)[finite])), 1e-12))
 
 
 def _error(positions: np.ndarray, observations: Observations, first: int) -> float:
-    """Mean distance, m, of tracked points [F, N, 3] from what was seen in the frames from `first` on; NaN: nothing was."""
-    seen = observations.object_points[first : first + len(positions)]
+    """Mean distance, m, of nodes [F, N, 3] from the visible points in the frames from `first` on; NaN if there are none."""
+    targets = observations.object_points[first : first + len(positions)]
     visible = observations.object_visibility[first : first + len(positions)]
     if not visible.any():
         return float("nan")
-    return float(np.linalg.norm(positions[:, : seen.shape[1]] - seen, axis=2)[visible].mean())
+    return float(np.linalg.norm(positions[:, : targets.shape[1]] - targets, axis=2)[visible].mean())

@@ -2,8 +2,7 @@
 
 S(e) = S0 + F(x_mid(e)), x_mid = (x_i + x_j) / 2. F reads three N x N planes of C channels (xy, yz, xz) spanning the bounding
 cube of all midpoints, bilinearly, sums the three features, and passes them through a Fourier feature transform and an MLP of
-three layers. The last layer starts at zero, so F = 0 at the start. This module returns F; what it is added to, and on which
-scale, is the business of `parameters`.
+three layers. The last layer starts at zero, so F = 0 at the start. `parameters` says what F is added to, and on which scale.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def midpoints(canonical: np.ndarray, springs: np.ndarray) -> np.ndarray:
 
 
 def in_cube(points: np.ndarray) -> np.ndarray:
-    """Points [S, 3] mapped to [-1, 1]^3 by their bounding cube: same centre, the longest side of the bounding box."""
+    """Points [S, 3] mapped to [-1, 1]^3 by their bounding cube: same center, the longest side of the bounding box."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = max(float((high - low).max()) / 2, 1e-12)
     mapped: np.ndarray = (points - (low + high) / 2) / half
@@ -60,7 +59,7 @@ class TriPlane(nn.Module):
 
     indices: torch.Tensor
     weights: torch.Tensor
-    neighbours: torch.Tensor
+    neighbors: torch.Tensor
 
     def __init__(self, points: np.ndarray, resolution: int, channels: int, scale: float, generator: torch.Generator) -> None:
         """`points` [S, 3] in [-1, 1]^3; texels start as N(0, scale^2), drawn for the full planes."""
@@ -71,22 +70,22 @@ class TriPlane(nn.Module):
         self.texels = nn.Parameter(full[torch.from_numpy(active)])
         self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
         self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
-        self.register_buffer("neighbours", torch.from_numpy(_neighbours(active, resolution)), persistent=False)
+        self.register_buffer("neighbors", torch.from_numpy(_neighbors(active, resolution)), persistent=False)
 
     def forward(self) -> torch.Tensor:
         """Summed features [S, C]."""
         return embedding_bag(self.indices, self.texels, per_sample_weights=self.weights, mode="sum")
 
     def roughness(self) -> torch.Tensor:
-        """Mean squared difference of neighbouring texels in use; every point uses 2 x 2 of each plane."""
-        first, second = self.neighbours.unbind(dim=1)
+        """Mean squared difference of neighboring texels in use; every point uses 2 x 2 of each plane."""
+        first, second = self.neighbors.unbind(dim=1)
         return (self.texels[first] - self.texels[second]).square().mean()
 
 
 def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels (numbered plane N^2 + row N + column) and bilinear weights [S, 12] of points [S, 3] in [-1, 1]^3.
 
-    Texel centres lie on a regular grid whose outermost ones are the cube's sides. The column follows a plane's first axis.
+    Texel centers lie on a regular grid whose outermost ones are the cube's sides. The column follows a plane's first axis.
     """
     grid = (np.clip(points, -1, 1) + 1) / 2 * (resolution - 1)
     low = np.minimum(np.floor(grid).astype(np.int64), resolution - 2)
@@ -101,17 +100,15 @@ def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarra
     return np.stack(cells, axis=1), np.stack(weights, axis=1)
 
 
-def _neighbours(active: np.ndarray, resolution: int) -> np.ndarray:
+def _neighbors(active: np.ndarray, resolution: int) -> np.ndarray:
     """Pairs [P, 2] of positions in the sorted `active` whose texels adjoin in the same plane."""
+    right, up = active % resolution < resolution - 1, active % resolution**2 < resolution**2 - resolution
     pairs = []
-    for step, inside in (
-        (1, active % resolution < resolution - 1),
-        (resolution, active % resolution**2 < resolution**2 - resolution),
-    ):
-        wanted = active + step
-        place = np.minimum(np.searchsorted(active, wanted), len(active) - 1)
-        found = inside & (active[place] == wanted)
-        pairs.append(np.stack([np.flatnonzero(found), place[found]], axis=1))
+    for step, inside in ((1, right), (resolution, up)):
+        neighbor = active + step
+        place = np.minimum(np.searchsorted(active, neighbor), len(active) - 1)
+        both = inside & (active[place] == neighbor)
+        pairs.append(np.stack([np.flatnonzero(both), place[both]], axis=1))
     return np.concatenate(pairs)
 
 
@@ -172,5 +169,5 @@ class SpringField(nn.Module):
         return result
 
     def roughness(self) -> torch.Tensor:
-        """Mean squared difference of neighbouring texels; 0 without planes."""
+        """Mean squared difference of neighboring texels; 0 without planes."""
         return self.planes.roughness() if self.planes is not None else self.coordinates.sum() * 0.0

@@ -27,7 +27,7 @@ from neuspring.core.checkpoint import Checkpoint
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
-from neuspring.physics.autograd import simulate_frame
+from neuspring.physics.autograd import simulate_frame, solver_for
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
@@ -106,6 +106,11 @@ ARRAYS = ("values", "moments", "best_values")
 """The fields of a state that hold arrays."""
 
 
+def tail_start(train_end: int, tail_fraction: float) -> int:
+    """The first held-back frame of `train_end` training frames: at least one frame is trained on, and one selects the epoch."""
+    return train_end - min(max(round(tail_fraction * (train_end - 1)), 1), train_end - 2)
+
+
 class TwinFit:
     """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
 
@@ -118,11 +123,9 @@ class TwinFit:
         )
         end = observations.scenario.train_end
         self.hands = torch.tensor(observations.controller_points[:end], device=problem.device)
-        held_back = round(settings.tail_fraction * (end - 1)) if settings.selection == "tail" else 0
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
-        # At least one frame to train on and one to select by.
-        self.head_end = end - min(max(held_back, int(settings.selection == "tail")), end - 2)
+        self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.head_end - 1
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
@@ -140,11 +143,9 @@ class TwinFit:
         return self.horizon >= self.head_end - 1
 
     def solver(self) -> FrameSolver:
-        """The solver for the present number of substeps."""
+        """The solver for the current number of substeps."""
         if self._solver is None:
-            topology = self.twin.topology
-            counts = (len(topology.nodes), len(topology.controllers))
-            self._solver = FrameSolver(topology.springs, *counts, self.twin.simulation, device=self.problem.device)
+            self._solver = solver_for(self.twin, self.problem.device)
         return self._solver
 
     @property

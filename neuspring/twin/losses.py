@@ -1,12 +1,14 @@
 """Training losses (those of the released PhysTwin code), differentiable in the predicted nodes.
 
-Chamfer: mean over visible observed points of the squared Euclidean distance to the nearest surface node (assignment held
-fixed). Track: smooth-L1 (beta = 1 m) between node i and track i where the motion is valid, mean over points and axes.
-Acceleration: 0.01 x smooth-L1 between consecutive velocity changes, mean over nodes and axes; search only.
+Chamfer: mean over visible observed points of the squared Euclidean distance to the nearest surface node (assignment fixed).
+Track: smooth-L1 (beta = 1 m) between node i and track i where the motion is valid, mean over points and axes.
+Acceleration: smooth-L1 between consecutive velocity changes, mean over nodes and axes; search only.
+A term is weighted by the field of `config.Losses` that has its name.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -22,11 +24,8 @@ CHUNK_ENTRIES = 1 << 22
 def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
     """Index [P] of the nearest node (Euclidean, lowest index on ties) for points [P, 3] among nodes [M, 3]."""
     rows = max(1, CHUNK_ENTRIES // max(1, len(nodes)))
-    found = []
-    for chunk in points.split(rows):
-        squared = (chunk[:, None] - nodes[None]).square().sum(dim=2)
-        found.append(squared.argmin(dim=1))
-    return torch.cat(found) if found else torch.zeros(0, dtype=torch.long, device=points.device)
+    # An empty tensor splits into itself, and argmin of no rows is empty too.
+    return torch.cat([(chunk[:, None] - nodes[None]).square().sum(dim=2).argmin(dim=1) for chunk in points.split(rows)])
 
 
 def chamfer(
@@ -36,12 +35,12 @@ def chamfer(
 
     `count` replaces the number of visible points as divisor (released quirk 4).
     """
-    seen = target[visible]
-    if len(seen) == 0:
+    points = target[visible]
+    if len(points) == 0:
         return nodes.sum() * 0.0
     with torch.no_grad():
-        index = nearest(seen, nodes[:surface])
-    return (nodes[index] - seen).square().sum() / (len(seen) if count is None else max(count, 1))
+        index = nearest(points, nodes[:surface])
+    return (nodes[index] - points).square().sum() / (len(points) if count is None else max(count, 1))
 
 
 def track(nodes: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, count: int | None = None) -> torch.Tensor:
@@ -51,7 +50,7 @@ def track(nodes: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, count:
 
 
 def acceleration(change: torch.Tensor, previous: torch.Tensor) -> torch.Tensor:
-    """Unweighted smoothness of motion: smooth-L1 between a frame's velocity change [N, 3] and that of the frame before."""
+    """Smoothness of motion: smooth-L1 between a frame's velocity change [N, 3] and that of the frame before."""
     return smooth_l1_loss(change, previous, reduction="mean", beta=1.0)
 
 
@@ -86,16 +85,30 @@ class FrameLoss:
         valid = torch.tensor(observations.object_motion_valid[:end], device=device)
         return cls(points, visible, valid, observations.surface_count, weights, frozen_counts)
 
-    def terms(self, frame: int, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(chamfer, track) of a frame >= 1, weighted. Frame t uses visibility[t] but motion_valid[t - 1]."""
-        seen = moved = None
-        if self.frozen_counts:
-            seen, moved = int(self.visible[1].sum()), int(self.motion_valid[0].sum())
-        target = self.points[frame]
-        near = self.weights.chamfer * chamfer(nodes, target, self.visible[frame], self.surface, seen)
-        return near, self.weights.track * track(nodes, target, self.motion_valid[frame - 1], moved)
+    def terms(self, frame: int, nodes: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Weighted terms of a frame >= 1 for nodes [N, 3], by name. Frame t uses visibility[t] but motion_valid[t - 1]."""
+        target, visible, valid = self.points[frame], self.visible[frame], self.motion_valid[frame - 1]
+        visible_count = int(self.visible[1].sum()) if self.frozen_counts else None
+        valid_count = int(self.motion_valid[0].sum()) if self.frozen_counts else None
+        values = {
+            "chamfer": chamfer(nodes, target, visible, self.surface, visible_count),
+            "track": track(nodes, target, valid, valid_count),
+        }
+        return {name: getattr(self.weights, name) * value for name, value in values.items()}
 
     def __call__(self, frame: int, nodes: torch.Tensor) -> torch.Tensor:
-        """Chamfer + track of a frame."""
-        near, moved = self.terms(frame, nodes)
-        return near + moved
+        """The sum of a frame's terms."""
+        first, *others = self.terms(frame, nodes).values()
+        return sum(others, start=first)
+
+    def of_rollout(self, states: Iterable[tuple[int, torch.Tensor, torch.Tensor]], velocity: torch.Tensor) -> float:
+        """Mean loss of the frames (frame, x, v) of a rollout from `velocity` [N, 3] on, acceleration included."""
+        total, count = 0.0, 0
+        previous: torch.Tensor | None = None
+        for frame, x, v in states:
+            total += float(self(frame, x))
+            change = v - velocity
+            if previous is not None:
+                total += self.weights.acceleration * float(acceleration(change, previous))
+            velocity, previous, count = v, change, count + 1
+        return total / count

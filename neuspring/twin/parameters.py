@@ -13,8 +13,8 @@ Beside them: four contact scalars, drag = drag0 exp(.), and the homogeneous fact
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -25,11 +25,14 @@ from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.autograd import ELASTICITY_RANGE, FRICTION_RANGE, pack, twin_tensors
+from neuspring.physics import contact
+from neuspring.physics.autograd import pack, twin_tensors
 from neuspring.physics.solver import Parameters
 from neuspring.twin.field import SpringField, midpoints
 
 CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
+UNTRAINED = ("contact_distance",)
+"""It only selects pairs, so it has no gradient."""
 LOWEST_STIFFNESS = 1e-3
 """Stiffness below this is raised to it before taking the logarithm, N."""
 
@@ -89,35 +92,28 @@ class TwinParameters(nn.Module):
             self.field = SpringField(points, settings.field, len(self.channels), seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict()
-        if settings.homogeneous_epochs:
-            self.factors["stiffness"] = nn.Parameter(torch.zeros(()))
-        if settings.damping != "fixed":
-            self.factors["drag"] = nn.Parameter(torch.zeros(()))
-            self.factors["dashpot"] = nn.Parameter(torch.zeros(()))
+        names = ["stiffness"] if settings.homogeneous_epochs else []
+        for name in names + (["drag", "dashpot"] if settings.damping != "fixed" else []):
+            self.factors[name] = nn.Parameter(torch.zeros(()))
         self.homogeneous = False
         """While true, offsets are not trained."""
         self.to(device)
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups for the optimiser, each with its learning rate (also kept as `base_rate`) and weight decay."""
+        """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later) and weight decay."""
         s = self.settings
         rate, decay = s.learning_rate, s.field.weight_decay
-        groups: list[dict[str, Any]] = []
-
-        def add(parameters: Iterator[nn.Parameter], rate: float, decay: float = 0.0) -> None:
-            groups.append({"params": list(parameters), "lr": rate, "base_rate": rate, "weight_decay": decay})
-
+        groups: list[tuple[Iterable[nn.Parameter], float, float]] = []
         if self.offsets is not None:
-            add(iter([self.offsets]), rate)
+            groups.append(([self.offsets], rate, 0.0))
         if self.field is not None:
-            add(self.field.layers.parameters(), rate, decay)
+            groups.append((self.field.layers.parameters(), rate, decay))
             if self.field.planes is not None:
-                add(self.field.planes.parameters(), s.field.plane_learning_rate or rate, decay)
+                groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate, decay))
         if self.rest_offsets is not None:
-            add(iter([self.rest_offsets]), s.rest_learning_rate or rate)
-        scalars = [*self.scalars.values(), *self.factors.values()]
-        add(iter(scalars), s.scalar_learning_rate or rate)
-        return groups
+            groups.append(([self.rest_offsets], s.rest_learning_rate or rate, 0.0))
+        groups.append(([*self.scalars.values(), *self.factors.values()], s.scalar_learning_rate or rate, 0.0))
+        return [{"params": list(each), "lr": rate, "base_rate": rate, "weight_decay": decay} for each, rate, decay in groups]
 
     def raw_offsets(self) -> torch.Tensor:
         """Offsets [S, channels] before bounding; zero for springs that the field does not cover."""
@@ -144,10 +140,9 @@ class TwinParameters(nn.Module):
         if "stiffness" in self.factors:
             factor = factor * self.factors["stiffness"].exp()
         stiffness = self.start["stiffness"] * factor
-        # The released baseline clamps plainly; the springs of a field move together, so one beyond a limit must find back.
-        values["stiffness"] = (
-            inward_clamp(stiffness, *s.stiffness_range) if self.kind == "field" else stiffness.clamp(*s.stiffness_range)
-        )
+        # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
+        clamp = inward_clamp if self.kind == "field" else torch.clamp
+        values["stiffness"] = clamp(stiffness, *s.stiffness_range)
         if "drag" in self.factors:
             values["drag"] = self.start["drag"] * self.factors["drag"].exp()
             values["dashpot"] = self.start["dashpot"] * self.factors["dashpot"].exp()
@@ -162,7 +157,7 @@ class TwinParameters(nn.Module):
         return pack(**self.physical(), substep=substep)
 
     def penalty(self) -> torch.Tensor:
-        """What is added to the loss of a step: the weighted roughness of the planes."""
+        """The regularizer of a step: the weighted roughness of the planes."""
         weight = self.settings.field.plane_smoothness
         if self.field is None or not weight or self.homogeneous:
             return torch.zeros(())
@@ -179,14 +174,15 @@ class TwinParameters(nn.Module):
                 tensor.copy_(torch.from_numpy(np.asarray(values[name])))
 
     def as_twin(self, twin: Twin) -> Twin:
-        """`twin` with the present values, clamped as they are used."""
+        """`twin` with the current values, clamped as in the simulation."""
         with torch.no_grad():
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
-        limits = {"elasticity": ELASTICITY_RANGE, "friction": FRICTION_RANGE}
-        contact: dict[str, Any] = {n: float(np.clip(values[n], *limits[n.rpartition("_")[2]])) for n in CONTACT_SCALARS}
-        contact["drag"] = float(values["drag"])
-        material = replace(twin.material, stiffness=values["stiffness"], dashpot=values["dashpot"], **contact)
+        material: dict[str, Any] = {}
+        for name in (f.name for f in fields(twin.material) if f.name not in UNTRAINED):
+            limits = contact.RANGES.get(name.rpartition("_")[2], (-np.inf, np.inf))
+            value = np.clip(values[name], *limits)
+            material[name] = value if value.ndim else float(value)
         topology = twin.topology
         if self.settings.rest_length_bound:
             topology = replace(topology, rest_lengths=values["rest_lengths"])
-        return replace(twin, material=material, topology=topology)
+        return replace(twin, material=replace(twin.material, **material), topology=topology)

@@ -10,7 +10,7 @@ import torch
 
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.physics import stability
-from neuspring.physics.autograd import pack, twin_tensors
+from neuspring.physics.autograd import solver_for
 from neuspring.physics.solver import FrameSolver
 
 FAR = 1e3
@@ -47,16 +47,6 @@ def frames(
         yield frame, x, v
 
 
-def solver_for(twin: Twin, device: str) -> FrameSolver:
-    """A forward-only solver with the twin's parameters."""
-    topology = twin.topology
-    solver = FrameSolver(
-        topology.springs, len(topology.nodes), len(topology.controllers), twin.simulation, device=device, differentiable=False
-    )
-    solver.set_parameters(pack(**twin_tensors(twin, device), substep=twin.simulation.substep))
-    return solver
-
-
 def roll_out(
     twin: Twin,
     controller_points: np.ndarray,
@@ -66,7 +56,7 @@ def roll_out(
 ) -> Trajectory:
     """Simulate over controller_points [T, C, 3], m, from velocity [N, 3], m/s (none: at rest). Divergence is a named result.
 
-    Raises InputError if the substep is beyond the stability bound.
+    Raises Unstable if the substep is beyond the stability bound.
     """
     stability.check(twin)
     return simulate(twin, controller_points, device, progress, velocity)
@@ -79,8 +69,8 @@ def simulate(
     progress: Callable[[int], None] | None = None,
     velocity: np.ndarray | None = None,
 ) -> Trajectory:
-    """As `roll_out`, whatever the stability bound says of the substep: the released simulator knows none."""
-    solver = solver_for(twin, device)
+    """As `roll_out`, without the check of the substep: the released simulator has none."""
+    solver = solver_for(twin, device, differentiable=False)
     hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
@@ -101,12 +91,9 @@ def simulate(
 
 
 def mean_trajectory(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """The mean of complete rollouts with equally many frames and nodes; one is returned as it is."""
+    """The mean of complete rollouts of the same number of frames and nodes; a single one is returned as it is."""
     if len(trajectories) == 1:
         return trajectories[0]
     mean: np.ndarray = np.stack([one.positions for one in trajectories]).mean(axis=0, dtype=np.float64)
-    return replace(
-        trajectories[0],
-        positions=mean,
-        collision_overflow=max(one.collision_overflow for one in trajectories),
-    )
+    overflow = max(one.collision_overflow for one in trajectories)
+    return replace(trajectories[0], positions=mean, collision_overflow=overflow)

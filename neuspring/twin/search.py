@@ -1,10 +1,10 @@
 """Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
 
-Variables are normalised to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
+Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
 whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
-evaluated candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform
-topology, and the regions are freed around the best candidate found. Every candidate is kept in a trace, from which a killed
-search continues, or a finished one with a larger budget: CMA-ES is replayed with the recorded costs.
+candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology; then
+the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so does a
+finished one with a larger budget: CMA-ES is replayed with the recorded costs.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
-from neuspring.twin.losses import FrameLoss, acceleration
+from neuspring.physics.autograd import solver_for
+from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
-from neuspring.twin.rollout import Diverged, frames, solver_for
+from neuspring.twin.rollout import Diverged, frames
 from neuspring.twin.topology import isolated, piecewise_topology, regions
 
 INTEGERS = ("object_neighbours", "controller_neighbours")
 REGIONAL = ("object_radius", "object_neighbours")
 """Variables of which every region has its own."""
 PENALTY = 1e6
-"""Cost of a candidate that diverges or cannot be integrated; far above any loss in square metres."""
+"""Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
 UNSTABLE = "unstable"
 RELEASED_FRAME_TIME = 667 * 5e-5
 RELEASED_SUBSTEPS = 667
@@ -70,74 +71,70 @@ class SearchProblem:
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
         return tuple(names)
 
-    def decode(self, normalised: np.ndarray) -> dict[str, float]:
-        """Physical values of normalised variables [2K + 10]; neighbour counts are truncated to integers."""
+    def decode(self, normalized: np.ndarray) -> dict[str, float]:
+        """Physical values of normalized variables [2K + 10]; neighbor counts are truncated to integers."""
         values = {}
-        for name, u in zip(self.variables, normalised, strict=True):
-            base = name.partition(".")[0]
-            low, high = getattr(self.search.ranges, base)
-            if self._logarithmic(base):
-                values[name] = float(low * (high / low) ** float(u))
-            else:
-                value = low + float(u) * (high - low)
-                values[name] = float(int(value)) if base in INTEGERS else value
+        for name, u in zip(self.variables, normalized, strict=True):
+            base, low, high, logarithmic = self._range(name)
+            value = float(low * (high / low) ** float(u)) if logarithmic else low + float(u) * (high - low)
+            values[name] = float(int(value)) if base in INTEGERS else value
         return values
 
     def encode(self) -> np.ndarray:
-        """Normalised variables [2K + 10] of the starting values."""
-        normalised = []
+        """Normalized variables [2K + 10] of the starting values."""
+        normalized = []
         for name in self.variables:
-            base = name.partition(".")[0]
-            low, high = getattr(self.search.ranges, base)
+            base, low, high, logarithmic = self._range(name)
             value = getattr(self.search.start, base)
-            logarithmic = self._logarithmic(base)
-            normalised.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
-        return np.array(normalised)
+            normalized.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
+        return np.array(normalized)
+
+    def _range(self, name: str) -> tuple[str, float, float, bool]:
+        """The setting of a variable, its range, and whether its scale is logarithmic."""
+        base = name.partition(".")[0]
+        return base, *getattr(self.search.ranges, base), base == "stiffness" and self.search.stiffness_scale == "log"
 
     def of_regions(self, values: dict[str, float], name: str) -> list[float]:
         """A regional variable's value in each region."""
         return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
 
-    def _logarithmic(self, name: str) -> bool:
-        return name == "stiffness" and self.search.stiffness_scale == "log"
-
 
 def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
     """The scenario's simulation with a given number of substeps per frame."""
-    scenario, chosen = problem.observations.scenario, problem.simulation
+    scenario, settings = problem.observations.scenario, problem.simulation
     return Simulation(
         frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
         substeps=substeps,
         up=scenario.up,
-        gravity=chosen.gravity,
+        gravity=settings.gravity,
         ground=scenario.ground,
         self_collision=scenario.self_collision,
-        collision_capacity=chosen.collision_capacity,
-        controller_velocity=chosen.controller_velocity,
-        initial_velocity=chosen.initial_velocity,
+        collision_capacity=settings.collision_capacity,
+        controller_velocity=settings.controller_velocity,
+        initial_velocity=settings.initial_velocity,
     )
 
 
 def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
-    """The twin with its substep count settled: 667 with the quirk, the configured count, or the smallest safe one.
+    """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
 
     Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
     """
-    chosen = problem.simulation
-    if problem.quirks.frame_time_667 or chosen.substeps != "auto":
-        count = RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(chosen.substeps)
-        settled = replace(twin, simulation=replace(twin.simulation, substeps=count))
-        stability.check(settled)
-        return settled
-    count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, chosen.safety)
-    if count > chosen.max_substeps:
-        raise NumericalFailure(f"needs {count} substeps per frame, more than max_substeps = {chosen.max_substeps}")
+    settings = problem.simulation
+    if problem.quirks.frame_time_667 or settings.substeps != "auto":
+        count = RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(settings.substeps)
+        twin = replace(twin, simulation=replace(twin.simulation, substeps=count))
+        stability.check(twin)
+        return twin
+    count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, settings.safety)
+    if count > settings.max_substeps:
+        raise NumericalFailure(f"needs {count} substeps per frame, more than max_substeps = {settings.max_substeps}")
     return replace(twin, simulation=replace(twin.simulation, substeps=count))
 
 
 def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
-    observations, rule = problem.observations, problem.search.isolated_nodes
+    observations, isolated_nodes = problem.observations, problem.search.isolated_nodes
     topology = piecewise_topology(
         observations.nodes,
         observations.controller_points[0],
@@ -146,26 +143,24 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         [int(n) for n in problem.of_regions(values, "object_neighbours")],
         values["controller_radius"],
         int(values["controller_neighbours"]),
-        repair=rule == "repair",
+        repair=isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
     )
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
     lonely = isolated(len(topology.nodes), topology.springs)
-    if rule == "penalise" and len(lonely):
+    if isolated_nodes == "penalise" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
-    material = Material(
-        stiffness=np.full(count, values["stiffness"]),
-        dashpot=np.full(count, values["dashpot"]),
-        drag=values["drag"],
-        ground_elasticity=values["ground_elasticity"],
-        ground_friction=values["ground_friction"],
-        contact_elasticity=values["contact_elasticity"],
-        contact_friction=values["contact_friction"],
-        contact_distance=values["contact_distance"],
-    )
+    material = homogeneous(values, count)
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
+
+
+def homogeneous(values: dict[str, float], springs: int) -> Material:
+    """A material that is the same everywhere; `values` has a number for every field of `Material`."""
+    numbers: dict[str, Any] = {f.name: values[f.name] for f in fields(Material)}
+    arrays = {f.name: np.full(springs, values[f.name]) for f in fields(Material) if "shape" in f.metadata}
+    return Material(**(numbers | arrays))
 
 
 def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, int]:
@@ -174,17 +169,9 @@ def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, in
     Raises Diverged.
     """
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    before = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    previous: torch.Tensor | None = None
-    total = 0.0
-    solver = solver_for(twin, problem.device)
-    for frame, x, v in frames(twin, solver, hands, problem.velocity):
-        total += float(loss(frame, x))
-        change = v - before
-        if previous is not None:
-            total += problem.losses.acceleration * float(acceleration(change, previous))
-        before, previous = v, change
-    return total / (len(hands) - 1), solver.collision_overflow
+    start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
+    solver = solver_for(twin, problem.device, differentiable=False)
+    return loss.of_rollout(frames(twin, solver, hands, problem.velocity), start), solver.collision_overflow
 
 
 @dataclass(frozen=True)
@@ -204,31 +191,32 @@ class SearchResult:
 def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
     """Run the search within its budget of rollouts.
 
-    `record` is where the trace is kept, written after every generation; a file with the same `key` there is continued from,
+    The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
     clock = time.perf_counter()
     trace, attempts, earlier = _recorded(record, key)
-    known = len(trace)
+    saved = len(trace)
     proposals = _Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.rollouts
     progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
-    done = 0
+    start = 0
     # The last generation may be cut short, so that searches of any population size use exactly the same budget.
-    while done < budget:
-        population = proposals.ask()[: budget - done]
-        if not _replays(trace[done : done + len(population)], population, problem.variables):
-            print(f"{record}: does not replay on this machine; the search continues afresh from rollout {done}")
-            trace, known = trace[:done], done
-            if not done:
+    while start < budget:
+        population = proposals.ask()[: budget - start]
+        stop = start + len(population)
+        if not _replays(trace[start:stop], population, problem.variables):
+            print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
+            trace, saved = trace[:start], start
+            if not start:
                 attempts, earlier = 1, 0.0
-        for normalised in population[max(len(trace) - done, 0) :]:
-            trace.append(_evaluate(problem, normalised, loss, len(trace), proposals.generation))
+        for normalized in population[max(len(trace) - start, 0) :]:
+            trace.append(_evaluate(problem, normalized, loss, len(trace), proposals.generation))
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
-        done += len(population)
-        proposals.tell([row["cost"] for row in trace[done - len(population) : done]])
-        if record is not None and len(trace) > known:
+        proposals.tell([row["cost"] for row in trace[start:stop]])
+        start = stop
+        if record is not None and len(trace) > saved:
             _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
     table = pd.DataFrame(trace[:budget])
     best = table.iloc[int(table["cost"].to_numpy().argmin())]
@@ -244,11 +232,11 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
 
 class _Proposals:
-    """The candidates that CMA-ES asks for, in all 2K + 10 normalised variables.
+    """The candidates of CMA-ES, in all 2K + 10 normalized variables.
 
-    In the first `tied_rollouts` it moves in the 12 variables of the uniform topology; then it starts again in all of them, from
-    the best candidate so far. Free from the start, K regions are too many variables for a few hundred rollouts: on cables the
-    piecewise search then ended above the uniform one on training frames, although its space contains the other's.
+    In the first `tied_rollouts` it searches the 12 variables of the uniform topology; then it starts again in all variables, from
+    the best candidate so far. K regions have too many variables for a few hundred rollouts: free from the start, the piecewise
+    search of cables ended above the uniform one on training frames, although its space contains the other's.
     """
 
     def __init__(self, problem: SearchProblem, seed: int) -> None:
@@ -261,58 +249,44 @@ class _Proposals:
             searched = replace(problem, clusters=1)
             self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
         self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
-        self._asked: list[np.ndarray] = []
+        self._population: list[np.ndarray] = []
         self._best = (np.inf, problem.encode())
-        self._done = 0
+        self._evaluated = 0
         self.generation = -1
 
     def ask(self) -> list[np.ndarray]:
         """The next generation; the last one with tied regions may be cut short."""
-        if self._tied and self._done == self._tied:
+        if self._tied and self._evaluated == self._tied:
             self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
             self._columns = np.arange(len(self._problem.variables))
-        self._asked = self._strategy.ask()
-        if self._done < self._tied:
-            self._asked = self._asked[: self._tied - self._done]
+        self._population = self._strategy.ask()
+        if self._evaluated < self._tied:
+            self._population = self._population[: self._tied - self._evaluated]
         self.generation += 1
-        return [np.asarray(searched)[self._columns] for searched in self._asked]
+        return [np.asarray(searched)[self._columns] for searched in self._population]
 
     def tell(self, costs: list[float]) -> None:
-        """Costs of the first candidates asked for last; CMA-ES learns from whole generations only."""
+        """Take the costs of the first candidates of the last generation; CMA-ES learns from whole generations only."""
         least = int(np.argmin(costs))
         if costs[least] < self._best[0]:
-            self._best = (costs[least], np.asarray(self._asked[least])[self._columns])
-        self._done += len(costs)
+            self._best = (costs[least], np.asarray(self._population[least])[self._columns])
+        self._evaluated += len(costs)
         if len(costs) == self._strategy.popsize:
-            self._strategy.tell(self._asked, costs)
+            self._strategy.tell(self._population, costs)
 
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
     # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
-    options = {
-        "bounds": [0, 1],
-        "seed": seed + 1,
-        "verbose": -9,
-        "maxiter": np.inf,
-        "tolfun": 0,
-        "tolx": 0,
-        "tolstagnation": np.inf,
-    }
+    no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
+    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
-def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
+def _evaluate(problem: SearchProblem, normalized: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
     start = time.perf_counter()
-    values = problem.decode(normalised)
-    row: dict[str, Any] = {
-        "rollout": index,
-        "generation": generation,
-        "cost": PENALTY,
-        "reason": "",
-        "springs": 0,
-        "substeps": 0,
-        "collision_overflow": 0,
-    }
+    values = problem.decode(normalized)
+    row: dict[str, Any] = {"rollout": index, "generation": generation, "cost": PENALTY, "reason": ""}
+    row |= {"springs": 0, "substeps": 0, "collision_overflow": 0}
     try:
         twin = candidate(problem, values)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
@@ -321,10 +295,10 @@ def _evaluate(problem: SearchProblem, normalised: np.ndarray, loss: FrameLoss, i
     except (Diverged, NumericalFailure) as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
-        # A fixed substep count that this candidate is too stiff for: penalised, like divergence.
+        # The candidate is too stiff for a fixed number of substeps.
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
-    return row | values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalised, strict=True)}
+    return row | values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
 
 
 def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
@@ -334,7 +308,7 @@ def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seco
 
 
 def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
-    """(candidates, attempts, seconds) of a recorded search with this key; (nothing, 1, 0) if there is none."""
+    """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
     fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
     if path is None or not path.is_file():
         return fresh
@@ -352,8 +326,8 @@ def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, f
 
 
 def _replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
-    """Whether recorded candidates are those that CMA-ES asks for now."""
+    """Whether recorded candidates are those that CMA-ES proposes now."""
     return all(
-        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), asked)
-        for row, asked in zip(rows, population, strict=False)
+        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), normalized)
+        for row, normalized in zip(rows, population, strict=False)
     )

@@ -1,8 +1,8 @@
 """From points to a spring graph (as the released PhysTwin code makes it), uniform or piecewise (the paper's piecewise topology).
 
-Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. The spring
-set is the union of all answers: a pair is kept if either side asks for it. In a piecewise topology each region of nodes has
-its own radius and number of neighbours; a node asks among all nodes, with its own region's values, so regions stay joined.
+Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. A spring is made
+if either end asks for it. In a piecewise topology each region of nodes has
+its own radius and number of neighbors; a node asks among all nodes, with its own region's values, so regions stay joined.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
     if len(nodes) < least:
         rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
         raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbours.")
-    # Here, since it takes longer to import than most commands that need a topology take to run.
+    # Imported here: it takes longer than most commands that need a topology.
     from sklearn.cluster import AgglomerativeClustering
     from sklearn.neighbors import kneighbors_graph
 
     points = np.asarray(nodes, np.float64)
     graph = None
     if settings.connectivity:
-        asked = kneighbors_graph(points, settings.connectivity)
-        graph = asked.maximum(asked.T)
-    found = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
+        directed = kneighbors_graph(points, settings.connectivity)
+        graph = directed.maximum(directed.T)
+    clusters = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
     # Micrometres: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
-    centroids = np.round([points[found == label].mean(axis=0) for label in range(count)], 6)
+    centroids = np.round([points[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
-    labels: np.ndarray = number[found]
+    labels: np.ndarray = number[clusters]
     return labels
 
 
 def join(nodes: np.ndarray, springs: np.ndarray, lonely: np.ndarray) -> np.ndarray:
-    """The springs [S, 2], and behind them springs from each of the nodes `lonely` to its nearest nodes."""
+    """The springs [S, 2], followed by springs from each of the nodes `lonely` to its nearest nodes."""
     if not len(lonely):
         return springs
     tree = cKDTree(nodes)
@@ -86,18 +86,17 @@ def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray
     distance, partner = distance.reshape(count, k), partner.reshape(count, k)
     rank = np.arange(k)
     # The first hit is the node itself (or an exact duplicate, which the length rule would refuse anyway).
-    asked = (rank > 0) & (rank < neighbours[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
-    first, column = np.nonzero(asked)
-    pairs = np.stack([first, partner[first, column]], axis=1)
-    return _first_of_each(pairs, count)
+    wanted = (rank > 0) & (rank < neighbours[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
+    first, column = np.nonzero(wanted)
+    return _first_of_each(np.stack([first, partner[first, column]], axis=1), count)
 
 
 def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
     """Keep the first occurrence of every unordered pair."""
     ordered = np.sort(pairs, axis=1)
     _, index = np.unique(ordered[:, 0] * count + ordered[:, 1], return_index=True)
-    kept: np.ndarray = pairs[np.sort(index)]
-    return kept
+    unique: np.ndarray = pairs[np.sort(index)]
+    return unique
 
 
 def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbours: int) -> np.ndarray:
@@ -112,8 +111,8 @@ def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float
 def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
     """Distance of the ends of each spring [S], m, in double precision."""
     ends = points.astype(np.float64)[springs.reshape(-1, 2)]
-    found: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return found
+    lengths: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    return lengths
 
 
 def build(
@@ -126,13 +125,8 @@ def build(
     """A Topology whose rest lengths are the distances in the rest shape [N + C, 3], m, or in frame 0 (rounded to float32)."""
     lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
     if (lengths <= 0).any():
-        pair = springs[int(np.argmin(lengths))].tolist()
-        raise InputError(
-            "topology",
-            "a controller may not coincide with an object node",
-            f"zero-length spring {pair}",
-            "Move or drop that point.",
-        )
+        pair = f"zero-length spring {springs[int(np.argmin(lengths))].tolist()}"
+        raise InputError("topology", "a controller may not coincide with an object node", pair, "Move or drop that point.")
     return Topology(
         nodes=nodes,
         controllers=controllers,
@@ -155,9 +149,9 @@ def piecewise_topology(
     repair: bool = False,
     rest_shape: np.ndarray = NO_REST_SHAPE,
 ) -> Topology:
-    """A radius [m] and a neighbour count (self included) per region; `labels` [N] says which region a node belongs to.
+    """A radius [m] and a neighbor count (self included) per region; `labels` [N] says which region a node belongs to.
 
-    Neighbours are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
+    Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
     any spring, controllers' included, to their nearest nodes. Raises InputError if a controller coincides with a node.
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
@@ -177,7 +171,7 @@ def uniform_topology(
     controller_radius: float,
     controller_neighbours: int,
 ) -> Topology:
-    """One radius [m] and one neighbour count (self included) for the whole object.
+    """One radius [m] and one neighbor count (self included) for the whole object.
 
     Raises InputError if a controller coincides with a node.
     """

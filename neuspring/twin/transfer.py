@@ -15,13 +15,12 @@ from neuspring.twin.topology import distances
 def rebase(
     twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
 ) -> Twin:
-    """The twin on the nodes and hands of another recording, node i on node i, rest lengths re-based on its rest shape.
+    """The twin on the nodes and hands of another recording, node i on node i. The rest shape is frame 0 unless recorded.
 
-    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape,
-    which is frame 0 unless the observations say otherwise. With `keep_lengths` it keeps the length itself: for trained ones,
-    which belong to the body and not to a first frame. Up, ground and, unless `keep_frame_time`, the frame time follow the
-    recording; more substeps are taken if the new distances need them. Raises InputError if the node or controller counts
-    differ, or a spring would have no length.
+    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape.
+    With `keep_lengths` it keeps the rest length itself: trained lengths belong to the body. Up, ground and, unless
+    `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more. Raises InputError if
+    the numbers of nodes or controllers differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
     nodes, hands = observations.nodes, observations.controller_points[0]
@@ -33,9 +32,8 @@ def rebase(
     lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else ratio)
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
-        raise InputError(
-            f"transfer to {scenario.name}", "the ends of a spring may not coincide in the rest shape", f"spring {pair}"
-        )
+        rule = "the ends of a spring may not coincide in the rest shape"
+        raise InputError(f"transfer to {scenario.name}", rule, f"spring {pair}")
     simulation = replace(
         twin.simulation,
         frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
@@ -43,10 +41,7 @@ def rebase(
         ground=scenario.ground,
         self_collision=scenario.self_collision,
     )
-    moved = Twin(
-        topology=replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape),
-        material=twin.material,
-        simulation=simulation,
-    )
-    count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
-    return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
+    topology = replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)
+    result = Twin(topology=topology, material=twin.material, simulation=simulation)
+    count = stability.smallest_safe_substeps(stability.twin_spectrum(result), simulation.frame_time, safety)
+    return replace(result, simulation=replace(simulation, substeps=max(count, simulation.substeps)))

@@ -79,7 +79,7 @@ def adjoints(points: np.ndarray, pairs: np.ndarray) -> tuple[Adjoint, Adjoint]:
 
     kernel, adjoint = springs.kernels(wp.float32)
     own = {"x": wp.zeros(total, dtype=vec3), "v": wp.zeros(total, dtype=vec3), "parameters": wp.zeros(count, dtype=vec3)}
-    inputs = [x, v, 0, ends, parameters, incoming, own["x"], own["v"], own["parameters"]]
+    inputs = [ends, parameters, x, v, 0, incoming, own["x"], own["v"], own["parameters"]]
     by_hand = Adjoint(lambda: wp.launch(adjoint, count, inputs), own, count)
 
     differentiated = wp.kernel(module="unique", enable_backward=True)(kernel.func)
@@ -89,8 +89,8 @@ def adjoints(points: np.ndarray, pairs: np.ndarray) -> tuple[Adjoint, Adjoint]:
         wp.launch(
             differentiated,
             count,
-            inputs=[x, v, 0, ends, parameters, force],
-            adj_inputs=[other["x"], other["v"], 0, None, other["parameters"], incoming],
+            inputs=[ends, parameters, x, v, 0, force],
+            adj_inputs=[None, other["parameters"], other["x"], other["v"], 0, incoming],
             adjoint=True,
         )
 

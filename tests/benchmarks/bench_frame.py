@@ -19,8 +19,7 @@ import warp as wp
 
 from neuspring.core.artifacts import Material, Simulation, Twin
 from neuspring.physics import reference, stability
-from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
 from neuspring.twin.topology import uniform_topology
 
 HANDS = 8
@@ -47,13 +46,6 @@ def box(nodes: int, substeps: int, neighbours: int, *, self_collision: bool = Fa
     twin = Twin(topology=topology, material=material, simulation=simulation)
     stability.check(twin)
     return twin, np.stack([hands, hands + np.array([0, 0, 0.005])])
-
-
-def solver_for(twin: Twin, device: str, *, differentiable: bool) -> FrameSolver:
-    t = twin.topology
-    solver = FrameSolver(t.springs, len(t.nodes), len(t.controllers), twin.simulation, device=device, differentiable=differentiable)
-    solver.set_parameters(pack(**twin_tensors(twin, device), substep=twin.simulation.substep))
-    return solver
 
 
 def timed(action: Callable[[], object], repeats: int, device: str) -> tuple[float, float]:
@@ -84,11 +76,10 @@ def bench(name: str, device: str, repeats: int) -> dict[str, float]:
         after.square().sum().backward()
 
     def relaunched() -> None:
-        kept._record_forward()
-        for adjoint in (b for name, b in kept._buffers.items() if name.startswith("adj_")):
-            adjoint.zero_()
-        kept._buffers["adj_x"][: len(x)].copy_(x)
-        kept._record_backward()
+        kept.launch_forward()
+        kept.clear_adjoints()
+        kept.buffers.tensors["adj_x"][: len(x)].copy_(x)
+        kept.launch_backward()
 
     start = time.perf_counter()
     free.forward(x, v, begin, end)
@@ -98,7 +89,7 @@ def bench(name: str, device: str, repeats: int) -> dict[str, float]:
     print(f"    first forward + backward:             {time.perf_counter() - start:.2f} s")
     rows = {
         "forward only, captured": lambda: free.forward(x, v, begin, end),
-        "forward only, launched": free._record_forward,
+        "forward only, launched": free.launch_forward,
         "forward + backward, captured": learn,
         "forward + backward, launched": relaunched,
     }

@@ -8,10 +8,10 @@ LOAD = """
 import logging, sys
 import warp as wp
 from neuspring.core import device as kernels
-from neuspring.physics import integrate, springs
+from neuspring.physics import springs, velocity
 wp.config.log_level = logging.INFO
 sys.stdin.readline()
-for kernel in (*springs.kernels(wp.float32), integrate.kernels(wp.float32).advance):
+for kernel in (*springs.kernels(wp.float32), velocity.kernels(wp.float32).velocity):
     kernels.load(kernel, "cpu")
 """
 

@@ -30,8 +30,8 @@ def sign(up: str) -> float:
 
 
 def fall(engine: Engine, substeps: int, drag: float, up: str = "+z", frames: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    made = scene(1, drag=drag, gravity=G, up=up, substeps=substeps, frame_time=0.1)
-    return engine(made, np.array([[0.1, 0.0, 3.0]]), np.array([[0.7, 0.0, 2.0]]), no_hands(frames))
+    body = scene(1, drag=drag, gravity=G, up=up, substeps=substeps, frame_time=0.1)
+    return engine(body, np.array([[0.1, 0.0, 3.0]]), np.array([[0.7, 0.0, 2.0]]), no_hands(frames))
 
 
 @SIDES
@@ -75,10 +75,10 @@ def oscillate(
     engine: Engine, substep: float, steps: int, per_frame: int = 1, dashpot: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Extension q [F] and its rate, at frame ends, along a tilted axis, starting at AMPLITUDE with rate 0."""
-    made = scene(2, [(0, 1)], [LENGTH], stiffness=STIFFNESS, dashpot=dashpot, substeps=per_frame, frame_time=substep * per_frame)
+    body = scene(2, [(0, 1)], [LENGTH], stiffness=STIFFNESS, dashpot=dashpot, substeps=per_frame, frame_time=substep * per_frame)
     axis = np.array([2.0, -1.0, 2.0]) / 3
     x = np.stack([np.zeros(3), axis * (LENGTH + AMPLITUDE)])
-    x, v = engine(made, x, np.zeros((2, 3)), no_hands(steps // per_frame))
+    x, v = engine(body, x, np.zeros((2, 3)), no_hands(steps // per_frame))
     return (x[:, 1] - x[:, 0]) @ axis - LENGTH, (v[:, 1] - v[:, 0]) @ axis
 
 
@@ -149,8 +149,8 @@ def net(dashpot: float, frames: int = 20) -> tuple:
     x, v = rng.uniform(-0.1, 0.1, (12, 3)), rng.uniform(-1, 1, (12, 3))
     springs = [(i, j) for i in range(12) for j in range(i + 1, 12) if rng.random() < 0.5]
     lengths = [np.linalg.norm(x[i] - x[j]) * rng.uniform(0.8, 1.2) for i, j in springs]
-    made = scene(12, springs, lengths, stiffness=rng.uniform(5, 100, len(springs)), dashpot=dashpot, substeps=20, frame_time=0.02)
-    return made, x, v, no_hands(frames)
+    body = scene(12, springs, lengths, stiffness=rng.uniform(5, 100, len(springs)), dashpot=dashpot, substeps=20, frame_time=0.02)
+    return body, x, v, no_hands(frames)
 
 
 @pytest.mark.parametrize("dashpot", [0.0, 2.0])
@@ -167,21 +167,21 @@ def test_momentum_and_angular_momentum(engine: Engine, dashpot: float) -> None:
 
 def test_a_damped_net_comes_to_rest_in_its_frame(engine: Engine) -> None:
     """Kinetic energy about the centre of mass and spring energy decay from frame to frame."""
-    made, x0, v0, hands = net(3.0, 40)
-    x, v = engine(made, x0, v0, hands)
-    i, j = made.springs.T
-    strain = np.linalg.norm(x[:, j] - x[:, i], axis=2) / made.rest_lengths - 1
-    energy = 0.5 * (v**2).sum(axis=(1, 2)) + 0.5 * (made.stiffness * made.rest_lengths * strain**2).sum(axis=1)
+    body, x0, v0, hands = net(3.0, 40)
+    x, v = engine(body, x0, v0, hands)
+    i, j = body.springs.T
+    strain = np.linalg.norm(x[:, j] - x[:, i], axis=2) / body.rest_lengths - 1
+    energy = 0.5 * (v**2).sum(axis=(1, 2)) + 0.5 * (body.stiffness * body.rest_lengths * strain**2).sum(axis=1)
     assert (np.diff(energy) < 0).all()
 
 
 @pytest.mark.parametrize(("e", "mu"), [(1.0, 0.0), (0.7, 0.3), (0.0, 2.0)])
 def test_a_colliding_pair(engine: Engine, e: float, mu: float) -> None:
     """Momentum is conserved, the normal speed is reversed times e, the tangential one shrinks by a."""
-    made = scene(2, self_collision=True, contact=(e, mu), contact_distance=0.02, substeps=1, frame_time=1e-3)
+    body = scene(2, self_collision=True, contact=(e, mu), contact_distance=0.02, substeps=1, frame_time=1e-3)
     x = np.array([[0.0, 0, 0], [0.015, 0, 0]])
     v = np.array([[0.4, 0.1, 0], [-0.2, -0.5, 0.3]])
-    _, after = engine(made, x, v, no_hands(1))
+    _, after = engine(body, x, v, no_hands(1))
     np.testing.assert_allclose(after[1].sum(axis=0), v.sum(axis=0), atol=1e-15)
     before, relative = v[1] - v[0], after[1, 1] - after[1, 0]
     tangent = np.linalg.norm(before[1:])
@@ -192,11 +192,11 @@ def test_a_colliding_pair(engine: Engine, e: float, mu: float) -> None:
 
 
 def test_receding_or_distant_pairs_do_not_collide(engine: Engine) -> None:
-    made = scene(2, self_collision=True, contact_distance=0.02)
+    body = scene(2, self_collision=True, contact_distance=0.02)
     v = np.array([[-0.1, 0, 0], [0.1, 0, 0]])
     near, far = np.array([[0.0, 0, 0], [0.015, 0, 0]]), np.array([[0.0, 0, 0], [0.02, 0, 0]])
     for x, speed in ((near, v), (near, 0 * v), (far, -v)):
-        np.testing.assert_array_equal(engine(made, x, speed, no_hands(1))[1][1], speed)
+        np.testing.assert_array_equal(engine(body, x, speed, no_hands(1))[1][1], speed)
 
 
 # Ground ---------------------------------------------------------------------------------------------------------------
@@ -207,8 +207,8 @@ def test_receding_or_distant_pairs_do_not_collide(engine: Engine) -> None:
 def test_restitution_is_exact_in_speed(engine: Engine, e: float, up: str) -> None:
     """One substep: reflected at the time of impact, then v' for the rest of the substep."""
     s, dt = sign(up), 1e-3
-    made = scene(1, on_ground=True, ground=(e, 0.0), up=up)
-    x, v = engine(made, np.array([[0, 0, s * 2e-4]]), np.array([[0.3, 0, -s * 0.8]]), no_hands(1))
+    body = scene(1, on_ground=True, ground=(e, 0.0), up=up)
+    x, v = engine(body, np.array([[0, 0, s * 2e-4]]), np.array([[0.3, 0, -s * 0.8]]), no_hands(1))
     impact = 2e-4 / 0.8
     np.testing.assert_allclose(v[1, 0], [0.3, 0, s * e * 0.8], atol=1e-15)
     np.testing.assert_allclose(x[1, 0], [0.3 * dt, 0, s * e * 0.8 * (dt - impact)], atol=1e-15)
@@ -218,8 +218,8 @@ def test_restitution_is_exact_in_speed(engine: Engine, e: float, up: str) -> Non
 def test_bounce_height_is_e_squared(engine: Engine, up: str) -> None:
     """Height of the n-th bounce: e^(2n) h, up to the distance fallen in a substep at full speed."""
     s, dt, height, e = sign(up), 2e-4, 0.1, 0.6
-    made = scene(1, on_ground=True, ground=(e, 0.0), gravity=G, up=up, frame_time=dt)
-    z = s * engine(made, np.array([[0, 0, s * height]]), np.zeros((1, 3)), no_hands(3000))[0][:, 0, 2]
+    body = scene(1, on_ground=True, ground=(e, 0.0), gravity=G, up=up, frame_time=dt)
+    z = s * engine(body, np.array([[0, 0, s * height]]), np.zeros((1, 3)), no_hands(3000))[0][:, 0, 2]
     tops = z[1:-1][(z[1:-1] > z[:-2]) & (z[1:-1] >= z[2:])]
     step = dt * np.sqrt(2 * G * height)
     assert len(tops) >= 2
@@ -231,8 +231,8 @@ def test_sliding_and_sticking(engine: Engine, up: str) -> None:
     """a = max(0, 1 - mu (1 + e) |v_n| / |v_t|): partly braked, or stopped when mu is large."""
     s, e, w = sign(up), 0.4, np.array([0.6, -0.8, -0.5 * sign(up)])
     for mu, a in ((0.0, 1.0), (0.3, 1 - 0.3 * 1.4 * 0.5), (2.0, 0.0)):
-        made = scene(1, on_ground=True, ground=(e, mu), up=up)
-        _, v = engine(made, np.array([[0, 0, s * 1e-4]]), w[None], no_hands(1))
+        body = scene(1, on_ground=True, ground=(e, mu), up=up)
+        _, v = engine(body, np.array([[0, 0, s * 1e-4]]), w[None], no_hands(1))
         np.testing.assert_allclose(v[1, 0], [a * w[0], a * w[1], -e * w[2]], atol=1e-15)
 
 
@@ -241,17 +241,17 @@ def test_sliding_and_sticking(engine: Engine, up: str) -> None:
 def test_the_ground_holds(engine: Engine, e: float, up: str) -> None:
     """From above nothing goes deeper than a node slower than APPROACH can travel in the substep in which it is let pass."""
     rng, s, dt = np.random.default_rng(2), sign(up), 1e-3
-    made = scene(40, on_ground=True, ground=(e, 0.2), gravity=G, up=up, frame_time=dt)
+    body = scene(40, on_ground=True, ground=(e, 0.2), gravity=G, up=up, frame_time=dt)
     x, v = rng.uniform(0, 0.02, (40, 3)), rng.uniform(-1, 1, (40, 3))
     x[:, 2] *= s
-    z = s * engine(made, x, v, no_hands(400))[0][:, :, 2]
+    z = s * engine(body, x, v, no_hands(400))[0][:, :, 2]
     assert (z < 1e-3).any()
     assert z.min() >= -APPROACH * dt - 1e-15
 
 
 def test_resting_weight_is_carried(engine: Engine) -> None:
     """A node lying on the ground with e = 0 stays there."""
-    made = scene(1, on_ground=True, ground=(0.0, 0.5), gravity=G)
-    x, v = engine(made, np.zeros((1, 3)), np.zeros((1, 3)), no_hands(50))
+    body = scene(1, on_ground=True, ground=(0.0, 0.5), gravity=G)
+    x, v = engine(body, np.zeros((1, 3)), np.zeros((1, 3)), no_hands(50))
     np.testing.assert_allclose(x, 0, atol=1e-15)
     np.testing.assert_allclose(v, 0, atol=1e-15)

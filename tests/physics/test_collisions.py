@@ -32,14 +32,14 @@ def clump(crowded: int, pairs: int) -> np.ndarray:
 
 def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") -> tuple[list[list[int]], int]:
     """Partner lists after `frames` frames that do not move anything, and the overflow reported."""
-    made = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
-    solver = solver_for(made, 0, device)
+    body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
+    solver = solver_for(body, 0, device)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
-    solver._views["partners"].fill_(-1)
+    solver.buffers.partners.fill_(-1)
     for _ in range(frames):
         after, _ = solver.forward(state, 0 * state, nobody, nobody)
         np.testing.assert_array_equal(after.cpu().numpy(), x)
-    partners, count = solver._views["partners"].numpy(), solver._views["count"].numpy()
+    partners, count = solver.buffers.partners.numpy(), solver.buffers.count.numpy()
     assert partners.shape == (len(x), capacity)
     assert (count <= capacity).all()
     # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
@@ -48,8 +48,8 @@ def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") ->
 
 
 def expected_lists(x: np.ndarray) -> list[list[int]]:
-    found = reference.candidates(x, DISTANCE)
-    return [found[found[:, 0] == i, 1].tolist() for i in range(len(x))]
+    pairs = reference.candidates(x, DISTANCE)
+    return [pairs[pairs[:, 0] == i, 1].tolist() for i in range(len(x))]
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -57,10 +57,10 @@ def expected_lists(x: np.ndarray) -> list[list[int]]:
 def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -> None:
     """Every list holds the first `capacity` partners in node order, whatever its neighbours' lists hold."""
     x = clump(7, 4)
-    found, overflow = lists(x, capacity, device=device)
+    partners, overflow = lists(x, capacity, device=device)
     wanted = expected_lists(x)
     assert sorted(len(row) for row in wanted) == [0] * 15 + [1] * 8 + [6] * 7
-    assert found == [row[:capacity] for row in wanted]
+    assert partners == [row[:capacity] for row in wanted]
     assert overflow == 7 * max(6 - capacity, 0)
 
 
@@ -75,8 +75,8 @@ def test_a_full_list_still_collides_with_its_partners() -> None:
     v = 100 * (x.round() - x)
     states = []
     for capacity in (1, 500):
-        made = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
-        solver = solver_for(made, 0)
+        body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
+        solver = solver_for(body, 0)
         nobody = torch.zeros(0, 3, dtype=torch.float64)
         states.append(solver.forward(torch.tensor(x), torch.tensor(v), nobody, nobody)[1].numpy())
     complete = np.array([len(row) == 1 for row in expected_lists(x)])
@@ -87,12 +87,12 @@ def test_a_full_list_still_collides_with_its_partners() -> None:
 
 def test_candidates_come_from_the_frame_start() -> None:
     """Pairs that come near within a frame are found in the next one (as released)."""
-    made = scene(2, self_collision=True, contact_distance=DISTANCE, substeps=10, frame_time=0.01)
+    body = scene(2, self_collision=True, contact_distance=DISTANCE, substeps=10, frame_time=0.01)
     x, v = np.array([[0.0, 0, 0], [0.021, 0, 0]]), np.array([[0.5, 0, 0], [-0.5, 0, 0]])
     for engine_frames in (1, 2):
-        _, speed = reference.rollout(made, x, v, no_hands(engine_frames))
+        _, speed = reference.rollout(body, x, v, no_hands(engine_frames))
         assert (speed[-1, 0, 0] < 0) == (engine_frames == 2)
-        solver = solver_for(made, 0)
+        solver = solver_for(body, 0)
         state, nobody = (torch.tensor(x), torch.tensor(v)), torch.zeros(0, 3, dtype=torch.float64)
         for _ in range(engine_frames):
             state = solver.forward(*state, nobody, nobody)
@@ -103,8 +103,8 @@ def test_candidates_come_from_the_frame_start() -> None:
 
 
 def crowded_twin(capacity: int) -> Twin:
-    made, x, _, hands = random_scene(41, nodes=12, self_collision=True, collision_capacity=capacity)
-    return twin_of(made, x, hands[0])
+    body, x, _, hands = random_scene(41, nodes=12, self_collision=True, collision_capacity=capacity)
+    return twin_of(body, x, hands[0])
 
 
 def test_a_rollout_reports_overflow() -> None:
@@ -120,10 +120,10 @@ def test_a_rollout_reports_overflow() -> None:
 
 def thrown(frames: int, when: int, speed: float) -> tuple[Twin, np.ndarray]:
     """A held node whose controller leaves the scene at frame `when`."""
-    made = scene(1, [(1, 0)], [0.1], stiffness=50.0, substeps=100, frame_time=0.1)
+    body = scene(1, [(1, 0)], [0.1], stiffness=50.0, substeps=100, frame_time=0.1)
     hands = np.tile([[[0.1, 0.0, 0.0]]], (frames, 1, 1)).astype(np.float32)
     hands[when:, 0, 0] = speed
-    return twin_of(made, np.zeros((1, 3)), hands[0]), hands
+    return twin_of(body, np.zeros((1, 3)), hands[0]), hands
 
 
 def test_a_diverged_rollout_is_a_named_result() -> None:
@@ -153,8 +153,8 @@ def test_a_saved_divergence_stays_one(tmp_path) -> None:
 
 
 def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
-    made, x, _, hands = random_scene(42)
-    twin, seen = twin_of(made, x, hands[0]), []
+    body, x, _, hands = random_scene(42)
+    twin, seen = twin_of(body, x, hands[0]), []
     result = rollout.roll_out(twin, hands, progress=seen.append)
     np.testing.assert_array_equal(result.positions[0], twin.topology.nodes)
     assert seen == [1, 2, 3]
@@ -165,8 +165,8 @@ def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
 
 
 def test_an_unstable_rollout_is_refused() -> None:
-    made, x, _, hands = random_scene(42)
-    twin = twin_of(replace(made, simulation=replace(made.simulation, frame_time=1.0, substeps=1)), x, hands[0])
+    body, x, _, hands = random_scene(42)
+    twin = twin_of(replace(body, simulation=replace(body.simulation, frame_time=1.0, substeps=1)), x, hands[0])
     with pytest.raises(InputError, match="substep must stay below"):
         rollout.roll_out(twin, hands)
 
@@ -181,7 +181,7 @@ def test_a_missing_device_is_named() -> None:
 
 
 def test_a_topology_without_springs_rolls_out() -> None:
-    made = scene(2, gravity=9.8, on_ground=True, substeps=10, frame_time=0.1)
+    body = scene(2, gravity=9.8, on_ground=True, substeps=10, frame_time=0.1)
     topology = Topology(
         nodes=np.array([[0, 0, 1.0], [0, 0, 2.0]]),
         controllers=np.zeros((1, 3)),
@@ -189,5 +189,5 @@ def test_a_topology_without_springs_rolls_out() -> None:
         rest_lengths=np.zeros(0),
         labels=np.zeros(2, np.int32),
     )
-    twin = Twin(topology=topology, material=twin_of(made, np.zeros((2, 3)), np.zeros((1, 3))).material, simulation=made.simulation)
+    twin = Twin(topology=topology, material=twin_of(body, np.zeros((2, 3)), np.zeros((1, 3))).material, simulation=body.simulation)
     assert len(rollout.roll_out(twin, np.zeros((3, 1, 3))).positions) == 3

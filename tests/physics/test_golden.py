@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neuspring.physics import reference, stability
-from neuspring.physics.autograd import pack, simulate_frame, twin_tensors
+from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.losses import acceleration
@@ -54,25 +54,14 @@ class Frame(NamedTuple):
 
 
 @cache
-def solver_for(name: str, device: str, dtype: torch.dtype, differentiable: bool) -> FrameSolver:
-    topology = clip(name).twin.topology
-    solver = FrameSolver(
-        topology.springs,
-        len(topology.nodes),
-        len(topology.controllers),
-        clip(name).twin.simulation,
-        device=device,
-        dtype=dtype,
-        differentiable=differentiable,
-    )
-    solver.set_parameters(pack(**twin_tensors(clip(name).twin, device, dtype), substep=clip(name).twin.simulation.substep))
-    return solver
+def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool) -> FrameSolver:
+    return solver_for(clip(name).twin, device, dtype, differentiable=differentiable)
 
 
 @cache
 def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, restart: bool) -> tuple[np.ndarray, np.ndarray]:
     """States x, v [F, N, 3] at frame ends; `restart` starts every frame from the record."""
-    c, solver = clip(name), solver_for(name, device, dtype, differentiable)
+    c, solver = clip(name), solver_of(name, device, dtype, differentiable)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -88,7 +77,7 @@ def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, re
 @cache
 def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool) -> list[Frame]:
     """Every frame as in the released first-order stage: state detached between frames, gradient of the frame's loss."""
-    c, solver, frames = clip(name), solver_for(name, device, dtype, True), []
+    c, solver, frames = clip(name), solver_of(name, device, dtype, True), []
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -105,7 +94,7 @@ def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool) 
         scalars = [values[scalar].requires_grad_() for scalar in CONTACT_SCALARS]
         parameters = pack(**values, substep=c.twin.simulation.substep)
         after, speed = simulate_frame(solver, parameters, x, v, hands[k - 1], hands[k])
-        near, moved = loss.terms(k, after)
+        near, moved = loss.terms(k, after).values()
         smooth = near.new_zeros(()) if change is None else c.weights.acceleration * acceleration(speed - v, change)
         total = near + moved + smooth
         total.backward()
@@ -150,8 +139,8 @@ def test_cloth_follows_the_record_frame_by_frame(dtype: torch.dtype, device: str
 @pytest.mark.parametrize("name", NAMES)
 def test_forward_only_equals_differentiable(name: str, device: str) -> None:
     """Two substep slots or all of them: the same numbers, bit for bit (on CUDA up to the order of atomic sums)."""
-    kept, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
-    for a, b in zip(kept, free, strict=True):
+    differentiable, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
+    for a, b in zip(differentiable, free, strict=True):
         if device == "cpu":
             np.testing.assert_array_equal(a, b)
         elif name in DRAWN:
@@ -171,8 +160,8 @@ def test_losses_and_gradients_of_the_quiet_cloth_frame(device: str) -> None:
     check_frames(clip(name), optimised_frames(name, device, torch.float32, True), range(QUIET_FRAME, QUIET_FRAME + 1))
 
 
-def check_frames(c: Clip, frames: list[Frame], chosen: range) -> None:
-    for k in chosen:
+def check_frames(c: Clip, frames: list[Frame], numbers: range) -> None:
+    for k in numbers:
         got, losses, gradient, collide = frames[k - 1], c.losses[k - 1], c.grad_log_stiffness[k - 1], c.grad_collide[k - 1]
         np.testing.assert_allclose(got.losses, losses, rtol=FRAME_LOSS, err_msg=f"losses of frame {k}")
         assert cosine(got.grad_log_stiffness, gradient) > COSINE, k

@@ -13,7 +13,7 @@ import warp as wp
 
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import start_warp
-from neuspring.physics import contact, integrate, reference, springs
+from neuspring.physics import collision, contact, position, reference, springs, velocity
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.solver import FrameSolver
 from tests.support.scenes import packed, random_scene, scene, solver_for, tensors, with_values
@@ -89,11 +89,11 @@ def test_spring_kernel(dashpot: float) -> None:
 
     def total(values: Arrays) -> float:
         force = vectors(np.zeros((4, 3)))
-        launch(force_kernel, 4, vectors(values["x"][None]), vectors(values["v"][None]), 0, index, vectors(columns(values)), force)
+        launch(force_kernel, 4, index, vectors(columns(values)), vectors(values["x"][None]), vectors(values["v"][None]), 0, force)
         return float((force.numpy() * weight).sum())
 
     adj_x, adj_v, adj_p = (vectors(np.zeros((4, 3))) for _ in range(3))
-    state = vectors(at["x"][None]), vectors(at["v"][None]), 0, index, vectors(columns(at))
+    state = index, vectors(columns(at)), vectors(at["x"][None]), vectors(at["v"][None]), 0
     launch(adjoint_kernel, 4, *state, vectors(weight), adj_x, adj_v, adj_p)
     p = adj_p.numpy()
     # The kernel leaves out the factor Y of the second column; d(1/l0) = -d(l0) / l0^2.
@@ -106,7 +106,7 @@ def test_spring_adjoint_accumulates() -> None:
     """Adjoints add to what is there: substeps share the buffers."""
     rng, pairs = np.random.default_rng(1), wp.array(np.array([[0, 1]], np.int32), dtype=wp.vec2i, device="cpu")
     start_warp()
-    state = vectors(rng.random((1, 2, 3))), vectors(rng.random((1, 2, 3))), 0, pairs, vectors(np.array([[2.0, 3.0, 0.5]]))
+    state = pairs, vectors(np.array([[2.0, 3.0, 0.5]])), vectors(rng.random((1, 2, 3))), vectors(rng.random((1, 2, 3))), 0
     weight, adjoints = vectors(rng.random((2, 3))), [vectors(np.zeros((n, 3))) for n in (2, 2, 1)]
     launch(springs.kernels(wp.float64)[1], 1, *state, weight, *adjoints)
     once = [a.numpy().copy() for a in adjoints]
@@ -118,29 +118,35 @@ def test_spring_adjoint_accumulates() -> None:
 def test_velocity_kernel() -> None:
     """v, force and the decay factor."""
     rng, dt, count = np.random.default_rng(2), 0.01, 5
-    terms, weight = integrate.kernels(wp.float64), rng.standard_normal((count, 3))
+    terms, weight = velocity.kernels(wp.float64), rng.standard_normal((count, 3))
     at = {"v": rng.standard_normal((count, 3)), "force": rng.standard_normal((count, 3)) * 50, "decay": np.array([0.93])}
 
     def after(values: Arrays) -> np.ndarray:
         result = vectors(np.zeros((1, count, 3)))
         force, gravity = vectors(values["force"]), VEC3(0.0, 0.0, -9.8)
-        launch(terms.velocity, count, vectors(values["v"][None]), 0, force, gravity, dt, reals(values["decay"]), result, 0)
+        launch(terms.velocity, count, gravity, dt, reals(values["decay"]), vectors(values["v"][None]), 0, force, result, 0)
         assert not force.numpy().any(), "the force is cleared for the next substep"
         return result.numpy()[0]
 
     adj_v, adj_force, adj_decay = vectors(np.zeros((count, 3))), vectors(np.zeros((count, 3))), reals(np.zeros(count))
-    state = vectors(after(at)[None]), 0, dt, reals(at["decay"]), vectors(weight)
+    state = dt, reals(at["decay"]), vectors(after(at)[None]), 0, vectors(weight)
     launch(terms.velocity_adjoint, count, *state, adj_v, adj_force, adj_decay)
     got = {"v": adj_v.numpy(), "force": adj_force.numpy(), "decay": adj_decay.numpy().sum(keepdims=True)}
     assert_gradients(got, differences(lambda values: float((after(values) * weight).sum()), at), KERNEL)
 
 
-def test_advance_kernel() -> None:
-    """x' = x + dt v', v' unchanged."""
+def test_position_kernel_without_ground() -> None:
+    """x' = x + dt v', v' unchanged, also for nodes below z = 0."""
     rng, dt = np.random.default_rng(3), 0.01
-    wx, wv = rng.standard_normal((2, 4, 3))
-    adj_x, adj_v = vectors(wx), vectors(wv)
-    launch(integrate.kernels(wp.float64).advance_adjoint, 4, adj_x, adj_v, dt)
+    wx, wv, x, v = rng.standard_normal((4, 4, 3))
+    after_x, after_v, response = vectors(np.stack([x, x])), vectors(np.stack([v, v])), reals([0.5, 0.3])
+    forward, adjoint = position.kernels(wp.float64)
+    launch(forward, 4, dt, 0.0, response, vectors(v[None]), 0, 0, 1, after_x, after_v)
+    np.testing.assert_allclose(after_x.numpy()[1], x + dt * v)
+    np.testing.assert_array_equal(after_v.numpy()[1], v)
+    adj_x, adj_v, scalars = vectors(wx), vectors(wv), (reals(np.zeros(4)), reals(np.zeros(4)))
+    launch(adjoint, 4, dt, 0.0, response, vectors(x[None]), 0, vectors(v[None]), adj_x, adj_v, *scalars)
+    assert not any(scalar.numpy().any() for scalar in scalars)
     np.testing.assert_allclose(adj_x.numpy(), wx)
     np.testing.assert_allclose(adj_v.numpy(), wv + dt * wx)
 
@@ -160,22 +166,22 @@ GROUND_CASES = {
 @pytest.mark.parametrize("case", GROUND_CASES)
 def test_ground_kernel(case: str, up: float) -> None:
     """x, v, elasticity and friction, in contact and out, sliding and sticking."""
-    position, speed, friction = GROUND_CASES[case]
-    rng, dt, hits = np.random.default_rng(4), 0.01, contact.kernels(wp.float64)
+    place, speed, friction = GROUND_CASES[case]
+    rng, dt, (forward, adjoint) = np.random.default_rng(4), 0.01, position.kernels(wp.float64)
     flip = np.array([1.0, 1.0, up])
     weight_x, weight_v = rng.standard_normal((2, 1, 3))
-    at = {"x": (np.array(position) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
+    at = {"x": (np.array(place) * flip)[None], "v": (np.array(speed) * flip)[None], "e": np.array(0.6), "mu": np.array(friction)}
 
     def total(values: Arrays) -> float:
         x, v = vectors(np.stack([values["x"]] * 2)), vectors(np.zeros((2, 1, 3)))
         response = reals([values["e"], values["mu"]])
-        launch(hits.ground, 1, x, v, 0, 1, vectors(values["v"][None]), 0, dt, up, response)
+        launch(forward, 1, dt, up, response, vectors(values["v"][None]), 0, 0, 1, x, v)
         return float((x.numpy()[1] * weight_x + v.numpy()[1] * weight_v).sum())
 
     adj_x, adj_v, adj_e, adj_mu = vectors(weight_x), vectors(weight_v), reals(0.0), reals(0.0)
     response = reals([at["e"], at["mu"]])
     adjoints = adj_x, adj_v, adj_e, adj_mu
-    launch(hits.ground_adjoint, 1, vectors(at["x"][None]), 0, vectors(at["v"][None]), dt, up, response, *adjoints)
+    launch(adjoint, 1, dt, up, response, vectors(at["x"][None]), 0, vectors(at["v"][None]), *adjoints)
     got = {"x": adj_x.numpy(), "v": adj_v.numpy(), "e": adj_e.numpy()[0], "mu": adj_mu.numpy()[0]}
     wanted = differences(total, at)
     if case == "falling straight":
@@ -202,7 +208,7 @@ def crowd(friction: float) -> tuple[Arrays, np.ndarray, np.ndarray]:
 def test_collision_kernel(friction: float) -> None:
     """x, v, elasticity and friction for Jacobi impulses of nodes with several partners each."""
     at, partners, count = crowd(friction)
-    distance, hits = 0.02, contact.kernels(wp.float64)
+    distance, hits = 0.02, collision.kernels(wp.float64)
     weight = np.random.default_rng(12).standard_normal((6, 3))
     start_warp()
     lists = wp.array(partners, dtype=int, device="cpu"), wp.array(count, dtype=int, device="cpu")
@@ -210,12 +216,12 @@ def test_collision_kernel(friction: float) -> None:
     def total(values: Arrays) -> float:
         after = vectors(np.zeros((1, 6, 3)))
         state = vectors(values["x"][None]), 0, vectors(values["v"][None]), 0
-        launch(hits.collide, 6, *state, reals(distance), reals([values["e"], values["mu"]]), *lists, after)
+        launch(hits.collide, 6, reals(distance), reals([values["e"], values["mu"]]), *lists, *state, after)
         return float((after.numpy()[0] * weight).sum())
 
     adj_v, adj_x, adj_e, adj_mu = vectors(np.zeros((6, 3))), vectors(np.zeros((6, 3))), reals(np.zeros(6)), reals(np.zeros(6))
-    state = vectors(at["x"][None]), 0, vectors(at["v"][None]), reals(distance), reals([at["e"], at["mu"]])
-    launch(hits.collide_adjoint, 6, *state, *lists, vectors(weight), adj_v, adj_x, adj_e, adj_mu)
+    model, state = (reals(distance), reals([at["e"], at["mu"]]), *lists), (vectors(at["x"][None]), 0, vectors(at["v"][None]))
+    launch(hits.collide_adjoint, 6, *model, *state, vectors(weight), adj_v, adj_x, adj_e, adj_mu)
     got = {"x": adj_x.numpy(), "v": adj_v.numpy(), "e": adj_e.numpy().sum(), "mu": adj_mu.numpy().sum()}
     # Lengths here are 0.01 m, so third derivatives in x are 1e4 times those of the other kernels: a smaller step.
     assert_gradients(got, differences(total, at, x=1e-7), KERNEL)
@@ -252,19 +258,19 @@ def lively(variant: str) -> tuple[reference.Scene, np.ndarray, np.ndarray, np.nd
 
     The seed is one for which no contact decision lies so near its threshold that a step of the differences flips it.
     """
-    made, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, **VARIANTS[variant])
-    return made, x, v, hands
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, **VARIANTS[variant])
+    return body, x, v, hands
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_gradcheck_of_a_frame(variant: str) -> None:
     """torch.autograd.gradcheck over pack and simulate_frame: every physical parameter and the initial state."""
-    made, x, v, hands = lively(variant)
-    solver, values = solver_for(made, hands.shape[1]), tensors(made)
+    body, x, v, hands = lively(variant)
+    solver, values = solver_for(body, hands.shape[1]), tensors(body)
     begin, end = torch.tensor(hands[0]), torch.tensor(hands[1])
 
     def run(x: torch.Tensor, v: torch.Tensor, *learned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        parameters = pack(**(values | dict(zip(LEARNED, learned, strict=True))), substep=made.simulation.substep)
+        parameters = pack(**(values | dict(zip(LEARNED, learned, strict=True))), substep=body.simulation.substep)
         return simulate_frame(solver, parameters, x, v, begin, end)
 
     inputs = [torch.tensor(x), torch.tensor(v), *(values[name] for name in LEARNED)]
@@ -275,9 +281,9 @@ def test_gradcheck_of_a_frame(variant: str) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_lively_scenes_touch_what_they_should(variant: str) -> None:
-    made, x, v, hands = lively(variant)
-    gradient = loss_gradient(made, x, v, hands[:2], weights(2, 6))
-    for name, on in (("ground", made.simulation.ground), ("contact", made.simulation.self_collision)):
+    body, x, v, hands = lively(variant)
+    gradient = loss_gradient(body, x, v, hands[:2], weights(2, 6))
+    for name, on in (("ground", body.simulation.ground), ("contact", body.simulation.self_collision)):
         assert bool(gradient[f"{name}_elasticity"].any()) == on
         assert bool(gradient[f"{name}_friction"].any()) == on
 
@@ -287,12 +293,12 @@ def weights(frames: int, nodes: int) -> np.ndarray:
     return np.random.default_rng(7).standard_normal((2, frames, nodes, 3))
 
 
-def loss_gradient(made: reference.Scene, x: np.ndarray, v: np.ndarray, hands: np.ndarray, weight: np.ndarray) -> Arrays:
+def loss_gradient(body: reference.Scene, x: np.ndarray, v: np.ndarray, hands: np.ndarray, weight: np.ndarray) -> Arrays:
     """Gradient of sum(weight * (x, v) at frame ends) through all frames, by simulate_frame; frame 0 has no weight."""
-    solver, motion = solver_for(made, hands.shape[1]), torch.tensor(hands)
-    values = {name: value.requires_grad_() for name, value in tensors(made).items()}
+    solver, motion = solver_for(body, hands.shape[1]), torch.tensor(hands)
+    values = {name: value.requires_grad_() for name, value in tensors(body).items()}
     start = torch.tensor(x).requires_grad_(), torch.tensor(v).requires_grad_()
-    parameters = pack(**values, substep=made.simulation.substep)
+    parameters = pack(**values, substep=body.simulation.substep)
     state, total = start, torch.zeros((), dtype=torch.float64)
     for k in range(1, len(hands)):
         state = simulate_frame(solver, parameters, *state, motion[k - 1], motion[k])
@@ -305,29 +311,29 @@ def loss_gradient(made: reference.Scene, x: np.ndarray, v: np.ndarray, hands: np
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_three_frames_match_differences_of_the_reference(variant: str) -> None:
     """The adjoint over three frames against central differences of the NumPy specification: no code in common."""
-    made, x, v, hands = lively(variant)
+    body, x, v, hands = lively(variant)
     weight = weights(4, 6)
     weight[:, 0] = 0.0
-    got = loss_gradient(made, x, v, hands, weight)
+    got = loss_gradient(body, x, v, hands, weight)
 
     def total(values: Arrays) -> float:
-        state = reference.rollout(with_values(made, values), values["x"], values["v"], hands)
+        state = reference.rollout(with_values(body, values), values["x"], values["v"], hands)
         return float((weight * np.stack(state)).sum())
 
-    at = {name: tensors(made)[name].numpy() for name in LEARNED} | {"x": x, "v": v}
+    at = {name: tensors(body)[name].numpy() for name in LEARNED} | {"x": x, "v": v}
     assert_gradients(got, differences(total, at, x=1e-7), FRAMES)
 
 
 def test_recomputed_frames_equal_the_chain_of_single_frames() -> None:
     """Backward runs when later frames have overwritten the buffers; the same chain with one solver per frame must agree."""
-    made, x, v, hands = random_scene(23, self_collision=True, frames=3)
-    weight = weights(4, made.nodes)
-    got = loss_gradient(made, x, v, hands, weight)
-    motion, solvers = torch.tensor(hands), [solver_for(made, hands.shape[1]) for _ in range(3)]
+    body, x, v, hands = random_scene(23, self_collision=True, frames=3)
+    weight = weights(4, body.nodes)
+    got = loss_gradient(body, x, v, hands, weight)
+    motion, solvers = torch.tensor(hands), [solver_for(body, hands.shape[1]) for _ in range(3)]
     state = torch.tensor(x), torch.tensor(v)
     for k, solver in enumerate(solvers):
         state = solver.forward(*state, motion[k], motion[k + 1])
-    adj_x, adj_v, springs_ = torch.zeros(made.nodes, 3).double(), torch.zeros(made.nodes, 3).double(), 0.0
+    adj_x, adj_v, springs_ = torch.zeros(body.nodes, 3).double(), torch.zeros(body.nodes, 3).double(), 0.0
     for k in (3, 2, 1):
         adj = solvers[k - 1].backward(adj_x + torch.tensor(weight[0, k]), adj_v + torch.tensor(weight[1, k]))
         adj_x, adj_v, springs_ = adj[0], adj[1], springs_ + adj[2]
@@ -337,11 +343,11 @@ def test_recomputed_frames_equal_the_chain_of_single_frames() -> None:
 
 def test_a_second_backward_gives_the_same() -> None:
     """retain_graph: the stored substeps survive a backward pass, and a recomputation."""
-    made, x, v, hands = random_scene(24, self_collision=True, frames=2)
-    solver, motion = solver_for(made, hands.shape[1]), torch.tensor(hands)
+    body, x, v, hands = random_scene(24, self_collision=True, frames=2)
+    solver, motion = solver_for(body, hands.shape[1]), torch.tensor(hands)
     start = torch.tensor(x).requires_grad_()
-    first = simulate_frame(solver, packed(made), start, torch.tensor(v), motion[0], motion[1])
-    second = simulate_frame(solver, packed(made), *first, motion[1], motion[2])
+    first = simulate_frame(solver, packed(body), start, torch.tensor(v), motion[0], motion[1])
+    second = simulate_frame(solver, packed(body), *first, motion[1], motion[2])
     grads = [torch.autograd.grad(second[0].sum(), start, retain_graph=True)[0] for _ in range(3)]
     for gradient in grads[1:]:
         torch.testing.assert_close(gradient, grads[0], rtol=EXACT, atol=0)
@@ -349,13 +355,13 @@ def test_a_second_backward_gives_the_same() -> None:
 
 def test_backward_uses_the_parameters_of_its_own_frame() -> None:
     """Two frames with different parameters through one solver."""
-    made, x, v, hands = random_scene(25, frames=1)
-    soft, motion = tensors(made), torch.tensor(hands)
+    body, x, v, hands = random_scene(25, frames=1)
+    soft, motion = tensors(body), torch.tensor(hands)
     stiffness = [soft["stiffness"].clone().requires_grad_(), (3 * soft["stiffness"]).requires_grad_()]
-    shared, alone = solver_for(made, hands.shape[1]), [solver_for(made, hands.shape[1]) for _ in range(2)]
+    shared, alone = solver_for(body, hands.shape[1]), [solver_for(body, hands.shape[1]) for _ in range(2)]
 
     def run(solver: FrameSolver, values: torch.Tensor) -> torch.Tensor:
-        parameters = pack(**(soft | {"stiffness": values}), substep=made.simulation.substep)
+        parameters = pack(**(soft | {"stiffness": values}), substep=body.simulation.substep)
         return simulate_frame(solver, parameters, torch.tensor(x), torch.tensor(v), motion[0], motion[1])[0].square().sum()
 
     together = torch.autograd.grad(sum(run(shared, s) for s in stiffness), stiffness)
@@ -369,34 +375,34 @@ def test_backward_uses_the_parameters_of_its_own_frame() -> None:
 ])  # fmt: skip
 def test_no_gradient_beyond_the_clamps(name: str, value: float) -> None:
     """Contact scalars may drift out of their range (released quirk 5): used at the bound, gradient zero."""
-    made, x, v, hands = lively("self-collision")
-    moved = with_values(made, {name: value})
+    body, x, v, hands = lively("self-collision")
+    moved = with_values(body, {name: value})
     assert loss_gradient(moved, x, v, hands, weights(4, 6))[name] == 0.0
     low, high = (0.0, 1.0) if name.endswith("elasticity") else (0.0, 2.0)
-    bound = with_values(made, {name: low if value < low else high})
-    for got, wanted in zip(packed(moved).tensors(), packed(bound).tensors(), strict=True):
+    bound = with_values(body, {name: low if value < low else high})
+    for got, wanted in zip(packed(moved), packed(bound), strict=True):
         assert torch.equal(got, wanted)
 
 
 def test_contact_distance_only_selects() -> None:
     """It has no gradient, and says so by None rather than by a zero that looks computed."""
-    made, x, v, hands = lively("self-collision")
-    values = {name: value.requires_grad_() for name, value in tensors(made).items()}
-    motion, parameters = torch.tensor(hands), pack(**values, substep=made.simulation.substep)
-    after, _ = simulate_frame(solver_for(made, 2), parameters, torch.tensor(x), torch.tensor(v), motion[0], motion[1])
+    body, x, v, hands = lively("self-collision")
+    values = {name: value.requires_grad_() for name, value in tensors(body).items()}
+    motion, parameters = torch.tensor(hands), pack(**values, substep=body.simulation.substep)
+    after, _ = simulate_frame(solver_for(body, 2), parameters, torch.tensor(x), torch.tensor(v), motion[0], motion[1])
     after.sum().backward()
     assert values["contact_distance"].grad is None
 
 
 def test_one_spring_by_hand() -> None:
     """One substep of one spring between a controller and a node: v' = dt Y (l / l0 - 1), so dv'/dY = dt (l / l0 - 1)."""
-    made = scene(1, [(1, 0)], [0.5], stiffness=7.0, substeps=1, frame_time=0.01)
-    assert isinstance(made.simulation, Simulation)
+    body = scene(1, [(1, 0)], [0.5], stiffness=7.0, substeps=1, frame_time=0.01)
+    assert isinstance(body.simulation, Simulation)
     stiffness = torch.tensor([7.0], dtype=torch.float64, requires_grad=True)
-    values = tensors(replace(made)) | {"stiffness": stiffness}
+    values = tensors(replace(body)) | {"stiffness": stiffness}
     hand = torch.tensor([[0.6, 0.0, 0.0]], dtype=torch.float64)
     zero = torch.zeros(1, 3, dtype=torch.float64)
-    _, v = simulate_frame(solver_for(made, 1), pack(**values, substep=0.01), zero, zero, hand, hand)
+    _, v = simulate_frame(solver_for(body, 1), pack(**values, substep=0.01), zero, zero, hand, hand)
     v[0, 0].backward()
     assert float(v[0, 0].detach()) == pytest.approx(0.01 * 7.0 * 0.2)
     assert stiffness.grad is not None

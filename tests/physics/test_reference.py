@@ -33,59 +33,59 @@ VARIANTS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_solver_equals_reference(variant: str, seed: int, device: str) -> None:
-    made = random_scene(seed, **VARIANTS[variant])
-    expected = reference.rollout(*made)
+    body = random_scene(seed, **VARIANTS[variant])
+    expected = reference.rollout(*body)
     for differentiable in (False, True):
-        for got, wanted in zip(warp(*made, device, differentiable=differentiable), expected, strict=True):
+        for got, wanted in zip(warp(*body, device, differentiable=differentiable), expected, strict=True):
             np.testing.assert_allclose(got, wanted, atol=SAME, rtol=0)
 
 
 def test_the_random_scenes_do_touch_the_ground_and_themselves() -> None:
     """Otherwise the comparison above would prove less than it says."""
     for seed in range(3):
-        made = random_scene(seed, self_collision=True)
+        body = random_scene(seed, self_collision=True)
         apart = random_scene(seed, self_collision=False)
         flying = random_scene(seed, self_collision=True, on_ground=False)
-        x = reference.rollout(*made)[0]
+        x = reference.rollout(*body)[0]
         assert np.abs(x - reference.rollout(*apart)[0]).max() > 1e-4
         assert np.abs(x - reference.rollout(*flying)[0]).max() > 1e-4
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_single_precision_is_close(seed: int) -> None:
-    made = random_scene(seed)
-    x, _ = warp(*made, dtype=torch.float32)
-    assert np.abs(x - reference.rollout(*made)[0]).max() < SINGLE
+    body = random_scene(seed)
+    x, _ = warp(*body, dtype=torch.float32)
+    assert np.abs(x - reference.rollout(*body)[0]).max() < SINGLE
 
 
 @pytest.mark.parametrize("variant", ["ground", "all"])
 def test_node_order_does_not_matter(variant: str) -> None:
     """Renaming nodes renames the result: nothing depends on the order of storage."""
-    made, x, v, hands = random_scene(3, **VARIANTS[variant])
-    order = np.random.default_rng(0).permutation(made.nodes)
-    renamed = np.concatenate([np.argsort(order), made.nodes + np.arange(hands.shape[1])])
+    body, x, v, hands = random_scene(3, **VARIANTS[variant])
+    order = np.random.default_rng(0).permutation(body.nodes)
+    renamed = np.concatenate([np.argsort(order), body.nodes + np.arange(hands.shape[1])])
     shuffled = scene(
-        made.nodes,
-        renamed[made.springs],
-        made.rest_lengths,
-        stiffness=made.stiffness,
-        dashpot=made.dashpot,
-        drag=made.drag,
-        contact_distance=made.contact_distance,
-        frame_time=made.simulation.frame_time,
+        body.nodes,
+        renamed[body.springs],
+        body.rest_lengths,
+        stiffness=body.stiffness,
+        dashpot=body.dashpot,
+        drag=body.drag,
+        contact_distance=body.contact_distance,
+        frame_time=body.simulation.frame_time,
     )
-    shuffled = replace(shuffled, simulation=made.simulation)
-    plain, moved = warp(made, x, v, hands)[0], warp(shuffled, x[order], v[order], hands)[0]
+    shuffled = replace(shuffled, simulation=body.simulation)
+    plain, moved = warp(body, x, v, hands)[0], warp(shuffled, x[order], v[order], hands)[0]
     np.testing.assert_allclose(moved, plain[:, order], atol=SAME, rtol=0)
 
 
 def test_upside_down_is_a_mirror_image() -> None:
     """z -> -z with `up` reversed gives the mirrored motion, exactly: negation does not round."""
-    made, x, v, hands = random_scene(4, self_collision=True)
-    below = replace(made, simulation=replace(made.simulation, up="-z"))
+    body, x, v, hands = random_scene(4, self_collision=True)
+    below = replace(body, simulation=replace(body.simulation, up="-z"))
     flip = np.array([1.0, 1.0, -1.0])
     for engine in (reference.rollout, warp):
-        for up, down in zip(engine(made, x, v, hands), engine(below, x * flip, v * flip, hands * flip), strict=True):
+        for up, down in zip(engine(body, x, v, hands), engine(below, x * flip, v * flip, hands * flip), strict=True):
             np.testing.assert_array_equal(up * flip, down)
 
 

@@ -37,9 +37,9 @@ def test_the_bound_is_sharp_for_an_oscillator(stiffness: float, dashpot: float) 
     start = 1e-9
     reached = []
     for factor in (1 - MARGIN, 1 + MARGIN):
-        made = held_node(factor * largest, stiffness, dashpot)
+        body = held_node(factor * largest, stiffness, dashpot)
         hands = np.tile([[[LENGTH, 0.0, 0.0]]], (401, 1, 1))
-        x, _ = reference.rollout(made, np.array([[start, 0.0, 0.0]]), np.array([[start / largest, 0.0, 0.0]]), hands)
+        x, _ = reference.rollout(body, np.array([[start, 0.0, 0.0]]), np.array([[start / largest, 0.0, 0.0]]), hands)
         reached.append(np.abs(x[:, 0, 0]).max() / start)
     assert reached[0] < GROWTH
     assert reached[1] > GROWTH
@@ -67,8 +67,8 @@ def matrices(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_twin(seed: int, **simulation: object) -> Twin:
-    made, x, _, hands = random_scene(seed, nodes=15, **simulation)
-    return twin_of(made, x, hands[0])
+    body, x, _, hands = random_scene(seed, nodes=15, **simulation)
+    return twin_of(body, x, hands[0])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -76,10 +76,10 @@ def test_spectrum_of_a_net(seed: int) -> None:
     """Lanczos finds the eigenvalues of the dense matrices, from below; Gershgorin bounds them from above."""
     twin = random_twin(seed)
     k, c = (np.linalg.eigvalsh(matrix)[-1] for matrix in matrices(twin))
-    found, t = stability.twin_spectrum(twin), twin.topology
+    spectrum, t = stability.twin_spectrum(twin), twin.topology
     stiffness = twin.material.stiffness / t.rest_lengths
     bound = stability.gershgorin(t.springs, len(t.nodes), stiffness, twin.material.dashpot)
-    for value, exact, above in ((found.stiffness, k, bound.stiffness), (found.damping, c, bound.damping)):
+    for value, exact, above in ((spectrum.stiffness, k, bound.stiffness), (spectrum.damping, c, bound.damping)):
         assert exact * (1 - LANCZOS) <= value <= exact * (1 + 1e-9)
         assert above >= exact
 
@@ -87,8 +87,8 @@ def test_spectrum_of_a_net(seed: int) -> None:
 def test_gershgorin_names_the_loaded_node() -> None:
     """A star: node 2 holds all springs."""
     springs = np.array([[2, 0], [2, 1], [2, 3], [4, 2]])
-    found = stability.gershgorin(springs, 4, np.full(4, 10.0), np.full(4, 1.0))
-    assert (found.stiffness, found.damping, found.node) == (2 * 3 * 10.0 + 10.0, 7.0, 2)
+    spectrum = stability.gershgorin(springs, 4, np.full(4, 10.0), np.full(4, 1.0))
+    assert (spectrum.stiffness, spectrum.damping, spectrum.node) == (2 * 3 * 10.0 + 10.0, 7.0, 2)
 
 
 def test_no_springs_are_always_stable() -> None:
@@ -112,9 +112,9 @@ def test_check_names_node_bound_and_remedy(seed: int) -> None:
     assert "received 0.25 s (2 substeps per frame)" in message
     assert "substeps: auto" in message
     # The remedy works, and it is the smallest that does.
-    found = re.search(r"at least (\d+) substeps", message)
-    assert found
-    needed = int(found[1])
+    match = re.search(r"at least (\d+) substeps", message)
+    assert match
+    needed = int(match[1])
     stability.check(with_substeps(twin, needed))
     refused(with_substeps(twin, needed - 1))
 
@@ -122,9 +122,9 @@ def test_check_names_node_bound_and_remedy(seed: int) -> None:
 def test_the_remedy_works_on_the_bound() -> None:
     """dt = 1 s is exactly on the bound of lambda = 4 / s^2; the check refuses it, so the remedy must ask for more."""
     twin = twin_of(held_node(1.0, 4.0 * LENGTH, 0.0), np.zeros((1, 3)), np.array([[LENGTH, 0.0, 0.0]]))
-    found = re.search(r"at least (\d+) substeps", refused(twin))
-    assert found
-    stability.check(with_substeps(twin, int(found[1])))
+    match = re.search(r"at least (\d+) substeps", refused(twin))
+    assert match
+    stability.check(with_substeps(twin, int(match[1])))
 
 
 def with_substeps(twin: Twin, count: int) -> Twin:

@@ -144,7 +144,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
     ends = np.concatenate([x, start])[springs]
     rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) * rng.uniform(0.8, 1.2, len(springs))
     options: dict[str, Any] = {"frame_time": 0.02, "substeps": 20, "gravity": 9.8, "on_ground": True} | simulation
-    made = scene(
+    body = scene(
         nodes,
         springs,
         rest,
@@ -156,7 +156,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
         contact_distance=0.035,
         **options,
     )
-    return made, x, v, hands
+    return body, x, v, hands
 
 
 def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:

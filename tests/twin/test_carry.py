@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.physics.autograd import solver_for
 from neuspring.twin import carry
 from neuspring.twin.carry import carry_over
-from neuspring.twin.rollout import frames, roll_out, solver_for
+from neuspring.twin.rollout import frames, roll_out
 from tests.support import small
 
 FRAMES = 30
@@ -56,15 +57,15 @@ def test_the_future_is_not_read():
     visible[end:] ^= True
     valid[end - 1 :] ^= True
     blind = replace(seen, object_points=points, object_visibility=visible, object_motion_valid=valid, tracks=seen.tracks + 1.0)
-    found, facts = carry_over(trajectory, twin, blind, velocity)
+    result, facts = carry_over(trajectory, twin, blind, velocity)
     expected, expected_facts = carry_over(trajectory, twin, seen, velocity)
-    np.testing.assert_array_equal(found.positions, expected.positions)
+    np.testing.assert_array_equal(result.positions, expected.positions)
     assert facts == expected_facts
 
 
 def test_a_rollout_goes_on_from_a_state_as_if_it_had_not_stopped():
     trajectory, twin, seen, velocity = kicked()
-    solver, hands = solver_for(twin, "cpu"), torch.tensor(seen.controller_points)
+    solver, hands = solver_for(twin, differentiable=False), torch.tensor(seen.controller_points)
     states = {frame: (x, v) for frame, x, v in frames(twin, solver, hands, velocity)}
     x, v = (values.numpy() for values in states[9])
     later = [x.numpy() for _, x, _ in frames(twin, solver, hands[9:], v, positions=x)]
@@ -78,10 +79,10 @@ def test_hidden_points_do_not_speak():
     visible[last, ::2] = False
     lost = points.copy()
     lost[last, ::2] += 1.0
-    found = [
+    results = [
         carry_over(trajectory, twin, replace(seen, object_visibility=visible, object_points=p), velocity)[0] for p in (points, lost)
     ]
-    np.testing.assert_array_equal(found[0].positions, found[1].positions)
+    np.testing.assert_array_equal(results[0].positions, results[1].positions)
 
 
 def test_a_continuation_that_diverges_is_not_used(monkeypatch):

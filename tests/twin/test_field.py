@@ -25,7 +25,7 @@ def points(count: int = 30, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, (count, 3)) * [0.3, 0.1, 0.2] + [5, -3, 1]
 
 
-def made(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **settings) -> SpringField:
+def field_of(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **settings) -> SpringField:
     """A small field in float64."""
     return SpringField(points() if at is None else at, config.SpringField(**(SMALL | settings)), outputs, seed).double()
 
@@ -44,7 +44,7 @@ def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"triplane": False}, {"fourier": "none"}, {"resolution": 256}])
 def test_the_field_is_zero_at_the_start_and_can_leave_it(settings):
-    field = made(**settings)
+    field = field_of(**settings)
     assert not field().any()
     train(field, torch.ones(30, 2))
     assert field().abs().min() > 0
@@ -57,16 +57,16 @@ def test_stiffness_is_bitwise_that_of_the_twin_at_the_start(scale, output_bound)
     twin = small.scene().truth  # stiffness from 6e3 to 2.4e4 N
     limits = (7e3, 2e4)
     settings = config.Fit(stiffness_range=limits, output_bound=output_bound, field=config.SpringField(scale=scale))
-    found = TwinParameters(twin, settings, "field", "cpu").physical()["stiffness"].detach().numpy()
-    np.testing.assert_array_equal(found, np.clip(twin.material.stiffness, *limits))
-    assert (found != twin.material.stiffness).any()
+    stiffness = TwinParameters(twin, settings, "field", "cpu").physical()["stiffness"].detach().numpy()
+    np.testing.assert_array_equal(stiffness, np.clip(twin.material.stiffness, *limits))
+    assert (stiffness != twin.material.stiffness).any()
 
 
 def test_weights_follow_the_seed_alone():
     torch.manual_seed(1)
-    first = made(seed=3).state_dict()
+    first = field_of(seed=3).state_dict()
     torch.manual_seed(2)
-    again, other = made(seed=3).state_dict(), made(seed=4).state_dict()
+    again, other = field_of(seed=3).state_dict(), field_of(seed=4).state_dict()
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["planes.texels"], other["planes.texels"])
     assert not torch.equal(first["layers.0.weight"], other["layers.0.weight"])
@@ -82,8 +82,8 @@ def test_the_adaptive_resolution_follows_the_number_of_springs(springs, resoluti
 
 
 def test_the_resolution_is_adaptive_or_fixed():
-    assert made(points(50)).resolution == 6
-    fixed = made(points(50), resolution=256)
+    assert field_of(points(50)).resolution == 6
+    fixed = field_of(points(50), resolution=256)
     assert fixed.resolution == 256
     assert fixed.planes is not None
     # Of 3 x 256 x 256 texels only those that some midpoint reads can change.
@@ -101,7 +101,7 @@ def test_the_network_has_three_layers_of_the_paper_s_width():
 @pytest.mark.parametrize("option", FOURIER)
 def test_every_fourier_option_has_its_width_and_trains(option):
     width = {"feature": 3 * 4, "coordinates": 3 + 3 * 4, "both": 3 * 4 + 3 * 4, "none": 3}[option]
-    field = made(fourier=option)
+    field = field_of(fourier=option)
     assert field.encoded().shape == (30, width)
     assert field.layers[0].in_features == width
     before = field.planes.texels.detach().clone()
@@ -128,23 +128,23 @@ def test_midpoints_lie_between_nodes_and_controllers():
 def test_the_bounding_cube_has_the_longest_side_and_one_scale_for_all_axes():
     corners = np.array([[0.0, 0, 0], [4, 1, 2], [1, 0.5, 0]])
     np.testing.assert_allclose(in_cube(corners), [[-1, -0.25, -0.5], [1, 0.25, 0.5], [-0.5, 0, -0.5]], atol=EXACT)
-    assert not in_cube(np.ones((3, 3))).any(), "a single place is the centre"
+    assert not in_cube(np.ones((3, 3))).any(), "a single place is the center"
 
 
 @pytest.mark.parametrize("factor", [1000.0, 39.37])
 def test_units_and_place_do_not_matter(factor):
-    """Midpoints in metres, millimetres or inches, here or elsewhere: the same coordinates, texels and features."""
-    metres, other = made(), made(points() * factor + 7)
-    torch.testing.assert_close(other.coordinates, metres.coordinates)
-    assert torch.equal(other.planes.indices, metres.planes.indices)
+    """Midpoints in meters, millimeters or inches, here or elsewhere: the same coordinates, texels and features."""
+    meters, other = field_of(), field_of(points() * factor + 7)
+    torch.testing.assert_close(other.coordinates, meters.coordinates)
+    assert torch.equal(other.planes.indices, meters.planes.indices)
     # Coordinates pass through float32 when the field is made.
-    torch.testing.assert_close(other.encoded(), metres.encoded(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(other.encoded(), meters.encoded(), rtol=0, atol=1e-5)
 
 
 def test_permuting_springs_permutes_the_field_and_changes_nothing_else():
     order = np.random.default_rng(1).permutation(30)
     target = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
-    first, second = made(), made(points()[order])
+    first, second = field_of(), field_of(points()[order])
     train(first, target)
     train(second, target[order])
     assert first().std() > 1e-3
@@ -154,13 +154,13 @@ def test_permuting_springs_permutes_the_field_and_changes_nothing_else():
 
 
 def test_without_planes_only_coordinates_count():
-    field = made(triplane=False)
+    field = field_of(triplane=False)
     assert field.planes is None
     torch.testing.assert_close(field.encoded(), fourier(field.coordinates, 2), rtol=0, atol=0)
     assert {name.partition(".")[0] for name, _ in field.named_parameters()} == {"layers"}
     assert field.roughness() == 0
     # Springs at the same place have the same F.
-    twice = made(np.concatenate([points(), points()]), triplane=False)
+    twice = field_of(np.concatenate([points(), points()]), triplane=False)
     train(twice, torch.randn(60, 2, generator=torch.Generator().manual_seed(0)))
     torch.testing.assert_close(twice()[30:], twice()[:30], rtol=0, atol=EXACT)
 
@@ -171,13 +171,13 @@ def test_without_planes_only_coordinates_count():
 def test_the_bilinear_lookup_by_hand():
     """N = 3: texels at -1, 0, 1. The point (0.5, -1, 0.2) lies on column 1.5 and row 0 of xy, and so on."""
     cells, weights = bilinear(np.array([[0.5, -1.0, 0.2]]), 3)
-    found = dict.fromkeys(range(27), 0.0)
+    texels = dict.fromkeys(range(27), 0.0)
     for cell, weight in zip(cells[0], weights[0], strict=True):
-        found[int(cell)] += weight
+        texels[int(cell)] += weight
     xy = {1: 0.5, 2: 0.5}  # row 0 (y = -1), columns 1 and 2
     yz = {9 + 3: 0.8, 9 + 6: 0.2}  # rows 1 and 2 (z = 0.2), column 0
     xz = {18 + 4: 0.4, 18 + 5: 0.4, 18 + 7: 0.1, 18 + 8: 0.1}
-    assert {cell: weight for cell, weight in found.items() if weight} == pytest.approx(xy | yz | xz)
+    assert {cell: weight for cell, weight in texels.items() if weight} == pytest.approx(xy | yz | xz)
 
 
 def dense(at: np.ndarray, resolution: int, channels: int, scale: float) -> tuple[TriPlane, torch.Tensor]:

@@ -69,12 +69,12 @@ def test_a_field_lowers_the_loss(field, horizon):
 def test_the_whole_horizon_gradient_moves_stiffness_towards_the_truth():
     truth = np.log(small.scene().truth.material.stiffness)
     result = fit(true_problem(horizon=0, epochs=30, learning_rate=5e-2))
-    found = np.log(result.twin.material.stiffness)
+    log_stiffness = np.log(result.twin.material.stiffness)
     start = np.log(1.2e4)
-    moved = np.abs(found - start) > 0.05
+    moved = np.abs(log_stiffness - start) > 0.05
     assert moved.sum() > 100
     # Eight frames do not determine every spring, but the ones that moved cannot have moved this way by chance.
-    correlation = pearsonr(found[moved], truth[moved])
+    correlation = pearsonr(log_stiffness[moved], truth[moved])
     assert correlation.statistic > 0
     assert correlation.pvalue < 1e-6
     assert result.history["loss"].iloc[-1] < 0.1 * result.history["loss"].iloc[0]
@@ -130,15 +130,15 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, kill
     pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
 
 
-def assert_same_twin(found: Twin, expected: Twin) -> None:
+def assert_same_twin(twin: Twin, expected: Twin) -> None:
     """Everything that a fit may change is equal, bit for bit."""
-    assert found.simulation == expected.simulation
+    assert twin.simulation == expected.simulation
     for name in ("stiffness", "dashpot"):
-        np.testing.assert_array_equal(getattr(found.material, name), getattr(expected.material, name))
-    np.testing.assert_array_equal(found.topology.rest_lengths, expected.topology.rest_lengths)
+        np.testing.assert_array_equal(getattr(twin.material, name), getattr(expected.material, name))
+    np.testing.assert_array_equal(twin.topology.rest_lengths, expected.topology.rest_lengths)
     for name in SCALARS:
         # The physics is computed in single precision, so a fit rounds scalars to it.
-        assert np.float32(getattr(found.material, name)) == np.float32(getattr(expected.material, name)), name
+        assert np.float32(getattr(twin.material, name)) == np.float32(getattr(expected.material, name)), name
 
 
 def test_the_seed_decides_the_first_weights_of_a_field():
@@ -183,7 +183,7 @@ def test_a_fit_that_never_completes_an_epoch_is_a_named_failure(monkeypatch, set
 
 
 def test_gradient_clipping_limits_the_step():
-    # Plain momentum-free Adam normalises steps, so clipping shows in its first moment, not in the step.
+    # Plain momentum-free Adam normalizes steps, so clipping shows in its first moment, not in the step.
     runs = {}
     for limit in (0.0, 1e-9):
         run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, clip_gradient_norm=limit, betas=(0.0, 0.0))))
@@ -254,7 +254,7 @@ def test_overflow_is_counted_although_solvers_are_rebuilt():
     start = replace(crowded.twin, simulation=replace(crowded.twin.simulation, collision_capacity=1))
     slow, fast = (fit(replace(crowded, twin=start, fit=config.Fit(epochs=2, learning_rate=rate))) for rate in (1e-4, 0.5))
     assert slow.twin.simulation.substeps == start.simulation.substeps < fast.twin.simulation.substeps
-    # Every node of the rope has about the same neighbours in both.
+    # Every node of the rope has about the same neighbors in both.
     assert fast.collision_overflow > 0.9 * slow.collision_overflow > 0
 
 
@@ -386,8 +386,8 @@ def test_schedules_set_the_rates_that_their_formulas_say(schedule, warmup):
         # Rollbacks halve every rate.
         for halved in (1.0, 0.25):
             run.start_epoch(epoch, halved)
-            found = [group["lr"] for group in run.optimiser.param_groups]
-            assert found == pytest.approx([halved * factor * rate for rate in (0.1, 0.2, 0.3)], rel=RATE)
+            rates = [group["lr"] for group in run.optimiser.param_groups]
+            assert rates == pytest.approx([halved * factor * rate for rate in (0.1, 0.2, 0.3)], rel=RATE)
 
 
 def test_the_scheduled_rate_is_the_step_that_is_taken():

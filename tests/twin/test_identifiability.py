@@ -1,4 +1,4 @@
-"""The study of recovered stiffness measures what it says, and repeats no finished run."""
+"""workflow/scripts/identifiability.py measures what it says, and repeats no finished run."""
 
 import functools
 from dataclasses import replace
@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from neuspring.data.synthetic import toy
-from tests.benchmarks import identifiability as study
-from tests.support import small
+from tests.support import scripts, small
+
+study = scripts.load("identifiability")
 
 
 @functools.cache
@@ -19,35 +20,35 @@ def scene() -> toy.ToyScene:
 
 
 def test_the_truth_is_recovered_and_a_constant_is_not() -> None:
-    found = study.compare(scene().truth, scene())
-    assert found["rms"] == found["node_rms"] == 0
-    assert found["correlation"] == pytest.approx(1)
-    assert found["training_loss"] < 1e-10 and found["future_track_error"] < 1e-5
+    exact = study.compare(scene().truth, scene())
+    assert exact["rms"] == exact["node_rms"] == 0
+    assert exact["correlation"] == pytest.approx(1)
+    assert exact["training_loss"] < 1e-10 and exact["future_track_error"] < 1e-5
     start = study.compare(study.constant(scene().truth, 0.6), scene())
     assert "correlation" not in start and "node_correlation" not in start
     log = np.log10(scene().truth.material.stiffness[: scene().truth.topology.object_spring_count].astype(float))
     middle = np.log10(scene().truth.material.stiffness.astype(float)).mean()
     assert start["rms"] == pytest.approx(np.sqrt(np.mean((np.log10(0.6) + middle - log) ** 2)), rel=1e-5)
-    assert start["training_loss"] > found["training_loss"]
+    assert start["training_loss"] > exact["training_loss"]
 
 
 def test_a_node_has_the_mean_of_its_springs() -> None:
     topology = scene().truth.topology
     doubled = scene().truth.material.stiffness.copy()
     doubled[0] *= 10
-    found = study.compare(replace(scene().truth, material=replace(scene().truth.material, stiffness=doubled)), scene())
+    scores = study.compare(replace(scene().truth, material=replace(scene().truth.material, stiffness=doubled)), scene())
     degree = np.bincount(topology.springs[: topology.object_spring_count].ravel())
     expected = np.sqrt((1 / degree[topology.springs[0]] ** 2).sum() / len(topology.nodes))
-    assert found["node_rms"] == pytest.approx(expected, rel=1e-4)
+    assert scores["node_rms"] == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_finished_run_is_found_again_by_its_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study, "scene_of", lambda *_: scene())
     run = study.Run("blob/shake/smooth", 0.0, 0, "field", 1)
     assert run.record(tmp_path) is None
-    made = study.execute(run, tmp_path)
-    assert run.record(tmp_path) == made
-    assert len(made["stiffness"]) == scene().truth.topology.object_spring_count
+    record = study.execute(run, tmp_path)
+    assert run.record(tmp_path) == record
+    assert len(record["stiffness"]) == scene().truth.topology.object_spring_count
     assert replace(run, epochs=2).record(tmp_path) is None
 
 

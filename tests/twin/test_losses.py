@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ def test_ties_go_to_the_lowest_index() -> None:
     assert losses.nearest(torch.zeros(1, 3), nodes.flip(0)).tolist() == [0]
 
 
-def test_the_track_loss_is_linear_beyond_one_metre() -> None:
+def test_the_track_loss_is_linear_beyond_one_meter() -> None:
     nodes = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True)
     value = losses.track(nodes, torch.zeros(1, 3), torch.tensor([True]))
     assert value.item() == pytest.approx((0.5**2 / 2 + 1.5) / 3)
@@ -119,10 +120,10 @@ def frame_loss(*, frozen: bool = False, weights: Losses | None = None) -> tuple[
 
 def test_frames_use_their_visibility_and_the_motion_before() -> None:
     loss, nodes = frame_loss()
-    near, moved = loss.terms(1, nodes)
+    near, moved = loss.terms(1, nodes).values()
     assert near.item() == pytest.approx(0.01)
     assert moved.item() == pytest.approx(2 * 0.005 / 6)
-    near, moved = loss.terms(2, nodes)
+    near, moved = loss.terms(2, nodes).values()
     # Only point 1 is visible, and node 2, which would be nearer, is not surface; only its motion 1 -> 2 is valid.
     assert near.item() == pytest.approx(0.04)
     assert moved.item() == pytest.approx(0.02 / 3)
@@ -134,12 +135,24 @@ def test_frozen_counts_divide_by_frame_one() -> None:
     plain, nodes = frame_loss()
     frozen, _ = frame_loss(frozen=True)
     assert torch.equal(frozen(1, nodes), plain(1, nodes))
-    for got, wanted in zip(frozen.terms(2, nodes), plain.terms(2, nodes), strict=True):
+    for got, wanted in zip(frozen.terms(2, nodes).values(), plain.terms(2, nodes).values(), strict=True):
         assert got.item() == pytest.approx(wanted.item() / 2)
 
 
 def test_weights() -> None:
     plain, nodes = frame_loss()
     weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))
-    near, moved = plain.terms(1, nodes)
+    near, moved = plain.terms(1, nodes).values()
     assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())
+
+
+def test_every_term_has_a_weight_of_its_name() -> None:
+    """A weight of 0 removes its term alone."""
+    rng = np.random.default_rng(0)
+    points = torch.tensor(rng.random((3, 5, 3)), dtype=torch.float32)
+    nodes, seen = torch.tensor(rng.random((6, 3)), dtype=torch.float32), torch.ones(3, 5, dtype=torch.bool)
+    full = FrameLoss(points, seen, seen, 6, Losses()).terms(1, nodes)
+    assert set(full) == {"chamfer", "track"}
+    for name in full:
+        terms = FrameLoss(points, seen, seen, 6, replace(Losses(), **{name: 0.0})).terms(1, nodes)
+        assert {other: float(value) for other, value in terms.items()} == {o: float(v) * (o != name) for o, v in full.items()}

@@ -103,7 +103,7 @@ def test_search_and_fit_start_with_the_observed_velocity(kind):
     problem = small.search_problem(seen, simulation=simulation)
     twin = candidate(problem, small.start_values() | {"drag": 0.0})
     loss = FrameLoss.of(seen, config.Losses(acceleration=0.0), "cpu")
-    found, _ = cost(replace(problem, losses=config.Losses(acceleration=0.0)), twin, loss)
+    loss_of_truth, _ = cost(replace(problem, losses=config.Losses(acceleration=0.0)), twin, loss)
     fitted = fit(small.fit_problem(seen, twin=twin, simulation=simulation, fit=config.Fit(epochs=1)))
-    # Millimetres squared: dashpots of controllers, which the released simulator holds at rest, leave a little.
-    assert (found < 1e-6) == (fitted.best_loss < 1e-6) == (kind == "observed"), (found, fitted.best_loss)
+    # Millimeters squared: dashpots of controllers, which the released simulator holds at rest, leave a little.
+    assert (loss_of_truth < 1e-6) == (fitted.best_loss < 1e-6) == (kind == "observed"), (loss_of_truth, fitted.best_loss)

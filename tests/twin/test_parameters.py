@@ -30,14 +30,14 @@ ALL = {"damping": "springs", "rest_length_bound": 0.2, "output_bound": 1.5}
 
 def twin() -> Twin:
     """Ten nodes, two controllers, about 20 springs of 20 to 200 N, some of them controllers'."""
-    made, x, _, hands = random_scene(3)
-    return twin_of(made, x, hands[0])
+    scene, x, _, hands = random_scene(3)
+    return twin_of(scene, x, hands[0])
 
 
 def parameters(kind: str = "field", start: Twin | None = None, field: dict | None = None, **settings) -> TwinParameters:
     """Trained values of the small twin."""
-    chosen = config.Fit(field=config.SpringField(**(SMALL | (field or {}))), **settings)
-    return TwinParameters(start or twin(), chosen, kind, "cpu")
+    fit = config.Fit(field=config.SpringField(**(SMALL | (field or {}))), **settings)
+    return TwinParameters(start or twin(), fit, kind, "cpu")
 
 
 def disturb(trained: TwinParameters, scale: float = 0.3, seed: int = 0) -> TwinParameters:
@@ -77,8 +77,8 @@ def test_gradients_through_simulated_frames_match_differences(name):
     lies beyond its clamp, where the gradient is not meant to be the derivative.
     """
     kind, field, settings = TRAINED[name]
-    made, x, v, hands = random_scene(9, substeps=10)
-    start = twin_of(made, x, hands[0])
+    scene, x, v, hands = random_scene(9, substeps=10)
+    start = twin_of(scene, x, hands[0])
     trained = parameters(kind, start, field, **settings).double()
     trained.start = {key: value.double() for key, value in trained.start.items()}
     disturb(trained)
@@ -148,9 +148,9 @@ def test_a_spring_beyond_a_limit_stays_there_as_released_and_a_field_finds_back(
     beyond = stiffness > limit[1]
     assert 0 < beyond.sum() < len(beyond)
     for trained in (single, field):
-        found = trained.physical()["stiffness"]
-        assert torch.equal(found.detach(), stiffness.clamp(*limit))
-        found.sum().backward()  # as if lower stiffness were better
+        stiffness_used = trained.physical()["stiffness"]
+        assert torch.equal(stiffness_used.detach(), stiffness.clamp(*limit))
+        stiffness_used.sum().backward()  # as if lower stiffness were better
     assert torch.equal(single.offsets.grad[:, 0], stiffness.masked_fill(beyond, 0.0))
     torch.testing.assert_close(field.field.layers[-1].bias.grad[0], stiffness.sum(), rtol=SINGLE, atol=0)
 
@@ -173,28 +173,28 @@ def test_bounded_is_the_identity_near_zero_and_saturates():
 def test_the_start_is_the_twin_whatever_is_trained(kind):
     """Bit for bit, in single precision."""
     start = twin()
-    found = parameters(kind, start, **ALL, homogeneous_epochs=2).physical()
+    values = parameters(kind, start, **ALL, homogeneous_epochs=2).physical()
     for name, value in twin_tensors(start, "cpu").items():
-        assert torch.equal(found[name].detach().expand_as(value), value), name
+        assert torch.equal(values[name].detach().expand_as(value), value), name
 
 
 def test_offsets_are_logarithms_of_factors():
     trained = parameters("springs", damping="springs")
     values = torch.linspace(-1, 1, len(trained.start["stiffness"]))
     offsets(trained, torch.stack([values, -values], dim=1))
-    found = trained.physical()
-    torch.testing.assert_close(found["stiffness"], trained.start["stiffness"] * values.exp(), rtol=SINGLE, atol=0)
-    torch.testing.assert_close(found["dashpot"], trained.start["dashpot"] * (-values).exp(), rtol=SINGLE, atol=0)
+    physical = trained.physical()
+    torch.testing.assert_close(physical["stiffness"], trained.start["stiffness"] * values.exp(), rtol=SINGLE, atol=0)
+    torch.testing.assert_close(physical["dashpot"], trained.start["dashpot"] * (-values).exp(), rtol=SINGLE, atol=0)
 
 
 def test_bounds_of_stiffness_dashpots_and_rest_lengths():
     """However far the offsets go; stiffness and dashpot share a bound, rest lengths have their own."""
     for sign in (-1.0, 1.0):
         trained = offsets(parameters("springs", **ALL), sign * 50.0)
-        found = trained.physical()
+        physical = trained.physical()
         for name, bound in (("stiffness", 1.5), ("dashpot", 1.5), ("rest_lengths", 0.2)):
             factor = torch.tensor(np.exp(sign * bound), dtype=torch.float32)
-            torch.testing.assert_close(found[name], trained.start[name] * factor, rtol=SINGLE, atol=0)
+            torch.testing.assert_close(physical[name], trained.start[name] * factor, rtol=SINGLE, atol=0)
     free = offsets(parameters("springs"), 3.0)
     assert torch.equal(free.physical()["rest_lengths"], free.start["rest_lengths"])
 
@@ -204,11 +204,11 @@ def test_homogeneous_damping_has_one_factor_for_all_dashpots_and_one_for_drag():
     with torch.no_grad():
         trained.factors["drag"].fill_(0.5)
         trained.factors["dashpot"].fill_(-0.5)
-    found, start = trained.physical(), trained.start
+    physical, start = trained.physical(), trained.start
     assert trained.channels == ["stiffness"]
-    torch.testing.assert_close(found["drag"], start["drag"] * np.exp(0.5), rtol=SINGLE, atol=0)
-    torch.testing.assert_close(found["dashpot"], start["dashpot"] * np.exp(-0.5), rtol=SINGLE, atol=0)
-    assert torch.equal(found["stiffness"], start["stiffness"])
+    torch.testing.assert_close(physical["drag"], start["drag"] * np.exp(0.5), rtol=SINGLE, atol=0)
+    torch.testing.assert_close(physical["dashpot"], start["dashpot"] * np.exp(-0.5), rtol=SINGLE, atol=0)
+    assert torch.equal(physical["stiffness"], start["stiffness"])
 
 
 def test_fixed_damping_does_not_move():
@@ -272,11 +272,11 @@ def test_rest_lengths_are_free_per_spring_or_an_output_of_the_field():
 
 
 def test_the_field_lives_on_the_rest_shape():
-    made = twin()
-    points = len(made.topology.nodes) + len(made.topology.controllers)
+    start = twin()
+    points = len(start.topology.nodes) + len(start.topology.controllers)
     shape = np.random.default_rng(0).uniform(0, 1, (points, 3)).astype(np.float32)
-    trained = parameters(start=replace(made, topology=replace(made.topology, rest_shape=shape)))
-    np.testing.assert_allclose(trained.field.coordinates, in_cube(midpoints(shape, made.topology.springs)), atol=SINGLE)
+    trained = parameters(start=replace(start, topology=replace(start.topology, rest_shape=shape)))
+    np.testing.assert_allclose(trained.field.coordinates, in_cube(midpoints(shape, start.topology.springs)), atol=SINGLE)
 
 
 def test_springs_are_covered_whatever_the_field_s_settings():
@@ -356,11 +356,11 @@ def test_the_penalty_is_the_weighted_roughness():
 @pytest.mark.parametrize("kind", ["springs", "field"])
 def test_copies_restore_everything_that_is_trained(kind):
     trained = disturb(parameters(kind, **ALL, homogeneous_epochs=1))
-    kept, before = trained.copy(), {name: value.detach().clone() for name, value in trained.physical().items()}
-    assert kept.keys() == dict(trained.named_parameters()).keys()
+    copy, before = trained.copy(), {name: value.detach().clone() for name, value in trained.physical().items()}
+    assert copy.keys() == dict(trained.named_parameters()).keys()
     disturb(trained, seed=1)
-    assert any(not np.array_equal(kept[name], value) for name, value in trained.copy().items())
-    trained.restore(kept)
+    assert any(not np.array_equal(copy[name], value) for name, value in trained.copy().items())
+    trained.restore(copy)
     for name, value in trained.physical().items():
         assert torch.equal(value, before[name]), name
 
@@ -372,18 +372,18 @@ def test_the_twin_is_what_is_simulated(kind):
     trained = disturb(parameters(kind, start, **ALL, stiffness_range=(0.0, 100.0)), 1.0)
     with torch.no_grad():
         trained.scalars["ground_elasticity"].fill_(1.2)  # beyond its clamp
-    made, substep = trained.as_twin(start), start.simulation.substep
-    again = pack(**twin_tensors(made, "cpu"), substep=substep)
-    for found, expected in zip(again.tensors(), trained.pack(substep).tensors(), strict=True):
-        assert torch.equal(found, expected.detach())
-    assert made.material.stiffness.max() == 100
-    np.testing.assert_array_equal(made.topology.springs, start.topology.springs)
-    assert made.simulation == start.simulation
+    result, substep = trained.as_twin(start), start.simulation.substep
+    again = pack(**twin_tensors(result, "cpu"), substep=substep)
+    for packed, expected in zip(again, trained.pack(substep), strict=True):
+        assert torch.equal(packed, expected.detach())
+    assert result.material.stiffness.max() == 100
+    np.testing.assert_array_equal(result.topology.springs, start.topology.springs)
+    assert result.simulation == start.simulation
 
 
 def test_a_fixed_rest_length_is_not_rewritten():
     start = twin()
-    made = disturb(parameters("springs", start)).as_twin(start)
-    assert made.topology is start.topology
-    assert made.material.contact_distance == start.material.contact_distance
-    assert set(CONTACT_SCALARS) <= set(twin_tensors(made, "cpu"))
+    result = disturb(parameters("springs", start)).as_twin(start)
+    assert result.topology is start.topology
+    assert result.material.contact_distance == start.material.contact_distance
+    assert set(CONTACT_SCALARS) <= set(twin_tensors(result, "cpu"))

@@ -32,9 +32,9 @@ RELEASED = {
     "drag": 0.15,
     "dashpot": 0.5,
 }
-"""The released variables in the released order, and the released start on the normalised scale."""
+"""The released variables in the released order, and the released start on the normalized scale."""
 CODING = 1e-12
-"""Relative: to the normalised scale and back, rounding of float64 only."""
+"""Relative: to the normalized scale and back, rounding of float64 only."""
 FLOAT32_LENGTHS = 1e-6
 """Relative: the rest shape is kept in float32; lengths of 0.02 m between points at 0.2 m round to parts in 1e6."""
 
@@ -162,8 +162,8 @@ def test_isolated_nodes_are_repaired_penalised_or_left():
 def test_allow_is_the_released_topology():
     seen, values = small.observations(), small.start_values() | {"object_radius": 0.005}
     released = uniform_topology(seen.nodes, seen.controller_points[0], 0.005, 18, values["controller_radius"], 50)
-    found = candidate(loosely(isolated_nodes="allow"), values).topology
-    np.testing.assert_array_equal(found.springs, released.springs)
+    topology = candidate(loosely(isolated_nodes="allow"), values).topology
+    np.testing.assert_array_equal(topology.springs, released.springs)
 
 
 def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
@@ -241,9 +241,9 @@ def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
     return replace(problem, search=replace(problem.search, rollouts=rollouts))
 
 
-def assert_same_trace(found: pd.DataFrame, expected: pd.DataFrame) -> None:
+def assert_same_trace(trace: pd.DataFrame, expected: pd.DataFrame) -> None:
     """Equal bit for bit, but for the time that each candidate took."""
-    pd.testing.assert_frame_equal(found.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)
+    pd.testing.assert_frame_equal(trace.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)
 
 
 @pytest.mark.parametrize(("clusters", "population"), [(1, 11), (3, 12)])

@@ -47,14 +47,14 @@ def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
     nodes, hands = cloud(1, 12), cloud(2, 2) + 2
     shape = np.concatenate([cloud(3, 12), cloud(4, 2)])
     labels = (np.arange(12) % 2).astype(np.int32)
-    asked = (labels, [0.4, 0.6], [4, 5], 0.5, 3)
-    given = piecewise_topology(nodes, hands, *asked, rest_shape=shape)
-    other = piecewise_topology(shape[:12], shape[12:], *asked)
-    np.testing.assert_array_equal(given.springs, other.springs)
-    np.testing.assert_array_equal(given.rest_lengths, other.rest_lengths)
-    np.testing.assert_array_equal(given.canonical, other.canonical)
-    np.testing.assert_array_equal(given.nodes, nodes.astype(np.float32))
-    np.testing.assert_array_equal(given.controllers, hands.astype(np.float32))
+    rules = (labels, [0.4, 0.6], [4, 5], 0.5, 3)
+    straight = piecewise_topology(nodes, hands, *rules, rest_shape=shape)
+    other = piecewise_topology(shape[:12], shape[12:], *rules)
+    np.testing.assert_array_equal(straight.springs, other.springs)
+    np.testing.assert_array_equal(straight.rest_lengths, other.rest_lengths)
+    np.testing.assert_array_equal(straight.canonical, other.canonical)
+    np.testing.assert_array_equal(straight.nodes, nodes.astype(np.float32))
+    np.testing.assert_array_equal(straight.controllers, hands.astype(np.float32))
 
 
 # The released simulator -----------------------------------------------------------------------------------------------
@@ -65,10 +65,10 @@ def test_golden_springs(name: str) -> None:
     """The same set of springs as the released code builds from the same points, and the same rest lengths."""
     c = clip(name)
     recorded = c.twin.topology
-    made = uniform_topology(recorded.nodes, c.controllers[0], *c.topology_params)
-    assert undirected(made.springs) == undirected(recorded.springs)
-    assert made.object_spring_count == c.object_springs
-    order = {tuple(sorted(pair)): length for pair, length in zip(made.springs.tolist(), made.rest_lengths, strict=True)}
+    topology = uniform_topology(recorded.nodes, c.controllers[0], *c.topology_params)
+    assert undirected(topology.springs) == undirected(recorded.springs)
+    assert topology.object_spring_count == c.object_springs
+    order = {tuple(sorted(pair)): length for pair, length in zip(topology.springs.tolist(), topology.rest_lengths, strict=True)}
     lengths = [order[tuple(sorted(pair))] for pair in recorded.springs.tolist()]
     np.testing.assert_allclose(lengths, recorded.rest_lengths, rtol=LENGTH)
 
@@ -77,10 +77,10 @@ def test_golden_springs(name: str) -> None:
 def test_golden_springs_have_the_released_order_of_ends(name: str) -> None:
     """Controllers come first in their springs, and all controller springs last."""
     c = clip(name)
-    made = uniform_topology(c.twin.topology.nodes, c.controllers[0], *c.topology_params)
-    outer = made.springs[made.object_spring_count :]
-    assert (outer[:, 0] >= len(made.nodes)).all()
-    assert (outer[:, 1] < len(made.nodes)).all()
+    topology = uniform_topology(c.twin.topology.nodes, c.controllers[0], *c.topology_params)
+    outer = topology.springs[topology.object_spring_count :]
+    assert (outer[:, 0] >= len(topology.nodes)).all()
+    assert (outer[:, 1] < len(topology.nodes)).all()
 
 
 # Rules ----------------------------------------------------------------------------------------------------------------
@@ -88,13 +88,13 @@ def test_golden_springs_have_the_released_order_of_ends(name: str) -> None:
 
 def brute(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> set[tuple[int, int]]:
     """The definition: i asks for its nearest, itself included, closer than its radius; the union of all answers."""
-    asked = set()
+    pairs = set()
     for i, node in enumerate(nodes):
         distance = np.linalg.norm(nodes - node, axis=1)
         for j in np.argsort(distance, kind="stable")[: neighbours[i]]:
             if j != i and MIN_LENGTH < distance[j] < radius[i]:
-                asked.add((min(i, int(j)), max(i, int(j))))
-    return asked
+                pairs.add((min(i, int(j)), max(i, int(j))))
+    return pairs
 
 
 @settings(max_examples=60, deadline=None)
@@ -159,8 +159,8 @@ def test_duplicate_nodes_are_not_joined(copies: int) -> None:
 
 def test_controllers_ask_for_nodes_only_and_without_a_minimum_length() -> None:
     nodes, hands = np.array([[0.0, 0, 0], [0.2, 0, 0], [9, 0, 0]]), np.array([[MIN_LENGTH / 2, 0, 0], [0.01, 0, 0]])
-    found = controller_springs(nodes, hands, 1.0, 5)
-    assert found.tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
+    springs = controller_springs(nodes, hands, 1.0, 5)
+    assert springs.tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
     assert controller_springs(nodes, hands, 1.0, 1).tolist() == [[3, 0], [4, 0]]
     assert controller_springs(nodes, hands, 1e-6, 5).shape == (0, 2)
 
@@ -177,17 +177,19 @@ def test_zero_length_springs_are_refused() -> None:
 
 
 def test_a_topology_may_have_no_springs() -> None:
-    made = uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
-    assert made.springs.shape == (0, 2)
-    assert made.object_spring_count == 0
+    topology = uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
+    assert topology.springs.shape == (0, 2)
+    assert topology.object_spring_count == 0
 
 
 def test_labels_and_rest_lengths() -> None:
     nodes = cloud(3)
     springs = same(nodes, 0.4, 6)
-    made = build(nodes, np.zeros((0, 3)), springs, labels=np.arange(25) % 4)
-    np.testing.assert_array_equal(made.labels, np.arange(25) % 4)
-    np.testing.assert_allclose(made.rest_lengths, np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1), rtol=LENGTH)
+    topology = build(nodes, np.zeros((0, 3)), springs, labels=np.arange(25) % 4)
+    np.testing.assert_array_equal(topology.labels, np.arange(25) % 4)
+    np.testing.assert_allclose(
+        topology.rest_lengths, np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1), rtol=LENGTH
+    )
     assert not build(nodes, np.zeros((0, 3)), springs).labels.any()
 
 
@@ -276,14 +278,14 @@ def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: i
     # The last region asks for so little that some nodes are left alone, which `repair` then joins.
     values = [0.35, 0.3, 0.05], [7, 4, 3], 0.4, 3
 
-    def made(points: np.ndarray) -> tuple[np.ndarray, dict[tuple[int, int], float], int]:
+    def graph(points: np.ndarray) -> tuple[np.ndarray, dict[tuple[int, int], float], int]:
         labels = regions(points, 3, settings)
         topology = piecewise_topology(points, hands, labels, *values, repair=repair)
         pairs = [tuple(sorted(pair)) for pair in topology.springs.tolist()]
         return labels, dict(zip(pairs, topology.rest_lengths.tolist(), strict=True)), topology.object_spring_count
 
-    labels, springs, inner = made(nodes)
-    shuffled_labels, shuffled, shuffled_inner = made(nodes[order])
+    labels, springs, inner = graph(nodes)
+    shuffled_labels, shuffled, shuffled_inner = graph(nodes[order])
     np.testing.assert_array_equal(shuffled_labels, labels[order])
     # Controllers keep their numbers behind the nodes.
     name = np.concatenate([order, 25 + np.arange(2)])
@@ -296,14 +298,14 @@ def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
     nodes, nobody = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]), np.array([[0.0, 9, 0]])
     labels = np.array([0, 0, 1, 1], np.int32)
 
-    def found(radius: list[float], neighbours: list[int]) -> set[tuple[int, int]]:
+    def springs(radius: list[float], neighbours: list[int]) -> set[tuple[int, int]]:
         return undirected(piecewise_topology(nodes, nobody, labels, radius, neighbours, 0.1, 1).springs)
 
-    assert found([0.15, 0.01], [5, 5]) == {(0, 1), (1, 2)}, "the left region asks"
-    assert found([0.01, 0.15], [5, 5]) == {(1, 2), (2, 3)}, "the right region asks"
-    assert found([0.01, 0.01], [5, 5]) == set()
+    assert springs([0.15, 0.01], [5, 5]) == {(0, 1), (1, 2)}, "the left region asks"
+    assert springs([0.01, 0.15], [5, 5]) == {(1, 2), (2, 3)}, "the right region asks"
+    assert springs([0.01, 0.01], [5, 5]) == set()
     # A node's own values decide whom it asks, whichever region the other is in.
-    assert found([0.25, 0.01], [5, 1]) == {(0, 1), (0, 2), (1, 2), (1, 3)}
+    assert springs([0.25, 0.01], [5, 1]) == {(0, 1), (0, 2), (1, 2), (1, 3)}
 
 
 # Isolated nodes -------------------------------------------------------------------------------------------------------

@@ -29,7 +29,9 @@ from neuspring.experiments.benchmark import fit_of, read_methods, read_searches,
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 """What a trial reads; observations are made before."""
 CLUSTERS = "clusters"
-FIXED = ("losses.chamfer", "losses.track", "fit.selection", "fit.tail_fraction", "released_quirks.frozen_loss_denominators")
+# The acceleration term guides the search alone; the objective is the loss of a fit.
+_WEIGHTS = tuple(f"losses.{term.name}" for term in dataclasses.fields(config.Losses) if term.name != "acceleration")
+FIXED = (*_WEIGHTS, "fit.selection", "fit.tail_fraction", "released_quirks.frozen_loss_denominators")
 """The objective is measured with these, so all trials must share them."""
 MOST_COMBINATIONS = 256
 """Combinations of range ends that are checked before the first trial. If there are more, only all lowest and all highest ones."""

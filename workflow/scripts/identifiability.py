@@ -1,12 +1,12 @@
 """Does a fit recover a known stiffness, and a neural spring field better than free springs? Toy scenes, whose truth is known.
 
-    python -m tests.benchmarks.identifiability OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
+    python workflow/scripts/identifiability.py OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
 
 A fit starts from the truth in everything (topology, dashpots, drag, contact, substeps) but the stiffness, which is the same
 everywhere and too low: 0.6 of the truth's geometric mean. Only the stiffness is trained, without bounds, by both kinds with
 the same settings but for the learning rate. Seeds vary noise, occlusion and the field's first weights.
 
-The learning rates have the lowest training loss, by which alone they were chosen, on cloth/shake/smooth (0.5 mm, seed 0, 80
+The learning rates were chosen by the training loss alone, on cloth/shake/smooth (0.5 mm, seed 0, 80
 epochs; mm^2 of a rollout): springs 1.65 at 1e-2, 1.17 at 2e-2, 1.05 at 3e-2; field 1.48 at 1e-3, 1.31 at 2e-3, 1.43 at 3e-3.
 The truth has 0.89, the start 50. With output_bound 1.5 the best were 1.13 and 1.38; with a cosine schedule too 1.44 and 1.34.
 
@@ -103,8 +103,8 @@ class Run:
     def record(self, folder: Path) -> dict[str, Any] | None:
         """What a finished run with the same settings left in `folder`."""
         path = folder / f"{self.name}.json"
-        found: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
-        return found if found and found["settings"] == self.settings() else None
+        record: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
+        return record if record and record["settings"] == self.settings() else None
 
 
 @functools.cache
@@ -130,10 +130,10 @@ def compare(twin: Twin, scene: toy.ToyScene) -> dict[str, float]:
     incidence[topology.springs[:count].T, np.arange(count)] = 1.0
     incidence = incidence[incidence.any(axis=1)]
     around = log @ (incidence / incidence.sum(axis=1, keepdims=True)).T
-    for prefix, (found, true) in {"": log, "node_": around}.items():
-        values[f"{prefix}rms"] = float(np.sqrt(np.mean((found - true) ** 2)))
-        if found.std() > 1e-9:
-            values[f"{prefix}correlation"] = float(np.corrcoef(found, true)[0, 1])
+    for prefix, (recovered, true) in {"": log, "node_": around}.items():
+        values[f"{prefix}rms"] = float(np.sqrt(np.mean((recovered - true) ** 2)))
+        if recovered.std() > 1e-9:
+            values[f"{prefix}correlation"] = float(np.corrcoef(recovered, true)[0, 1])
     trajectory = roll_out(twin, seen.controller_points)
     loss, end = FrameLoss.of(seen, config.Losses(), "cpu"), seen.scenario.train_end
     if len(trajectory.positions) >= end:
@@ -170,8 +170,8 @@ def execute_all(runs: list[Run], folder: Path, jobs: int) -> list[dict[str, Any]
     todo, clock = [run for run in runs if run.record(folder) is None], time.perf_counter()
     print(f"{len(runs) - len(todo)} of {len(runs)} runs are there, {len(todo)} to make", flush=True)
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        made = pool.imap(functools.partial(execute, folder=folder), todo)
-        for done, (run, record) in enumerate(zip(todo, made, strict=True), 1):
+        records = pool.imap(functools.partial(execute, folder=folder), todo)
+        for done, (run, record) in enumerate(zip(todo, records, strict=True), 1):
             text = ", ".join(f"{name} {value:.3g}" for name, value in record["values"].items()) or record["failure"]
             elapsed = time.perf_counter() - clock
             left = elapsed / done * (len(todo) - done)
@@ -210,14 +210,14 @@ def report(table: pd.DataFrame) -> list[str]:
     return lines + markdown(["noise [mm]", *headings], rows)
 
 
-def picture(found: dict[str, dict[str, np.ndarray]]) -> Figure:
-    """Per scene: truth, springs and field at rest, coloured by stiffness, and recovered against true stiffness.
+def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
+    """Per scene: truth, springs and field at rest, colored by stiffness, and recovered against true stiffness.
 
-    `found` is scene -> kind -> stiffness [N] of the object springs; shown relative to the truth's geometric mean.
+    `scenes` is scene -> kind -> stiffness [N] of the object springs; shown relative to the truth's geometric mean.
     """
-    figure, axes = plt.subplots(len(found), 4, figsize=(14, 2.9 * len(found) + 1), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(len(scenes), 4, figsize=(14, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
     norm = LogNorm(0.3, 1 / 0.3)
-    for row, (scene, kinds) in zip(axes, found.items(), strict=True):
+    for row, (scene, kinds) in zip(axes, scenes.items(), strict=True):
         truth, unit = scene_of(scene, *SHOWN).truth, np.exp(np.log(kinds["truth"]).mean())
         view = figures_views.side_view(figures_views.widest_axis(truth.topology.nodes), truth.simulation.up)
         bounds = figures_views.limits(view.project(truth.topology.nodes))
@@ -228,10 +228,10 @@ def picture(found: dict[str, dict[str, np.ndarray]]) -> Figure:
             axis.set_title(f"{scene}: {kind}", fontsize=10)
             axis.tick_params(labelleft=kind == "truth", labelsize=8)
         row[0].set_ylabel(view.labels[1] + ("\n(stretched)" if slender else ""))
-        for kind, colour, shift in (("springs", "tab:orange", -0.012), ("field", "tab:blue", 0.012)):
+        for kind, color, shift in (("springs", "tab:orange", -0.012), ("field", "tab:blue", 0.012)):
             true, recovered = np.log10(kinds["truth"] / unit), np.log10(kinds[kind] / unit)
             label = f"{kind}, r = {np.corrcoef(true, recovered)[0, 1]:.2f}"
-            row[3].scatter(true + shift, recovered, s=5, color=colour, alpha=0.35, lw=0, label=label)
+            row[3].scatter(true + shift, recovered, s=5, color=color, alpha=0.35, lw=0, label=label)
         row[3].plot([-0.35, 0.35], [-0.35, 0.35], color="black", lw=0.8, label="equal")
         row[3].axhline(np.log10(kinds["start"][0] / unit), color="0.4", ls=":", lw=1, label="start")
         row[3].set(xlabel="log$_{10}$ true / mean (kinds side by side)", ylabel="log$_{10}$ recovered / mean", ylim=(-1.1, 1.1))
@@ -253,9 +253,9 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=SCENES, help="shape/motion/law, as in config/scenarios.tsv")
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES, help="m")
     parser.add_argument("--jobs", type=int, default=2)
-    given = parser.parse_args()
-    runs = [Run(*one, given.epochs) for one in itertools.product(given.scenes, given.noises, given.seeds, KINDS)]
-    records = execute_all(runs, given.output / "runs", given.jobs)
+    options = parser.parse_args()
+    runs = [Run(*one, options.epochs) for one in itertools.product(options.scenes, options.noises, options.seeds, KINDS)]
+    records = execute_all(runs, options.output / "runs", options.jobs)
     rows, shown, failed = [], {}, []
     for run, record in zip(runs, records, strict=True):
         rows += [(run.scene, run.noise, run.seed, run.kind, metric, value) for metric, value in record["values"].items()]
@@ -263,14 +263,14 @@ def main() -> None:
         if (run.noise, run.seed) == SHOWN and record["stiffness"]:
             shown.setdefault(run.scene, {})[run.kind] = np.array(record["stiffness"])
     table = pd.DataFrame(rows, columns=["scene", "noise", "seed", "kind", "metric", "value"])
-    write_text(given.output / "identifiability.csv", table.to_csv(index=False))
+    write_text(options.output / "identifiability.csv", table.to_csv(index=False))
     rates = " and ".join(f"{rate:g} ({kind})" for kind, rate in RATES.items())
-    head = f"Mean ± standard deviation over {len(given.seeds)} seed(s); {given.epochs} epochs, learning rates {rates}.\n"
+    head = f"Mean ± standard deviation over {len(options.seeds)} seed(s); {options.epochs} epochs, learning rates {rates}.\n"
     text = "\n".join([head, *report(table), *failed]) + "\n"
-    write_text(given.output / "identifiability.md", text)
+    write_text(options.output / "identifiability.md", text)
     shown = {scene: kinds for scene, kinds in shown.items() if len(kinds) == len(KINDS)}
     if shown:
-        figures_views.save(picture(shown), given.output / "identifiability.png")
+        figures_views.save(picture(shown), options.output / "identifiability.png")
     print(text)
 
 

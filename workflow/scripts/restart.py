@@ -1,6 +1,6 @@
 """Where the error of the future comes from: twins restarted from what was observed at the split.
 
-python -m tests.benchmarks.restart RESULTS_FOLDER DATA_SET METHOD [METHOD ...]
+python workflow/scripts/restart.py RESULTS_FOLDER DATA_SET METHOD [METHOD ...]
 
 The workflow's rollout carries what went wrong in all training frames into the future. Here the same twin starts again in the
 first frame after the split, with nodes and velocities made from the markers there as in frame 0; what is left is the model's
@@ -54,8 +54,8 @@ def scores(results: Path, benchmark: Benchmark, name: str, method: str, seed: in
     velocity = initial_velocity(again, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, again.controller_points, "cpu", velocity=velocity)
     frames = range(1, again.scenario.frame_count)
-    known = pd.read_parquet(results / name / method / str(seed) / "scores.parquet")
-    return pd.concat([known, metrics.score_tasks(trajectory, again, method, seed, {"restarted": frames})])
+    original = pd.read_parquet(results / name / method / str(seed) / "scores.parquet")
+    return pd.concat([original, metrics.score_tasks(trajectory, again, method, seed, {"restarted": frames})])
 
 
 def main(results: Path, data_set: Path, methods: list[str]) -> None:
