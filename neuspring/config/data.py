@@ -58,6 +58,8 @@ class Synthetic(Section):
     """Size of the images, with meshes to match: 120 x 68, 424 x 240 or 848 x 480 pixels."""
     frames: Annotated[int, Field(ge=5)] | None = None
     """Number of frames that are kept, the first ones; null keeps all."""
+    certified_frames: Count = 20
+    """Number of first frames in which twice the substeps must not move the clip; more of them cost time and change no picture."""
     cameras: Annotated[int, Field(ge=1, le=3)] = 3
     """Number of cameras that film the scene."""
     sensor: Literal["model", "clean"] = "model"

@@ -10,7 +10,9 @@ import warp as wp
 
 from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.kernels import kernels
-from neuspring.core.device import load, start_warp
+from neuspring.core.device import start_warp
+from neuspring.physics.autograd import Frame
+from neuspring.physics.buffers import Graphs
 
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them, see `AnchorParameters.tensors`."""
@@ -82,7 +84,7 @@ class AnchorSolver:
         self._model.substep = physics.frame_time / substeps
         self._model.gravity, self._model.up = -physics.up_sign * physics.gravity, physics.up_sign
         self._model.ground = int(physics.ground)
-        self._captured: dict[bool, Any] = {}
+        self._graphs = Graphs(device)
         self.frame_token = 0
         """Number of the frame whose substeps are in the buffers."""
 
@@ -94,10 +96,10 @@ class AnchorSolver:
         self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(x, v) [N, 3] one frame later, differentiable in x, v and parameters; controllers [C, 3] go from `begin` to `end`."""
-        result: tuple[torch.Tensor, torch.Tensor] = _Frame.apply(self, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
+        result: tuple[torch.Tensor, torch.Tensor] = Frame.apply(self, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
         return result
 
-    def forward(
+    def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(x, v) after a frame; `packed` are the kernel's stiffness, soft vector and scalars."""
@@ -122,31 +124,12 @@ class AnchorSolver:
         return [b["adj_x"][0].clone(), b["adj_v"][0].clone(), *(b[f"adj_{name}"].clone() for name in PACKED)]
 
     def _launch(self, *, backward: bool) -> None:
-        if backward not in self._captured:
-            kernel = load(self._kernels.adjoint if backward else self._kernels.substep, self.device)
-            structs = (self._state, self._model, self._adjoint) if backward else (self._state, self._model)
-            with wp.ScopedCapture(device=self.device) as capture:
-                for substep in reversed(range(self.substeps)) if backward else range(self.substeps):
-                    fraction = self._real((substep + 1) / self.substeps)
-                    wp.launch(kernel, self.count, [substep, fraction, *structs], device=self.device)
-            self._captured[backward] = capture.graph
-        # Torch orders its own work on its current stream, so the graph must run there too.
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device != "cpu" else None
-        wp.capture_launch(self._captured[backward], stream=stream)
+        kernel = self._kernels.adjoint if backward else self._kernels.substep
+        structs = (self._state, self._model, self._adjoint) if backward else (self._state, self._model)
 
+        def record() -> None:
+            for substep in reversed(range(self.substeps)) if backward else range(self.substeps):
+                fraction = self._real((substep + 1) / self.substeps)
+                wp.launch(kernel, self.count, [substep, fraction, *structs], device=self.device)
 
-class _Frame(torch.autograd.Function):
-    """A frame of a solver; simulated again in the backward pass if the solver's buffers hold another one by then."""
-
-    @staticmethod
-    def forward(ctx: Any, solver: AnchorSolver, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
-        result = solver.forward(*tensors)
-        ctx.solver, ctx.token = solver, solver.frame_token
-        ctx.save_for_backward(*tensors)
-        return result
-
-    @staticmethod
-    def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
-        if ctx.solver.frame_token != ctx.token:
-            ctx.solver.forward(*ctx.saved_tensors)
-        return (None, None, None, *ctx.solver.backward(adj_x, adj_v))
+        self._graphs.run("backward" if backward else "forward", [kernel], record)

@@ -44,8 +44,6 @@ MOST_DEVIATION = 0.001
 """m. A clip is refused if twice the substeps move the mean node farther than this and than CHAOS times the effect of a nudge."""
 CHAOS = 3.0
 """If a nudge of the start moves the clip nearly as far, the motion is chaotic and the time step is not too long."""
-CERTIFIED_FRAMES = 20
-"""Frames at the start of a clip that are simulated again with twice the substeps."""
 GRAINS = {"cloth": (45.0, 0.5), "rope": (70.0, 0.5), "package": (35.0, 0.5)}
 """Frequency, 1/m, and contrast of the fine texture by category."""
 PLUSH_GRAIN, HAND_GRAIN = (36.0, 1.1), (45.0, 0.6)
@@ -86,7 +84,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     engine = ENGINES[engine_name](body, hands, frames, FRAME_RATE, Damping(), start=start)
     clip = engine.run()
-    truth = _truth(body, hands, clip, engine.holder, certify(engine, clip, CERTIFIED_FRAMES))
+    truth = _truth(body, hands, clip, engine.holder, certify(engine, clip, settings.certified_frames))
     _refuse(row.scenario, truth)
     cameras = place_cameras(clip, hands, size, settings.cameras)
     description = Description(

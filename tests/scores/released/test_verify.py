@@ -25,7 +25,7 @@ from neuspring.data.released import (
     visible_pixels,
 )
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
-from neuspring.scores.released.findings import MEAN, TOLERANCES, Finding, Published, of_means
+from neuspring.scores.released.findings import MEAN, Finding, Published, of_means
 from neuspring.scores.released.images import RELEASED, frame_scores
 from neuspring.scores.released.run import CHECKS, Report, read_observations, verify_released
 from tests.support.phystwin_case import dump, edit, stored
@@ -357,7 +357,7 @@ def test_an_error_in_drawing_exceeds_the_tolerance(conforming, quirk):
     first, second = (frame_scores(case, read_observations(case), "none", "cpu", images) for images in (RELEASED, wrong))
     for metric, values in first.groupby("metric")["value"]:
         other = second.loc[second["metric"] == metric, "value"]
-        assert abs(values.mean() - other.mean()) > 4 * TOLERANCES[metric], metric
+        assert abs(values.mean() - other.mean()) > 4 * METRICS[metric].tolerance, metric
 
 
 def test_a_released_case_is_held_against_the_known_number_of_springs(tmp_path):
