@@ -53,7 +53,7 @@ def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_
     pods.mkdir()
     (pods / "evicted").write_text("1")
     command = on_kubernetes(place)
-    environment = kubectl(tmp_path / "bin", f'exec "{sys.executable}" "{ROOT}/tests/dag/kubectl.py" "$@"')
+    environment = kubectl(tmp_path / "bin", f'exec "{sys.executable}" "{ROOT}/tests/support/kubectl.py" "$@"')
     # pods.py takes the environment's python3.
     (tmp_path / "bin" / "python3").symlink_to(sys.executable)
     environment["KUBECTL_FOLDER"] = str(pods)

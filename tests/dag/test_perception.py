@@ -5,13 +5,11 @@ import re
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.core.artifacts import Observations
-from tests.stages.test_perceive import perceived
 from tests.support.filmed import film, write_raw
+from tests.support.perceived import final_data, perceived
 from tests.support.phystwin_case import dump
 from tests.support.project import copy_finished, copy_workflow, jobs, run
 
@@ -157,7 +155,7 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(place):
     capture = film(place / "mine" / "film", up="-z")
     seen = perceived(capture, place / "seen")
     case = write_raw(capture, place / "data" / "film")
-    dump(case / "final_data.pkl", final_data_of(seen))
+    dump(case / "final_data.pkl", final_data(seen))
     table = place / "config" / "scenarios.tsv"
     table.write_text(table.read_text() + "film\tphystwin\ttoy\tfilm\tfalse\ttrue\n")
     changes = {"scenarios": ["film"], "methods": ["search_only"], "compare_with": "search_only", "data_root": str(place / "data")}
@@ -175,19 +173,6 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(place):
     # Without its images the case has no pictures, and the rest runs.
     shutil.rmtree(case / "color")
     assert "appearance" not in jobs(run(place, changes | {"results": "other"}, "--dry-run"))
-
-
-def final_data_of(seen: Observations) -> dict[str, np.ndarray]:
-    visible = seen.object_visibility
-    return {
-        "object_points": seen.object_points.astype(float),
-        "object_colors": np.where(visible[..., None], 0.5, 0.0) * np.ones(3),
-        "object_visibilities": visible,
-        "object_motions_valid": seen.object_motion_valid,
-        "controller_points": seen.controller_points.astype(float),
-        "surface_points": seen.surface_points.astype(float),
-        "interior_points": seen.interior_points.astype(float),
-    }
 
 
 def test_a_capture_that_is_not_there_is_named_before_any_job(place):

@@ -23,8 +23,8 @@ from neuspring.splats.draw import turned
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
 from neuspring.stages import appearance
-from tests.stages.test_perceive import SETTINGS, perceived
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
+from tests.support.perceived import SETTINGS, perceived
 
 IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
 

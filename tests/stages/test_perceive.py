@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config import Config, ScenarioRow
-from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling, Segmentation
+from neuspring.config import ScenarioRow
+from neuspring.config.perception import Lift, Segmentation
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
@@ -16,31 +16,8 @@ from neuspring.data import phystwin
 from neuspring.data.capture import Capture
 from neuspring.stages import perceive, stages
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
+from tests.support.perceived import ROW, SETTINGS, final_data, perceived
 from tests.support.phystwin_case import dump, write_json
-
-ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
-SETTINGS = Config(
-    scenarios=("film",),
-    perception=Perception(
-        track=PointTracking(opencv=OpenCvTracking(points=400)),
-        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
-        sample=Sampling(voxel=0.015),
-    ),
-)
-
-
-def perceived(capture: Capture, folder, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
-    """All steps through their records, as the workflow calls them."""
-    masks, tracks = [], []
-    for camera in capture.cameras:
-        masks.append(folder / camera / "masks.json")
-        tracks.append(folder / camera / "tracks.json")
-        masks[-1].parent.mkdir(parents=True)
-        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
-        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
-    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
-    return Observations.load(folder / "observations.npz")
 
 
 @pytest.fixture(scope="module")
@@ -123,20 +100,7 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
 def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp_path):
     observations = perceived(film(tmp_path / "capture", cameras=2, up="-z"), tmp_path)
     case = tmp_path / "different_types" / "film"
-    visible = observations.object_visibility
-    dump(
-        case / "final_data.pkl",
-        {
-            "object_points": observations.object_points.astype(float),
-            "object_colors": np.where(visible[..., None], 0.5, 0.0) * np.ones(3),
-            "object_visibilities": visible,
-            "object_motions_valid": observations.object_motion_valid,
-            "controller_points": observations.controller_points.astype(float),
-            "surface_points": observations.surface_points.astype(float),
-            "interior_points": observations.interior_points.astype(float),
-            "controller_mask": np.arange(observations.controller_points.shape[1]),
-        },
-    )
+    dump(case / "final_data.pkl", final_data(observations))
     write_json(case / "split.json", {"frame_len": FRAMES, "train": [0, 4], "test": [4, FRAMES]})
     dump(case / "gt_track_3d.pkl", observations.tracks.astype(float))
     read = phystwin.read(replace(ROW, source="phystwin", path=str(case)), case)

@@ -1,0 +1,50 @@
+"""All perception steps on a small film, through their records as the workflow calls them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.config import Config, ScenarioRow
+from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling
+from neuspring.core.artifacts import Observations
+from neuspring.data.capture import Capture
+from neuspring.stages import perceive, stages
+
+ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
+SETTINGS = Config(
+    scenarios=("film",),
+    perception=Perception(
+        track=PointTracking(opencv=OpenCvTracking(points=400)),
+        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
+        sample=Sampling(voxel=0.015),
+    ),
+)
+
+
+def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
+    """What perception finds in a capture; its records and files are in the folder."""
+    masks, tracks = [], []
+    for camera in capture.cameras:
+        masks.append(folder / camera / "masks.json")
+        tracks.append(folder / camera / "tracks.json")
+        masks[-1].parent.mkdir(parents=True)
+        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
+        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
+    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
+    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
+    return Observations.load(folder / "observations.npz")
+
+
+def final_data(observations: Observations) -> dict[str, np.ndarray]:
+    """Observations as the contents of PhysTwin's `final_data.pkl`."""
+    visible = observations.object_visibility
+    return {
+        "object_points": observations.object_points.astype(float),
+        "object_colors": np.where(visible[..., None], 0.5, 0.0) * np.ones(3),
+        "object_visibilities": visible,
+        "object_motions_valid": observations.object_motion_valid,
+        "controller_points": observations.controller_points.astype(float),
+        "surface_points": observations.surface_points.astype(float),
+        "interior_points": observations.interior_points.astype(float),
+        "controller_mask": np.arange(observations.controller_points.shape[1]),
+    }
