@@ -18,6 +18,8 @@ from neuspring.core.job_records import Attempt, read_jobs
 from tests.support import slurm
 from tests.support.project import ROOT, SCENE, config_with, copy_workflow
 
+pytestmark = pytest.mark.slow
+"""Small versions: what a profile asks of a cluster in test_profiles and, with a stand-in for the cluster, in test_kubernetes."""
 GPU_RULES = {"search", "fit", "rollout"}
 PATIENCE = 600
 """s for the whole benchmark; it took 225 on two cores that five processes shared."""

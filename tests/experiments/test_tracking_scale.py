@@ -22,6 +22,8 @@ from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import query as tracking_query
 from tests.support import loggers, stores
 
+pytestmark = pytest.mark.slow
+"""Small versions: a few processes and a failing server in test_tracking."""
 SMALL: dict[str, Any] = {"histories": {}, "artifacts": {"twin": ["twin.npz"]}, "params": {"fit.epochs": 3}}
 
 

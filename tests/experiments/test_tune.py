@@ -465,6 +465,7 @@ def test_two_workers_and_a_kill_make_exactly_the_trials_asked_for(folder, monkey
     two_workers(folder, study(trials=6, workers=2, pruner="none"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(stores.without_postgres()), reason=stores.without_postgres())
 def test_postgresql_holds_a_study(folder, monkeypatch):
     monkeypatch.setattr(stages, "search", stages.search)
