@@ -1,4 +1,7 @@
-"""Raw RGBD through the real workflow: a synthetic package at the smallest size, and a folder of the user's own."""
+"""Raw RGBD through the real workflow: a synthetic package at the smallest size, and a folder of the user's own.
+
+What the steps compute is tested in tests/stages, without the workflow; here only plans are quick.
+"""
 
 import json
 import re
@@ -36,6 +39,7 @@ def perceived_run(tmp_path_factory):
     return project
 
 
+@pytest.mark.slow
 def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(perceived_run):
     results = perceived_run / "results"
     scores = pd.read_parquet(results / "tables" / "scores.parquet")
@@ -49,17 +53,30 @@ def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(perceived_
     assert "| package " in (results / "tables" / "perception.md").read_text()
 
 
-def test_cameras_are_perceived_by_jobs_of_their_own_and_nothing_reruns(perceived_run):
+def test_cameras_are_perceived_by_jobs_of_their_own_and_all_methods_share_one_appearance(project):
+    jobs = plan(project, SYNTHETIC)
+    assert (jobs["synthesise"], jobs["segment"], jobs["track"], jobs["lift"], jobs["observe"]) == (1, 3, 3, 1, 1)
+    jobs = plan(project, SYNTHETIC | {"methods": ["search_only", "baseline", "neuspring"], "seeds": [0, 1]})
+    assert (jobs["appearance"], jobs["render"], jobs["score"]) == (2, 6, 6)
+    # A run without images has no such steps.
+    assert "render" not in plan(project, SYNTHETIC | {"images": {"enabled": False}})
+
+
+@pytest.mark.slow
+def test_a_change_leaves_the_steps_before_it_alone(perceived_run):
     assert plan(perceived_run, SYNTHETIC) == {}
-    anew = plan(perceived_run, SYNTHETIC | {"results": "other"})
-    assert (anew["synthesise"], anew["segment"], anew["track"], anew["lift"], anew["observe"]) == (1, 3, 3, 1, 1)
-    # A change of the last step leaves the steps before it alone.
-    changed = SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}}
-    jobs = plan(perceived_run, changed)
+    jobs = plan(perceived_run, SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}})
     assert "lift" not in jobs
     assert jobs["observe"] == 1
+    # What concerns drawing alone does not train again.
+    jobs = plan(perceived_run, SYNTHETIC | {"images": {"views": "all", "appearance": {"iterations": 40}}})
+    assert "appearance" not in jobs
+    assert (jobs["render"], jobs["score"]) == (1, 1)
+    quirk = {"released_quirks": {"any_alpha": True}, "appearance": {"iterations": 40}}
+    assert "appearance" not in plan(perceived_run, SYNTHETIC | {"images": quirk})
 
 
+@pytest.mark.slow
 def test_predictions_are_drawn_scored_and_filmed(perceived_run):
     run_folder = perceived_run / "results" / PACKAGE / "search_only" / "0"
     scores = pd.read_parquet(run_folder / "scores.parquet")
@@ -89,19 +106,6 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
     assert {path.name for path in folder.iterdir()} == {"appearance.json", "appearance.png", "history.parquet", "splats.ply"}
 
 
-def test_all_methods_share_one_appearance(perceived_run):
-    changes = SYNTHETIC | {"methods": ["search_only", "baseline", "neuspring"], "seeds": [0, 1]}
-    jobs = plan(perceived_run, changes | {"results": "other"})
-    assert (jobs["appearance"], jobs["render"], jobs["score"]) == (2, 6, 6)
-    # What concerns drawing alone does not train again; a run without images has no such steps.
-    jobs = plan(perceived_run, SYNTHETIC | {"images": {"views": "all", "appearance": {"iterations": 40}}})
-    assert "appearance" not in jobs
-    assert (jobs["render"], jobs["score"]) == (1, 1)
-    quirk = {"released_quirks": {"any_alpha": True}, "appearance": {"iterations": 40}}
-    assert "appearance" not in plan(perceived_run, SYNTHETIC | {"images": quirk})
-    assert "render" not in plan(perceived_run, SYNTHETIC | {"results": "other", "images": {"enabled": False}})
-
-
 @pytest.mark.slow
 def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
     project = copy_project(perceived_run, tmp_path / "project")
@@ -123,6 +127,7 @@ def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tm
     assert (folder / "spring_gaus" / "0" / "centres.npz").is_file()
 
 
+@pytest.mark.slow
 def test_the_truth_lies_beside_the_capture_and_not_in_it(perceived_run):
     folder = perceived_run / "results" / PACKAGE
     assert (folder / "capture_truth.npz").is_file()
