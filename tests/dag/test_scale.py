@@ -113,7 +113,7 @@ def test_a_study_named_like_another_target_is_refused(project):
 
 
 def test_a_sweep_without_a_study_is_explained(project):
-    assert "The target sweep needs a study" in run(project, {}, "--dry-run", "--", "sweep", fails=True)
+    assert "the target sweep needs a" in run(project, {}, "--dry-run", "--", "sweep", fails=True).lower()
 
 
 @pytest.mark.slow

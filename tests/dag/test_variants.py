@@ -89,6 +89,7 @@ def names(folder: Path) -> list[str]:
 def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(project):
     # No candidate can be integrated with a single substep, so the search fails numerically.
     changes = {"simulation": {"max_substeps": 1}, "methods": ["search_only"], "tracking": {"enabled": False}}
-    output = run(project, changes, "--", "results/tables/summary.md")
-    assert "0/1 (1 failed)" in output
-    assert "none of 11 candidates could be simulated" in output
+    assert "0/1 (1 failed)" in run(project, changes, "--", "results/tables/summary.md")
+    (row,) = pd.read_csv(project / "results" / "tables" / "runs.csv").to_dict("records")
+    assert row["status"] == "failed"
+    assert "none of 11 candidates could be simulated" in row["reason"]
