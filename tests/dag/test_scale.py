@@ -133,7 +133,7 @@ def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(project, tmp_pat
         (tmp_path / "data" / "different_types" / name).mkdir(parents=True)
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
     command += ["--cores", "8", "--dry-run", "--quiet", "rules"]
-    command += ["--configfile", "config/benchmark.yaml", "--config", f"data_root={tmp_path}"]
+    command += ["--configfile", "config/data/phystwin.yaml", "--config", f"data_root={tmp_path}"]
     output = output_of(start(command, project, **{gpus.VISIBLE: ""}))
     # Of the baselines' models Spring-Gaus needs images, which these folders do not have.
     twins, models = 22 * 18 * 3, 22 * 3 * 3

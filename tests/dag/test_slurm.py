@@ -38,7 +38,7 @@ def slurm_run(tmp_path_factory):
                 [
                     *(sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/slurm"),
                     *("--default-resources", "slurm_partition=main", "--slurm-init-seconds-before-status-checks", "2"),
-                    *("--configfile", "config/config.yaml", "overlay.yaml"),
+                    *("--configfile", "config/data/demo.yaml", "overlay.yaml"),
                 ],
                 cwd=project,
                 env=environment(),

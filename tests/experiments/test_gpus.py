@@ -1,6 +1,7 @@
 """Leases: no two jobs on one slot, no slot lost to a crash, none idle while somebody waits."""
 
 import contextlib
+import functools
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -12,10 +13,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import pynvml  # noqa: F401 - loaded once, not in each of 500 forks
+import pynvml  # noqa: F401 - loaded once, not in each fork
 import pytest
 
 from neuspring.core.errors import InputError
+from neuspring.core.lock import try_lock
 from neuspring.experiments.jobs import gpus
 
 EIGHT = tuple(map(str, range(8)))
@@ -48,15 +50,15 @@ def crowd(folder, durations, at_once):
     return ended, [path.read_text().split() for path in folder.glob("*.journal")]
 
 
-@pytest.mark.parametrize("holders", [60, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("holders", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_no_slot_is_given_twice_or_lost_when_holders_are_killed(tmp_path, holders):
-    draw = random.Random(0)
-    ended, journals = crowd(tmp_path, [draw.uniform(0.05, 0.1) for _ in range(holders)], at_once=16)
+    random_time = random.Random(0)
+    ended, journals = crowd(tmp_path, [random_time.uniform(0.05, 0.1) for _ in range(holders)], at_once=16)
     assert ended == [-signal.SIGKILL] * holders
     assert sum(map(len, journals)) == 2 * holders
     assert all(journal[::2] == journal[1::2] for journal in journals)
-    held = [gpus.acquire(1, EIGHT, folder=tmp_path, timeout=5) for _ in EIGHT]
-    assert sorted(lease.devices[0] for lease in held) == list(EIGHT)
+    leases = [gpus.acquire(1, EIGHT, folder=tmp_path, timeout=5) for _ in EIGHT]
+    assert sorted(lease.devices[0] for lease in leases) == list(EIGHT)
 
 
 def test_two_jobs_of_two_devices_each_do_not_wait_for_each_other(tmp_path):
@@ -94,12 +96,13 @@ def test_a_job_gets_all_its_devices_or_holds_none(tmp_path):
 
 
 def test_jobs_of_a_scenario_return_to_its_device(tmp_path):
-    for scenario in ("rope", "cloth"):
-        gpus.acquire(1, (("0",) if scenario == "rope" else ("1",)), affinity=scenario, folder=tmp_path).release()
-    cloth = gpus.acquire(1, ("0", "1"), affinity="cloth", folder=tmp_path)
+    notes = tmp_path / "notes"
+    for scenario, device in {"rope": "0", "cloth": "1"}.items():
+        gpus.acquire(1, (device,), affinity=scenario, folder=tmp_path, notes=notes).release()
+    cloth = gpus.acquire(1, ("0", "1"), affinity="cloth", folder=tmp_path, notes=notes)
     assert cloth.devices == ("1",)
     # A wish, not a condition: the other device is taken rather than waited for.
-    assert gpus.acquire(1, ("0", "1"), affinity="cloth", folder=tmp_path, timeout=0).devices == ("0",)
+    assert gpus.acquire(1, ("0", "1"), affinity="cloth", folder=tmp_path, notes=notes, timeout=0).devices == ("0",)
 
 
 def test_a_lease_outlives_its_wrapper_while_the_command_runs(tmp_path):
@@ -126,201 +129,141 @@ def test_a_folder_of_leases_that_cannot_be_used_is_named(tmp_path, monkeypatch):
         gpus.lock_folder()
 
 
-def fail_on(device, folder, *, gone=True):
-    """A job that is lost on a device."""
-    lease = gpus.acquire(1, (device,), folder=folder, timeout=0)
-    lease.lost(gone=gone)
+@pytest.fixture
+def run(tmp_path):
+    """`acquire` as the jobs of one run of the workflow call it."""
+    return functools.partial(gpus.acquire, folder=tmp_path, notes=tmp_path / "notes")
+
+
+def fail_on(device, run, failure=gpus.LOST):
+    """A job that fails by an error of its device."""
+    lease = run(1, (device,), timeout=0)
+    lease.note(failure)
     lease.release()
 
 
-def test_a_lost_device_is_passed_over_and_not_waited_for(tmp_path):
-    fail_on("0", tmp_path)
-    told = []
-    lease = gpus.acquire(1, ("0", "1"), affinity="rope", folder=tmp_path, passing=told.append)
+def test_a_lost_device_is_passed_over_and_not_waited_for(run):
+    fail_on("0", run)
+    messages = []
+    lease = run(1, ("0", "1"), affinity="rope", say=messages.append)
     assert lease.devices == ("1",)
-    assert [list(marks) for marks in told] == [["0"]]
-    assert "lost at" in str(told[0]["0"]) and "tried again from" in str(told[0]["0"])
-    # Device 0 has no holder; one waits for the other all the same.
+    assert messages == ["passed over: GPU 0 (lost)"]
+    # Device 0 has no holder; the next job waits for the other one all the same.
     with pytest.raises(TimeoutError):
-        gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0)
+        run(1, ("0", "1"), timeout=0)
     lease.release()
-    assert gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0).devices == ("1",)
+    assert run(1, ("0", "1"), timeout=0).devices == ("1",)
 
 
-@pytest.mark.parametrize(("boot", "age", "passed_over"), [("a", 60, True), ("b", 60, False), ("a", gpus.LOST_FOR + 60, False)])
-def test_a_loss_counts_until_the_machine_starts_again_or_for_a_while(tmp_path, monkeypatch, boot, age, passed_over):
-    start = tmp_path / "boot_id"
-    start.write_text("a")
-    monkeypatch.setattr(gpus, "BOOT", start)
-    now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now - age)
-    fail_on("0", tmp_path)
-    monkeypatch.setattr(time, "time", lambda: now)
-    start.write_text(boot)
-    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == (("1",) if passed_over else ("0",))
+def test_a_loss_is_forgotten_when_the_next_run_begins(tmp_path, run):
+    fail_on("0", run)
+    assert gpus.acquire(1, ("0", "1"), folder=tmp_path, notes=tmp_path / "of the next run").devices == ("0",)
 
 
-def test_a_device_that_works_again_is_no_longer_passed_over(tmp_path):
-    fail_on("0", tmp_path)
-    mark = next(tmp_path.glob("*.lost"))
-    held = gpus.Lease(("0",), (), 0.0, (mark,))
-    held.worked()
-    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == ("0",)
+def test_a_device_that_works_again_is_no_longer_passed_over(run):
+    lease = run(1, ("0",))
+    lease.note(gpus.LOST)
+    lease.note("")
+    lease.release()
+    assert run(1, ("0", "1")).devices == ("0",)
 
 
-def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(tmp_path):
-    fail_on("0", tmp_path)
-    with pytest.raises(
-        InputError, match=r"a job needs 2 of the GPUs 0, 1, and too few are left; received GPU 0 \(lost at .*nvidia-smi"
-    ):
-        gpus.acquire(2, ("0", "1"), folder=tmp_path)
-    fail_on("1", tmp_path)
-    with pytest.raises(InputError, match=r"received GPU 0 \(lost at .*, GPU 1 \(lost at .*delete .*\*\.lost"):
-        gpus.acquire(1, ("0", "1"), folder=tmp_path)
-    for mark in tmp_path.glob("*.lost"):
-        mark.unlink()
-    assert gpus.acquire(1, ("0", "1"), folder=tmp_path).devices == ("0",)
+def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(run):
+    fail_on("0", run)
+    with pytest.raises(InputError, match=r"needs 2 of the GPUs 0, 1, and too few are left; received GPU 0 \(lost\).*nvidia-smi"):
+        run(2, ("0", "1"))
+    fail_on("1", run)
+    with pytest.raises(InputError, match=r"received GPU 0 \(lost\), GPU 1 \(lost\)"):
+        run(1, ("0", "1"))
 
 
-def test_a_device_lost_while_others_wait_for_it_ends_their_wait(tmp_path):
-    lease = gpus.acquire(1, ("0",), folder=tmp_path)
+def test_a_device_lost_while_others_wait_for_it_ends_their_wait(run):
+    lease = run(1, ("0",))
 
-    def lose():
-        lease.lost(gone=True)
+    def lose(text):
+        lease.note(gpus.LOST)
         lease.release()
 
     with pytest.raises(InputError, match="too few are left"):
-        gpus.acquire(1, ("0",), folder=tmp_path, timeout=20, waiting=lose)
+        run(1, ("0",), timeout=20, say=lose)
 
 
-def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(tmp_path):
-    fail_on("0", tmp_path, gone=False)
-    second = gpus.acquire(1, ("0", "1"), folder=tmp_path)
+def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(run):
+    fail_on("0", run, gpus.SUSPECT)
+    second = run(1, ("0", "1"))
     assert second.devices == ("1",)
     with pytest.raises(TimeoutError):
-        gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0)
+        run(1, ("0", "1"), timeout=0)
     second.release()
-    fail_on("1", tmp_path, gone=False)
+    fail_on("1", run, gpus.SUSPECT)
     # None is beyond doubt: the one whose failure is longest ago comes first.
-    first = gpus.acquire(1, ("1", "0"), folder=tmp_path)
+    first = run(1, ("1", "0"))
     assert first.devices == ("0",)
-    first.worked()
+    first.note("")
     first.release()
-    assert [gpus.acquire(1, ("1", "0"), folder=tmp_path).devices for _ in range(2)] == [("0",), ("0",)]
+    assert run(1, ("1", "0")).devices == ("0",)
 
 
-def test_of_two_jobs_on_a_lost_device_the_one_that_knows_is_believed(tmp_path):
-    first, second = (gpus.acquire(1, ("0",), jobs_per_gpu=2, folder=tmp_path) for _ in range(2))
-    first.lost(gone=True)
-    second.lost(gone=False)
+def test_of_two_jobs_on_a_lost_device_the_one_that_knows_is_believed(run):
+    first, second = (run(1, ("0",), jobs_per_gpu=2) for _ in range(2))
+    first.note(gpus.LOST)
+    second.note(gpus.SUSPECT)
     with pytest.raises(InputError, match="too few are left"):
-        gpus.acquire(1, ("0",), jobs_per_gpu=2, folder=tmp_path)
+        run(1, ("0",), jobs_per_gpu=2)
 
 
-def test_a_damaged_mark_counts_for_nothing(tmp_path):
+def test_damaged_notes_count_for_nothing(tmp_path, run):
     for text in ("", "{", "[]", '{"time": "x"}'):
-        (tmp_path / "0.lost").write_text(text)
-        gpus.acquire(1, ("0",), folder=tmp_path, timeout=0).release()
+        (tmp_path / "notes").write_text(text)
+        run(1, ("0",), timeout=0).release()
 
 
-@pytest.fixture
-def private():
-    before = os.umask(0o077)
-    yield
-    os.umask(before)
-
-
-def mode(path):
-    return path.stat().st_mode & 0o7777
-
-
-@pytest.mark.usefixtures("private")
-def test_a_folder_that_is_made_for_sharing_is_open_to_all_users_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(Path, "chmod", lambda *_: None)  # another user may come before it
-    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
-    assert mode(gpus.lock_folder()) == 0o1777
-    lease = gpus.acquire(1, ("0",))
-    lease.lost(gone=True)
-    assert {path.name: mode(path) for path in (tmp_path / "locks").iterdir()} == dict.fromkeys(
-        ("allocation.lock", "names.json", "0.0.lock", "0.lost"), 0o666
-    )
-    assert os.umask(0o077) == 0o077, "the user's own files stay private"
-
-
-def test_a_folder_that_was_there_keeps_its_rights(tmp_path, monkeypatch):
-    (tmp_path / "locks").mkdir(mode=0o750)
-    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
-    assert mode(gpus.lock_folder()) == 0o750
-
-
-def test_another_user_s_file_is_opened_as_the_kernel_allows_it_in_a_shared_folder(tmp_path, monkeypatch):
-    """With O_CREAT it does not, even where the file may be written to (fs.protected_regular, which is off on some machines)."""
-    gpus.acquire(1, ("0",), folder=tmp_path).release()
-    opened = []
-
-    def watched(path, flags, *rest):
-        opened.append(flags)
-        return os_open(path, flags, *rest)
-
-    os_open = os.open
-    monkeypatch.setattr(os, "open", watched)
-    gpus.acquire(1, ("0",), folder=tmp_path).release()
-    assert opened and not any(flags & os.O_CREAT for flags in opened)
+def test_a_disk_that_takes_no_notes_fails_no_job(tmp_path):
+    lease = gpus.acquire(1, ("0",), affinity="rope", folder=tmp_path, notes=tmp_path / "0.0.lock" / "notes")
+    lease.note(gpus.LOST)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="acts as two users")
 def test_two_users_share_devices(monkeypatch):
     # pytest's own folders are closed to other users.
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder).chmod(0o777)
-        monkeypatch.setenv(gpus.LOCKS, str(Path(folder) / "locks"))
-        for user, expected in ((1001, ("0",)), (1002, ("1",)), (1001, ("1",))):
-            process = FORK.Process(target=lose_as, args=(user, expected))
+        Path(folder).chmod(0o1777)
+        monkeypatch.setenv(gpus.LOCKS, folder)
+        locks = Path(folder)
+        for user, expected in ((1001, ("0",)), (1002, ("0",)), (1001, ("0",))):
+            process = FORK.Process(target=lease_as, args=(user, expected))
             process.start()
             process.join(20)
             assert process.exitcode == 0, (user, expected)
+        with try_lock(locks / "0.0.lock"):
+            process = FORK.Process(target=lease_as, args=(1002, ("1",)))
+            process.start()
+            process.join(20)
+            assert process.exitcode == 0
 
 
-def lose_as(user, expected):
-    """Lose device 0, if it is free to be lost, as another user with a private umask."""
-    os.umask(0o077)
+def lease_as(user, expected):
+    """Lease a device as another user."""
     os.setuid(user)
-    lease = gpus.acquire(1, ("0", "1"))
-    assert lease.devices == expected
-    if expected == ("0",):
-        lease.lost(gone=True)
+    assert gpus.acquire(1, ("0", "1")).devices == expected
 
 
 class Driver:
-    """NVML of a machine with two GPUs, of which those in `gone` have fallen off the bus."""
-
-    gone: tuple[str, ...] = ()
+    """NVML of a machine with two GPUs."""
 
     def nvmlDeviceGetHandleByIndex(self, index):
-        if str(index) in self.gone:
-            raise RuntimeError("GPU is lost")
         return index
+
+    def nvmlDeviceGetHandleByUUID(self, name):
+        return name.removeprefix("GPU-")
 
     def nvmlDeviceGetUUID(self, handle):
         return f"GPU-{handle}"
 
 
-def test_a_lost_device_keeps_its_name_where_the_driver_no_longer_tells_it(tmp_path, monkeypatch):
-    driver = Driver()
-    monkeypatch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(driver))
-    lease = gpus.acquire(1, ("0", "1"), folder=tmp_path)
-    driver.gone = lease.devices
-    lease.lost(gone=True)
-    lease.release()
-    passed = {}
-    assert gpus.acquire(1, ("0", "1"), folder=tmp_path, passing=passed.update).devices == ("1",)
-    assert list(passed) == ["0"]
-    # Where NVML does not start at all, a slot that is held under one name is not free under another.
-    monkeypatch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(None))
-    (other := tmp_path / "other").mkdir()
-    with monkeypatch.context() as patch:
-        patch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(Driver()))
-        second = gpus.acquire(1, ("0",), folder=other)
+def test_index_and_uuid_of_a_device_are_one_slot(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpus, "nvml", lambda: contextlib.nullcontext(Driver()))
+    lease = gpus.acquire(1, ("0",), folder=tmp_path)
     with pytest.raises(TimeoutError):
-        gpus.acquire(1, ("0",), folder=other, timeout=0.1)
-    second.release()
+        gpus.acquire(1, ("GPU-0",), folder=tmp_path, timeout=0.1)
+    lease.release()

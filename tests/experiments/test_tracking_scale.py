@@ -23,16 +23,7 @@ from neuspring.experiments.tracking import query as tracking_query
 from tests.support import loggers, stores
 
 pytestmark = pytest.mark.slow
-"""Small versions: a few processes and a failing server in test_tracking."""
 SMALL: dict[str, Any] = {"histories": {}, "artifacts": {"twin": ["twin.npz"]}, "params": {"fit.epochs": 3}}
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A migrated database. Making one takes seconds, copying it does not."""
-    results = tmp_path_factory.mktemp("template")
-    assert tracking.init(results, Tracking(experiment="template"))["outcome"] == "ready"
-    return results / "mlflow.db"
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +128,9 @@ def test_a_server_killed_under_load_loses_and_doubles_no_run(tmp_path: Path, bac
     kill_in_the_middle(0, tmp_path, process, results, settings)
     stores.wait_until(lambda: len(loggers.outcomes(tmp_path)) >= 4, process, "four runs")
     server.kill()
-    said = finish(process, tmp_path)
-    assert set(said) == {"logged", "unreachable"} and said["logged"] >= 4
-    assert said.total() < 20, "the killed logger never came to its other records"
+    outcomes = finish(process, tmp_path)
+    assert set(outcomes) == {"logged", "unreachable"} and outcomes["logged"] >= 4
+    assert outcomes.total() < 20, "the killed logger never came to its other records"
 
     begin = time.monotonic()
     ((outcome, names),) = tracking.sync(results, settings).items()
@@ -149,7 +140,7 @@ def test_a_server_killed_under_load_loses_and_doubles_no_run(tmp_path: Path, bac
     synced = Counter({name: len(of) for name, of in tracking.sync(results, settings).items()})
     assert synced["logged"] + synced["already logged"] == 20
     # A run whose last tag arrived, but not the answer, is said to be unreachable and is there.
-    assert synced["already logged"] >= said["logged"]
+    assert synced["already logged"] >= outcomes["logged"]
     assert_every_run_is_there_once(results, settings, groups)
     assert "KILLED" in {run.info.status for run in all_runs(results, settings)}, "what the killed logger had begun"
     assert {name: len(of) for name, of in tracking.sync(results, settings).items()} == {"already logged": 20}
@@ -164,8 +155,8 @@ def test_a_database_that_crashes_behind_the_server_loses_and_doubles_no_run(
     process = loggers.start(groups, results, settings, tmp_path)
     stores.wait_until(lambda: len(loggers.outcomes(tmp_path)) >= 3, process, "three runs")
     cluster.stop(signal.SIGQUIT)
-    said = finish(process, tmp_path)
-    assert set(said) == {"logged", "unreachable"} and said.total() == 16
+    outcomes = finish(process, tmp_path)
+    assert set(outcomes) == {"logged", "unreachable"} and outcomes.total() == 16
     cluster.start()
     synced = Counter({name: len(of) for name, of in tracking.sync(results, settings).items()})
     assert synced["logged"] + synced["already logged"] == 16

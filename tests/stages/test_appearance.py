@@ -11,64 +11,20 @@ import pandas as pd
 import pytest
 import torch
 
-from neuspring.config import Config
-from neuspring.config.images import Appearance, ImageQuirks, Images, LpipsWeights
-from neuspring.core.artifacts import SplatCentres, Trajectory
+from neuspring.config.images import ImageQuirks, LpipsWeights
+from neuspring.core.artifacts import SplatCentres
 from neuspring.core.errors import InputError
-from neuspring.core.records import StageRecord, Stopwatch
+from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import HANDS, Capture
 from neuspring.perception.results import Masks
 from neuspring.scores import metrics
 from neuspring.splats.draw import turned
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
-from neuspring.stages import appearance
+from neuspring.stages import appearance, draw, render
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
-from tests.support.perceived import SETTINGS, perceived
-
-IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
-
-
-def settings(**changes: object) -> Config:
-    return dataclasses.replace(SETTINGS, images=dataclasses.replace(IMAGES, **changes))
-
-
-class Scene:
-    """A filmed scene with its perception, and what the steps of appearance make of it."""
-
-    def __init__(self, capture: Capture, folder) -> None:
-        self.capture, self.folder = capture, folder
-        self.observations = perceived(capture, folder)
-        self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
-        self.appearance = folder / "appearance" / "appearance.json"
-
-    def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
-        self.appearance.parent.mkdir(exist_ok=True)
-        lifted = self.folder / "lifted.json"
-        appearance.learn(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
-        return StageRecord.load(self.appearance)
-
-    def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
-        """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
-        path = self.folder / name / "rollout.json"
-        path.parent.mkdir(exist_ok=True)
-        nodes = self.observations.nodes
-        positions = nodes + np.arange(frames)[:, None, None] * step
-        ended = {} if frames == FRAMES else {"diverged_frame": frames, "reason": "test"}
-        Trajectory(positions=positions, frame_count=FRAMES, **ended).save(path.with_name("trajectory.npz"))
-        status = "ok" if frames == FRAMES else "failed"
-        record = Stopwatch().stage(
-            "rollout", status, {"trajectory": path.with_name("trajectory.npz")}, reason="" if status == "ok" else "rollout: test"
-        )
-        record.save(path)
-        return path
-
-    def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
-        output = rollout.with_name("render.json")
-        paths = (self.masks, self.folder / "observations.npz", self.appearance, rollout)
-        appearance.render(self.capture.folder, *paths, chosen, "cpu", output)
-        record = StageRecord.load(output)
-        return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None
+from tests.support.pictured import IMAGES, Scene
+from tests.support.pictured import pictured as settings
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +145,7 @@ def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_p
         (tmp_path / kind).symlink_to(scene.capture.folder / kind)
     rollout = scene.roll(STEP, "covered")
     paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
-    appearance.render(tmp_path, *paths, settings(video=False), "cpu", rollout.with_name("render.json"))
+    render.run(tmp_path, *paths, settings(video=False), "cpu", rollout.with_name("render.json"))
     record = StageRecord.load(rollout.with_name("render.json"))
     assert record.facts["empty_frames"] == 1
     table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
@@ -206,13 +162,13 @@ def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
     SplatCentres(positions=splats.means + np.arange(FRAMES)[:, None, None] * STEP).save(path)
     before = StageRecord.load(rollout)
     files = {"trajectory": rollout.with_name("trajectory.npz"), "centres": path}
-    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    Recorder("rollout", rollout).save(files)
     record, drawn = scene.render(rollout, settings())
     # The nodes stand still, the splats do not; all of them are drawn, also faint ones.
     assert record.facts["splats"] == len(splats.means)
     assert mean(drawn, "iou", FRAMES - 1) > 0.85
     SplatCentres(positions=splats.means[None, 1:]).save(path)
-    Stopwatch().stage("rollout", "ok", files).save(rollout)
+    Recorder("rollout", rollout).save(files)
     with pytest.raises(InputError, match="one centre for each of"):
         scene.render(rollout, settings())
     before.save(rollout)
@@ -221,18 +177,18 @@ def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
 def test_pictures_of_any_camera_and_frame(scene, tmp_path):
     rollout = scene.roll(STEP, "drawn")
     common = (scene.capture.folder, scene.appearance, rollout)
-    made = appearance.draw(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
+    made = draw.run(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
     assert [path.name for path in made] == ["00001.png", "00004.png"]
     white = cv2.imread(str(made[0]), cv2.IMREAD_UNCHANGED)
-    black = cv2.imread(str(appearance.draw(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
+    black = cv2.imread(str(draw.run(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
     assert white.shape == (SIZE[1], SIZE[0], 4)
     assert np.array_equal(white[..., 3], black[..., 3])
     # Over a background c the colour is colour over black + (1 - coverage) c.
     assert np.abs(white[..., :3].astype(int) - black[..., :3] - (255 - black[..., 3:].astype(int))).max() <= 2
     with pytest.raises(InputError, match="must be a camera of"):
-        appearance.draw(*common, "7", None, "black", settings(), "cpu", tmp_path)
+        draw.run(*common, "7", None, "black", settings(), "cpu", tmp_path)
     with pytest.raises(InputError, match=r"frames 0 to 5; received \[9\]"):
-        appearance.draw(*common, "0", [9], "black", settings(), "cpu", tmp_path)
+        draw.run(*common, "0", [9], "black", settings(), "cpu", tmp_path)
 
 
 def test_training_follows_its_seed_and_repeats(scene, tmp_path):
@@ -274,7 +230,7 @@ def spoiled(scene: Scene, folder, **changes: object) -> Capture:
 
 def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
     lifted = scene.folder / "lifted.json"
-    appearance.learn(capture.folder, masks or scene.masks, settings(), 0, "cpu", tmp_path / "appearance.json", lifted_record=lifted)
+    appearance.run(capture.folder, masks or scene.masks, settings(), 0, "cpu", tmp_path / "appearance.json", lifted_record=lifted)
 
 
 def test_a_camera_inside_the_object_is_named(scene, tmp_path):
@@ -293,7 +249,7 @@ def with_masks(scene: Scene, folder, labels: np.ndarray) -> list:
     """The scene's masks, camera 0's replaced."""
     folder.mkdir()
     Masks(labels=labels, backend="given").save(folder / "masks.npz")
-    Stopwatch().stage("segment", "ok", {"masks": folder / "masks.npz"}).save(folder / "masks.json")
+    Recorder("segment", folder / "masks.json").save({"masks": folder / "masks.npz"})
     return [folder / "masks.json", *scene.masks[1:]]
 
 
@@ -316,7 +272,7 @@ def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
     rollout = scene.roll(STEP, "length")
     paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
     with pytest.raises(InputError, match=r"capture\.json: must have as many frames as .*observations\.npz: 6.*received 5.*enabled"):
-        appearance.render(shorter.folder, *paths, settings(), "cpu", rollout.with_name("render.json"))
+        render.run(shorter.folder, *paths, settings(), "cpu", rollout.with_name("render.json"))
 
 
 def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
@@ -328,7 +284,7 @@ def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene,
 def test_processed_data_need_no_lifted_points(scene, tmp_path):
     """As of PhysTwin's released cases: masks are lifted, surface points of the observations stand for the shape prior."""
     output, seen = tmp_path / "appearance.json", scene.folder / "observations.npz"
-    appearance.learn(scene.capture.folder, scene.masks, settings(), 0, "cpu", output, observations_path=seen)
+    appearance.run(scene.capture.folder, scene.masks, settings(), 0, "cpu", output, observations_path=seen)
     facts = StageRecord.load(output).facts
     assert facts["unseen_surface"] is None
     assert all(facts[f"psnr_{name}"] > 25 for name in scene.capture.cameras)

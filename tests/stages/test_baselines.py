@@ -8,25 +8,23 @@ import pandas as pd
 import pytest
 
 from neuspring import config
+from neuspring.baselines import BASELINES
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
-from neuspring.baselines.gs_dynamics.predict import predict
+from neuspring.baselines.gs_dynamics.predict import predict as predicted
 from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.config import baselines as config_baselines
 from neuspring.config.baselines import Baselines
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.config.images import Appearance, Images
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.artifacts import Observations, SplatCentres, Trajectory
 from neuspring.core.errors import InputError
-from neuspring.core.records import StageRecord, Stopwatch
+from neuspring.core.records import Recorder, StageRecord
 from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
-from neuspring.stages import baselines as stages_baselines
-from neuspring.stages import stages
-from tests.stages.test_appearance import Scene
-from tests.stages.test_appearance import settings as pictured_settings
+from neuspring.stages import predict, score, train, transfer
 from tests.support import small
 from tests.support.filmed import FRAMES, film
+from tests.support.pictured import Scene, pictured
 
 POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbours=8, full_neighbours=6, bound_anchors=6)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
@@ -48,12 +46,12 @@ def run_all(seen, model: str, chosen: config.Config):
     """Train, predict and score; returns the path of run.json."""
     folder = seen.parent / model / "0"
     trained = None
-    if model in config_baselines.TRAINING:
+    if BASELINES[model].trained:
         trained = folder / "train.json"
-        stages_baselines.train(seen, model, chosen, 0, "cpu", trained)
-    stages_baselines.predict(seen, model, trained, None, "cpu", folder / "rollout.json")
+        train.run(seen, model, chosen, 0, "cpu", trained)
+    predict.run(seen, model, trained, None, "cpu", folder / "rollout.json")
     records = ({"train": trained} if trained else {}) | {"rollout": folder / "rollout.json"}
-    stages.score(seen, records, model, {"model": model}, 0, folder / "run.json")
+    score.run(seen, records, model, {"model": model}, 0, folder / "run.json")
     return folder / "run.json"
 
 
@@ -62,7 +60,7 @@ def test_every_model_passes_through_every_stage(seen, model):
     run = run_all(seen, model, settings())
     record = json.loads(run.read_text())
     assert (record["status"], record["held_file"]) == ("ok", None)
-    trained = model in config_baselines.TRAINING
+    trained = BASELINES[model].trained
     assert ("train" in record["timings"], "train" in record["histories"]) == (trained, trained)
     scores = pd.read_parquet(run.with_name("scores.parquet"))
     assert set(scores["task"]) == {"reconstruction", "future"}
@@ -80,7 +78,7 @@ def test_training_reads_no_frame_of_the_future(seen, tmp_path, model):
     small.spoiled_future().save(other)
     found = []
     for path in (seen, other):
-        stages_baselines.train(path, model, settings(), 0, "cpu", path.with_name("train.json"))
+        train.run(path, model, settings(), 0, "cpu", path.with_name("train.json"))
         found.append(StageRecord.load(path.with_name("train.json")).files["model"][1])
     assert found[0] == found[1]
 
@@ -89,12 +87,12 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
     out, target = seen.parent / "gs_dynamics" / "0", tmp_path / "other" / "observations.npz"
     other = small.scene("rope/shake/smooth").observations
     other.save(target)
-    stages_baselines.train(seen, "gs_dynamics", settings(), 0, "cpu", out / "train.json")
-    stages.transfer([target], out / "train.json", "gs_dynamics", 0, settings(), "cpu", out / "transfer.json")
+    train.run(seen, "gs_dynamics", settings(), 0, "cpu", out / "train.json")
+    transfer.run([target], out / "train.json", "gs_dynamics", 0, settings(), "cpu", out / "transfer.json")
     scores = pd.read_parquet(out / "transfer.parquet")
     model = GsDynamicsModel.load(out / "model.npz")
     frames = {"transfer": range(1, other.scenario.frame_count)}
-    wanted = metrics.score_tasks(predict(model, other, "cpu").trajectory, other, "gs_dynamics", 0, frames)
+    wanted = metrics.score_tasks(predicted(model, other, "cpu").trajectory, other, "gs_dynamics", 0, frames)
     pd.testing.assert_frame_equal(scores, wanted)
 
 
@@ -118,10 +116,10 @@ def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen)
 
 def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path):
     learned = tmp_path / "appearance.json"
-    Stopwatch().stage("appearance", "failed", reason="appearance: step 3 removed the last splat").save(learned)
-    pictures = stages_baselines.Pictures(tmp_path, [], learned)
+    Recorder("appearance", learned).save(failure="appearance: step 3 removed the last splat")
+    pictures = train.PictureRecords(tmp_path, [], learned)
     out = seen.with_name("train.json")
-    stages_baselines.train(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", out, pictures)
+    train.run(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", out, pictures)
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
     lonely = settings(spring_gaus=replace(POINTS, neighbours=500))
@@ -133,18 +131,18 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
 
 def test_all_that_training_reads_is_in_its_record(seen):
     out = seen.with_name("train.json")
-    stages_baselines.train(seen, "spring_gaus", settings(), 0, "cpu", out)
+    train.run(seen, "spring_gaus", settings(), 0, "cpu", out)
     found = StageRecord.load(out).settings
     assert found["gravity"] == 9.8 and found["losses"]["track"] == 1.0 and found["anchors"] == 60
 
 
 def test_what_is_missing_is_named(seen):
     with pytest.raises(InputError, match="only spring_gaus, gs_dynamics are trained"):
-        stages_baselines.train(seen, "static", settings(), 0, "cpu", seen.with_name("train.json"))
+        train.run(seen, "static", settings(), 0, "cpu", seen.with_name("train.json"))
     with pytest.raises(InputError, match="supervision: masks needs --capture"):
-        stages_baselines.train(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", seen.with_name("train.json"))
+        train.run(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", seen.with_name("train.json"))
     with pytest.raises(InputError, match="model gs_dynamics is trained first"):
-        stages_baselines.predict(seen, "gs_dynamics", None, None, "cpu", seen.with_name("rollout.json"))
+        predict.run(seen, "gs_dynamics", None, None, "cpu", seen.with_name("rollout.json"))
 
 
 @pytest.fixture(scope="module")
@@ -152,21 +150,19 @@ def filmed(tmp_path_factory):
     """A film whose motion is known, with splats of Spring-Gaus' kind."""
     folder = tmp_path_factory.mktemp("filmed")
     scene = Scene(film(folder / "capture"), folder)
-    scene.learn(
-        pictured_settings(appearance=Appearance(iterations=60, degree=0, start="shape_prior", fixed_radius=0.004, spacing=2.0))
-    )
+    scene.learn(pictured(appearance=Appearance(iterations=60, degree=0, start="shape_prior", fixed_radius=0.004, spacing=2.0)))
     return scene
 
 
 def test_silhouettes_train_and_both_outputs_are_written(filmed):
     chosen = replace(settings(spring_gaus=MASKS), images=Images())
-    pictures = stages_baselines.Pictures(filmed.capture.folder, filmed.masks, filmed.appearance)
+    pictures = train.PictureRecords(filmed.capture.folder, filmed.masks, filmed.appearance)
     seen, out = filmed.folder / "observations.npz", filmed.folder / "spring_gaus"
-    stages_baselines.train(seen, "spring_gaus", chosen, 0, "cpu", out / "train.json", pictures)
+    train.run(seen, "spring_gaus", chosen, 0, "cpu", out / "train.json", pictures)
     trained = StageRecord.load(out / "train.json")
     assert trained.status == "ok" and trained.facts["vgg16"].startswith("no VGG16 weights")
     assert {"masks0", "appearance", "observations"} <= set(trained.inputs)
-    stages_baselines.predict(seen, "spring_gaus", out / "train.json", filmed.appearance, "cpu", out / "rollout.json")
+    predict.run(seen, "spring_gaus", out / "train.json", filmed.appearance, "cpu", out / "rollout.json")
     record = StageRecord.load(out / "rollout.json")
     centres = SplatCentres.load(record.file("centres", out / "rollout.json")).positions
     trajectory = Trajectory.load(record.file("trajectory", out / "rollout.json"))
@@ -175,9 +171,9 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     np.testing.assert_allclose(trajectory.positions[0], Observations.load(seen).nodes, atol=1e-6)
     assert record.facts["frame0_shift"] > 0
     assert record.facts["centres_chamfer_reconstruction"] > 0
-    drawn, _ = filmed.render(out / "rollout.json", pictured_settings())
+    drawn, _ = filmed.render(out / "rollout.json", pictured())
     assert drawn.status == "ok" and drawn.facts["splats"] == centres.shape[1]
     run = out / "run.json"
     records = {"train": out / "train.json", "rollout": out / "rollout.json", "render": out / "render.json"}
-    stages.score(seen, records | {"appearance": filmed.appearance}, "spring_gaus", {}, 0, run)
+    score.run(seen, records | {"appearance": filmed.appearance}, "spring_gaus", {}, 0, run)
     assert "without the loss of VGG16's features" in " ".join(json.loads(run.read_text())["notes"])

@@ -14,7 +14,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data import phystwin
 from neuspring.data.capture import Capture
-from neuspring.stages import perceive, stages
+from neuspring.stages import capture, lift, observe, segment
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
 from tests.support.perceived import ROW, SETTINGS, final_data, perceived
 from tests.support.phystwin_case import dump, write_json
@@ -88,7 +88,7 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
     own = film(tmp_path / "own", cameras=2, up="-z", train_end=4)
     case = write_raw(own, tmp_path / "data" / "thing")
     row = ScenarioRow(scenario="film", source="phystwin_raw", category="toy", path="thing", self_collision=False, ground=True)
-    perceive.make_capture(row, replace(SETTINGS, data_root=str(case.parent)), tmp_path / "imported" / "capture.json")
+    capture.run(row, replace(SETTINGS, data_root=str(case.parent)), tmp_path / "imported" / "capture.json")
     imported = Capture.load(tmp_path / "imported")
     assert imported.train_end == 4
     expected, found = perceived(own, tmp_path / "a"), perceived(imported, tmp_path / "b", row)
@@ -111,7 +111,7 @@ def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp
 def test_given_masks_must_be_there(tmp_path):
     capture = film(tmp_path / "capture", cameras=1, masks=False)
     with pytest.raises(InputError, match=r"backend: given needs masks: true.*Choose another backend: opencv"):
-        perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+        segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
 
 
 def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
@@ -121,7 +121,7 @@ def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
         labels[2:22, 2:22] = 1
         labels = np.where((labels == 1) & (frame > 3), 0, labels).astype(np.uint8)
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
-    perceive.segment(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+    segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
     said = capsys.readouterr().out
     assert "the object's mask of frame 0 has 2 pieces far apart; two objects become one twin" in said
     assert "no object in 2 frames, first in frame 4" in said
@@ -139,13 +139,13 @@ def test_a_camera_without_object_and_hand_in_frame_0_is_not_used(tmp_path, capsy
 
 def test_an_unknown_camera_is_named(tmp_path, whole):
     with pytest.raises(InputError, match=r"must have a camera left; received \['0', '1', '2'\]"):
-        perceive.segment(whole[0].folder, "left", SETTINGS, "cpu", tmp_path / "masks.json")
+        segment.run(whole[0].folder, "left", SETTINGS, "cpu", tmp_path / "masks.json")
 
 
 def test_every_camera_s_records_are_required(tmp_path, whole):
     _, _, folder = whole
     with pytest.raises(InputError, match="one record per camera is required"):
-        perceive.lift(whole[0].folder, [folder / "0" / "masks.json"], [folder / "0" / "tracks.json"], SETTINGS, tmp_path / "l.json")
+        lift.run(whole[0].folder, [folder / "0" / "masks.json"], [folder / "0" / "tracks.json"], SETTINGS, tmp_path / "l.json")
 
 
 def test_too_few_controllers_say_what_to_change(tmp_path, whole):
@@ -153,12 +153,12 @@ def test_too_few_controllers_say_what_to_change(tmp_path, whole):
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighbourhood=0.02, least_controllers=3000)))
     records = [[folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")]
     with pytest.raises(InputError, match=r"at least 3000 points of the hands.*perception\.lift has controller_gaps"):
-        perceive.lift(whole[0].folder, *records, settings, tmp_path / "lifted.json")
+        lift.run(whole[0].folder, *records, settings, tmp_path / "lifted.json")
 
 
 def test_raw_video_must_be_perceived_first(tmp_path):
     with pytest.raises(InputError, match="need --capture and --lifted"):
-        stages.observe(ROW, SETTINGS, tmp_path / "observations.npz")
+        observe.run(ROW, SETTINGS, tmp_path / "observations.npz")
 
 
 def test_records_are_plain_json(whole):

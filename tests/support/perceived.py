@@ -8,7 +8,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling
 from neuspring.core.artifacts import Observations
 from neuspring.data.capture import Capture
-from neuspring.stages import perceive, stages
+from neuspring.stages import lift, observe, segment, track
 
 ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
 SETTINGS = Config(
@@ -28,10 +28,10 @@ def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: 
         masks.append(folder / camera / "masks.json")
         tracks.append(folder / camera / "tracks.json")
         masks[-1].parent.mkdir(parents=True)
-        perceive.segment(capture.folder, camera, settings, "cpu", masks[-1])
-        perceive.track(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
-    perceive.lift(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    stages.observe(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
+        segment.run(capture.folder, camera, settings, "cpu", masks[-1])
+        track.run(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
+    lift.run(capture.folder, masks, tracks, settings, folder / "lifted.json")
+    observe.run(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
     return Observations.load(folder / "observations.npz")
 
 

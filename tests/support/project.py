@@ -61,7 +61,7 @@ def arguments(
     overlay.write_text(yaml.safe_dump(config_with(changes or {})))
     command = [sys.executable, "-m", "snakemake", "--profile", f"workflow/profiles/{profile}"]
     command += [] if cores is None else ["--cores", str(cores)]
-    return [*command, "--configfile", "config/config.yaml", str(overlay), *extra]
+    return [*command, "--configfile", "config/data/demo.yaml", str(overlay), *extra]
 
 
 def environment(**variables: str) -> dict[str, str]:

@@ -1,0 +1,56 @@
+"""A filmed scene with its perception, and the steps of appearance on it, for tests that need pictures."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+
+from neuspring.config import Config
+from neuspring.config.images import Appearance, Images
+from neuspring.core.artifacts import Trajectory
+from neuspring.core.records import Recorder, StageRecord
+from neuspring.data.capture import Capture
+from neuspring.stages import appearance, render
+from tests.support.filmed import FRAMES
+from tests.support.perceived import SETTINGS, perceived
+
+IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
+
+
+def pictured(**changes: object) -> Config:
+    return dataclasses.replace(SETTINGS, images=dataclasses.replace(IMAGES, **changes))
+
+
+class Scene:
+    """A filmed scene with its perception, and what the steps of appearance make of it."""
+
+    def __init__(self, capture: Capture, folder) -> None:
+        self.capture, self.folder = capture, folder
+        self.observations = perceived(capture, folder)
+        self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
+        self.appearance = folder / "appearance" / "appearance.json"
+
+    def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
+        self.appearance.parent.mkdir(exist_ok=True)
+        lifted = self.folder / "lifted.json"
+        appearance.run(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
+        return StageRecord.load(self.appearance)
+
+    def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
+        """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
+        path = self.folder / name / "rollout.json"
+        path.parent.mkdir(exist_ok=True)
+        nodes = self.observations.nodes
+        positions = nodes + np.arange(frames)[:, None, None] * step
+        ended = {} if frames == FRAMES else {"diverged_frame": frames, "reason": "test"}
+        Trajectory(positions=positions, frame_count=FRAMES, **ended).save(path.with_name("trajectory.npz"))
+        failure = "" if frames == FRAMES else "rollout: test"
+        Recorder("rollout", path).save({"trajectory": path.with_name("trajectory.npz")}, failure=failure)
+        return path
+
+    def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
+        output = rollout.with_name("render.json")
+        paths = (self.masks, self.folder / "observations.npz", self.appearance, rollout)
+        render.run(self.capture.folder, *paths, chosen, "cpu", output)
+        record = StageRecord.load(output)
+        return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None
