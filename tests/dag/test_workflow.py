@@ -114,17 +114,12 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
     results = tmp_path / "my 'best' results; echo"
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(project / "Snakefile"), "--cores", "1"]
-    target = f"{results}/{SCENE}/observations.npz"
     arguments(project)
-    command += [
-        "--configfile",
-        str(project / "config/config.yaml"),
-        str(project / "overlay.yaml"),
-        "--config",
-        f"results={results}",
-    ]
-    output_of(start([*command, "--", target], elsewhere))
+    overlays = [str(project / name) for name in ("config/data/demo.yaml", "overlay.yaml")]
+    target = f"{results}/{SCENE}/observations.npz"
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(project / "Snakefile"), "--cores", "1"]
+    command += ["--configfile", *overlays, "--config", f"results={results}", "--", target]
+    output_of(start(command, elsewhere))
     assert Path(target).is_file()
     assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
 

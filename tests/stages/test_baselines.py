@@ -19,8 +19,8 @@ from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.artifacts import Observations, SplatCentres, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
-from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
+from neuspring.scores.runs import collect
 from neuspring.stages import predict, score, train, transfer
 from tests.support import small
 from tests.support.filmed import FRAMES, film
@@ -64,7 +64,7 @@ def test_every_model_passes_through_every_stage(seen, model):
     assert ("train" in record["timings"], "train" in record["histories"]) == (trained, trained)
     scores = pd.read_parquet(run.with_name("scores.parquet"))
     assert set(scores["task"]) == {"reconstruction", "future"}
-    assert set(tables.collect(seen.parents[1], ["small"], [model], [0]).runs["status"]) == {"ok"}
+    assert set(collect(seen.parents[1], ["small"], [model], [0]).runs["status"]) == {"ok"}
     if trained:
         history = pd.read_parquet(run.with_name("history.parquet"))
         assert list(history.columns) == ["step", "metric", "value"] and "loss" in set(history["metric"])
