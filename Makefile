@@ -1,14 +1,15 @@
-# make install | demo | test | lint | bench: each makes or reuses .venv by itself.
+# make install | demo | test | test-all | lint | bench: each makes or reuses .venv by itself.
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 SNAKEMAKE := $(BIN)/snakemake --profile workflow/profiles/default
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test lint format bench clean
+.PHONY: install demo test test-slow test-all lint format bench clean
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
@@ -23,7 +24,13 @@ demo: $(INSTALLED)
 	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml
 
 test: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) --dist worksteal -m "not slow"
+
+# Clusters, databases and crowds of processes: a file's tests share one of them, so that a file stays with one worker.
+test-slow: $(INSTALLED)
+	$(PYTEST) --dist loadfile -m slow
+
+test-all: test test-slow
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
-"""The rooms of the package: imports go down only, each room on its floor; what the workflow imports at its start is light."""
+"""Who imports whom: rooms of the package import downwards only, the workflow starts light, and no test imports another test."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -51,3 +52,25 @@ def test_only_the_tracking_package_imports_mlflow():
 def test_what_the_workflow_imports_at_its_start_is_light(module):
     code = f"import sys, neuspring{module}; print([name for name in {HEAVY} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_no_test_imports_another_test_or_a_conftest():
+    """Helpers that several test modules use live in tests/support."""
+    tests = Path(__file__).parent
+    wrong = []
+    for path in tests.rglob("*.py"):
+        for module in modules_named_in(path):
+            if any(part == "conftest" or part.startswith("test_") for part in module.split(".")):
+                wrong.append(f"{path.relative_to(tests)} imports {module}")
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def modules_named_in(path: Path) -> list[str]:
+    """Every module or name that a file imports, with dots."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f"{node.module or ''}.{alias.name}" for alias in node.names]
+    return names

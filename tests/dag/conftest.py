@@ -4,6 +4,6 @@ from tests.support.project import copy_workflow
 
 
 @pytest.fixture
-def place(tmp_path):
+def project(tmp_path):
     """A project folder of the test's own."""
     return copy_workflow(tmp_path / "project")

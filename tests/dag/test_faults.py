@@ -13,8 +13,10 @@ import pytest
 
 from neuspring.core.job_records import JobRecord, read_jobs
 from tests.support.phystwin_case import write_case
-from tests.support.project import ROOT, SCENE, arguments, planned_jobs
+from tests.support.project import ROOT, SCENE, arguments, jobs_in, output_of, run, start
 
+pytestmark = pytest.mark.slow
+"""Small versions: retries, causes and killed commands of one job in test_job; a killed run in test_workflow."""
 RELEASED = "weird_package"
 SABOTAGE = '''
 """Lets chosen `neuspring` commands fail when they are first called; counts the calls of all."""
@@ -32,26 +34,28 @@ if sys.orig_argv[1:3] == ["-m", "neuspring"] and "FAULTS" in os.environ:
 '''
 
 
+class Sabotage:
+    """Lets `neuspring` commands fail once, and counts the calls of those that it is told about."""
+
+    def __init__(self, folder: Path) -> None:
+        self.site, self.calls = folder / "site", folder / "calls"
+        self.site.mkdir()
+        self.calls.mkdir()
+        (self.site / "sitecustomize.py").write_text(SABOTAGE)
+
+    def variables(self, **faults: tuple[list[str], str]) -> dict[str, str]:
+        """Of an environment with faults: name = (words of the command line, last words; empty where it only counts)."""
+        path = os.pathsep.join([str(self.site), str(ROOT)])
+        return {"PYTHONPATH": path, "FAULTS": json.dumps(faults), "FAULT_CALLS": str(self.calls)}
+
+    def count(self, name: str) -> int:
+        """How often the command of a fault was called so far."""
+        return (self.calls / name).stat().st_size if (self.calls / name).exists() else 0
+
+
 @pytest.fixture
 def sabotage(tmp_path):
-    """Environment in which commands fail once: faults(name=(words of the command line, last words or "")); and the calls so far."""
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(SABOTAGE)
-    calls = tmp_path / "calls"
-    calls.mkdir()
-
-    def environment(**faults):
-        path = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
-        return os.environ | {"PYTHONPATH": path, "FAULTS": json.dumps(faults), "FAULT_CALLS": str(calls)}
-
-    environment.count = lambda name: (calls / name).stat().st_size if (calls / name).exists() else 0
-    return environment
-
-
-def start(place, changes, environment, *extra):
-    return subprocess.Popen(
-        arguments(place, changes, *extra), cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    return Sabotage(tmp_path)
 
 
 def wait_for(condition, process):
@@ -75,13 +79,13 @@ def record(results, name):
     return JobRecord.load(results / "jobs" / f"{name}.json")
 
 
-def finished(results):
+def scenarios_with_runs(results):
     return {path.parent.parent.parent.name for path in results.glob("*/*/*/run.json")}
 
 
-def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path, sabotage):
+def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_path, sabotage):
     """Out of GPU memory, a wrapper killed in the middle, corrupt data and a dead tracking server, all in one run."""
-    results, data = place / "results", tmp_path / "data"
+    results, data = project / "results", tmp_path / "data"
     case = write_case(data, RELEASED)
     whole = (case / "final_data.pkl").read_bytes()
     (case / "final_data.pkl").write_bytes(whole[:1000])
@@ -97,17 +101,16 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path
         "killed": (["fit --", f"/{SCENE}/"], ""),
         "corrupt": (["observe", RELEASED], ""),
     }
-    process = start(place, changes, sabotage(**faults))
+    process = start(arguments(project, changes), project, **sabotage.variables(**faults))
     partial = results / SCENE / "baseline" / "0" / "fit.partial.npz"
     wait_for(partial.exists, process)
     wrapper = wrapper_of("fit", f"/{SCENE}/")
     (command,) = wrapper.children()
     wrapper.send_signal(signal.SIGKILL)
-    output, _ = process.communicate(timeout=240)
-    assert process.returncode == 1, output
+    output = output_of(process, fails=True)
 
-    # The healthy scenario is finished and in the table: its search after another attempt, its fit from its checkpoint.
-    assert finished(results) == {SCENE}
+    # The healthy scenario has its run and is in the table: its search after another attempt, its fit from its checkpoint.
+    assert scenarios_with_runs(results) == {SCENE}
     assert "1/2" in output
     assert [attempt.outcome for attempt in record(results, f"search/{SCENE}/uniform/0").attempts] == ["transient", "ok"]
     assert record(results, f"search/{SCENE}/uniform/0").attempts[0].cause == "out of GPU memory"
@@ -129,15 +132,13 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path
     report = (results / "tables" / "so_far" / "report.html").read_text()
     assert "bad input" in report
 
-    # Mended data: the same command does what is missing, and nothing again; the tables so far do not pass for the table.
+    # With the data repaired the same command does what is missing, and nothing twice. The tables so far are not the tables.
     calls = {name: sabotage.count(name) for name in ("memory", "killed")}
     (case / "final_data.pkl").write_bytes(whole)
-    process = start(place, changes, sabotage(**faults))
-    output, _ = process.communicate(timeout=240)
-    assert process.returncode == 0, output
-    done_now = dict.fromkeys(("observe", "search", "fit", "rollout", "score", "log_run", "tables", "report", "all"), 1)
-    assert planned_jobs(output) == done_now
-    assert finished(results) == {SCENE, RELEASED}
+    output = run(project, changes, **sabotage.variables(**faults))
+    expected = dict.fromkeys(("observe", "search", "fit", "rollout", "score", "log_run", "tables", "report", "all"), 1)
+    assert jobs_in(output) == expected
+    assert scenarios_with_runs(results) == {SCENE, RELEASED}
     assert {name: sabotage.count(name) for name in calls} == calls
     assert not [job.name for job in read_jobs(results) if job.failed]
 
@@ -145,11 +146,11 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(place, tmp_path
 def mount(folder: Path, size: str):
     """A small file system of its own; skips where that is not allowed."""
     folder.mkdir()
-    done = subprocess.run(
+    result = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, text=True, check=False
     )
-    if done.returncode:
-        pytest.skip(f"a file system of a chosen size cannot be mounted here: {done.stderr.strip()}")
+    if result.returncode:
+        pytest.skip(f"a file system of a chosen size cannot be mounted here: {result.stderr.strip()}")
 
 
 def remount(folder: Path, option: str):
@@ -157,40 +158,28 @@ def remount(folder: Path, option: str):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mounts a tmpfs")
-def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(place, tmp_path, sabotage):
+def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(project, tmp_path, sabotage):
     disk = tmp_path / "disk"
     mount(disk, "40k")
     try:
         results = disk / "results"
         changes = {"methods": ["search_only"], "results": str(results), "tracking": {"enabled": False}}
-        calls = {name: ([f"{name} --"], "") for name in ("observe", "search", "rollout")}
+        variables = sabotage.variables(**{name: ([f"{name} --"], "") for name in ("observe", "search", "rollout")})
         # What can fill the disk; the tables come after it.
         target = ("--", f"{results}/{SCENE}/search_only/0/run.json")
-        process = start(place, changes, sabotage(**calls), *target)
-        output, _ = process.communicate(timeout=240)
-        assert process.returncode == 1, output
+        output = run(project, changes, *target, fails=True, **variables)
         assert "no space left on the disk. Free some space; the same command continues." in output
-        done = {name: sabotage.count(name) for name in calls if record_ok(results, name)}
-        assert done
+        calls = {job.rule: sabotage.count(job.rule) for job in read_jobs(results) if job.last.outcome == "ok"}
+        assert calls
 
         remount(disk, "size=100m")
         remount(disk, "ro")
-        process = start(place, changes, sabotage(**calls), *target)
-        output, _ = process.communicate(timeout=240)
-        assert process.returncode == 1
+        output = run(project, changes, *target, fails=True, **variables)
         assert "this folder must be writable; received Read-only file system" in output
         remount(disk, "rw")
-        process = start(place, changes, sabotage(**calls), *target)
-        output, _ = process.communicate(timeout=240)
-        assert process.returncode == 0, output
-        # What was finished before the disk was full was not made again.
-        assert {name: sabotage.count(name) for name in done} == done
-        assert finished(results) == {SCENE}
+        run(project, changes, *target, **variables)
+        # What had ended before the disk was full was not made again.
+        assert {name: sabotage.count(name) for name in calls} == calls
+        assert scenarios_with_runs(results) == {SCENE}
     finally:
         subprocess.run(["umount", "-l", str(disk)], check=True)
-
-
-def record_ok(results, rule):
-    """Whether a rule's only job has finished."""
-    found = [job for job in read_jobs(results) if job.rule == rule]
-    return bool(found) and found[0].last.outcome == "ok"

@@ -9,56 +9,44 @@ import sys
 import pytest
 
 from neuspring.core.job_records import read_jobs
-from tests.support.project import ROOT, SCENE, arguments
+from tests.support.project import ROOT, SCENE, arguments, environment, output_of, start
 
 PODS = ROOT / "workflow/profiles/kubernetes/pods.py"
 GPU = "nvidia.com/gpu"
 
 
 def kubectl(folder, text: str) -> dict[str, str]:
-    """An environment in which kubectl is this shell script."""
+    """Variables of an environment in which kubectl is this shell script."""
     folder.mkdir()
     program = folder / "kubectl"
     program.write_text(f"#!/bin/sh\n{text}\n")
     program.chmod(0o755)
-    return os.environ | {"PATH": f"{folder}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def on_kubernetes(place):
-    """The command of a search in pods; a cluster's jobs are not counted by cores."""
-    target = f"results/{SCENE}/search-uniform/0/search.json"
-    command = arguments(place, {"device": "auto"}, "--seconds-between-status-checks", "1", "--", target)
-    command[command.index("workflow/profiles/default")] = "workflow/profiles/kubernetes"
-    cores = command.index("--cores")
-    del command[cores : cores + 2]
-    return command
-
-
-def test_cores_are_refused_before_any_pod(place, tmp_path):
+def search_in_pods(project, cores: int | None = None) -> list[str]:
+    """The command of a search in pods."""
     if importlib.util.find_spec("snakemake_executor_plugin_cluster_generic") is None:
         pytest.skip("needs snakemake-executor-plugin-cluster-generic: pip install 'neuspring[kubernetes]'")
-    command = on_kubernetes(place)
-    environment = kubectl(tmp_path / "bin", f'touch "{tmp_path / "asked"}"')
-    options = {"cwd": place, "env": environment, "capture_output": True, "text": True, "timeout": 300, "check": False}
-    done = subprocess.run([*command[:3], "--cores", "2", *command[3:]], **options)
-    assert done.returncode == 1
-    assert "--cores: a cluster's scheduler counts cores itself" in done.stderr
-    assert not (tmp_path / "asked").exists()
+    extra = ("--seconds-between-status-checks", "1", "--", f"results/{SCENE}/search-uniform/0/search.json")
+    return arguments(project, {"device": "auto"}, *extra, profile="kubernetes", cores=cores)
 
 
-def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_with_more_memory(place, tmp_path):
-    if importlib.util.find_spec("snakemake_executor_plugin_cluster_generic") is None:
-        pytest.skip("needs snakemake-executor-plugin-cluster-generic: pip install 'neuspring[kubernetes]'")
+def test_cores_are_refused_before_any_pod(project, tmp_path):
+    variables = kubectl(tmp_path / "bin", f'touch "{tmp_path / "called"}"')
+    output = output_of(start(search_in_pods(project, cores=2), project, **variables), fails=True)
+    assert "--cores: a cluster's scheduler counts cores itself" in output
+    assert not (tmp_path / "called").exists()
+
+
+def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_with_more_memory(project, tmp_path):
     pods = tmp_path / "pods"
     pods.mkdir()
     (pods / "evicted").write_text("1")
-    command = on_kubernetes(place)
-    environment = kubectl(tmp_path / "bin", f'exec "{sys.executable}" "{ROOT}/tests/dag/kubectl.py" "$@"')
-    # pods.py takes the environment's python3.
+    variables = kubectl(tmp_path / "bin", f'exec "{sys.executable}" "{ROOT}/tests/support/kubectl.py" "$@"')
+    # pods.py runs with the environment's python3.
     (tmp_path / "bin" / "python3").symlink_to(sys.executable)
-    environment["KUBECTL_FOLDER"] = str(pods)
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr + "".join(path.read_text() for path in pods.glob("*.log"))
+    output_of(start(search_in_pods(project), project, KUBECTL_FOLDER=str(pods), **variables))
 
     manifests = [json.loads(path.read_text()) for path in sorted(pods.glob("*.json"))]
     assert [job["metadata"]["generateName"] for job in manifests] == ["neuspring-observe-", *["neuspring-search-"] * 2]
@@ -67,12 +55,12 @@ def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_
     assert [container["resources"]["requests"] for container in containers] == needs
     limits = [{"memory": "4000M"}, {"memory": "8000M", GPU: "1"}, {"memory": "16000M", GPU: "1"}]
     assert [container["resources"]["limits"] for container in containers] == limits
-    pods = [job["spec"]["template"]["spec"] for job in manifests]
-    assert [pod["activeDeadlineSeconds"] for pod in pods] == [60 * minutes for minutes in (30, 240, 480)]
+    specifications = [job["spec"]["template"]["spec"] for job in manifests]
+    assert [pod["activeDeadlineSeconds"] for pod in specifications] == [60 * minutes for minutes in (30, 240, 480)]
     assert {job["spec"]["backoffLimit"] for job in manifests} == {0}
     # The evicted pod never began, so only the other one left a trace.
-    ran = {job.name: [attempt.outcome for attempt in job.attempts] for job in read_jobs(place / "results")}
-    assert ran == {f"observe/{SCENE}": ["ok"], f"search/{SCENE}/uniform/0": ["ok"]}
+    outcomes = {job.name: [attempt.outcome for attempt in job.attempts] for job in read_jobs(project / "results")}
+    assert outcomes == {f"observe/{SCENE}": ["ok"], f"search/{SCENE}/uniform/0": ["ok"]}
 
 
 @pytest.mark.parametrize(
@@ -87,13 +75,13 @@ def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_
     ],
 )
 def test_what_kubernetes_says_of_a_job(tmp_path, answer, expected):
-    command = [sys.executable, str(PODS), "status", "a"]
-    done = subprocess.run(command, env=kubectl(tmp_path / "bin", answer), capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == expected
+    variables = environment(**kubectl(tmp_path / "bin", answer))
+    result = subprocess.run([sys.executable, str(PODS), "status", "a"], env=variables, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == expected
 
 
 def test_names_alone_are_jobs_to_cancel(tmp_path):
-    asked = tmp_path / "asked"
-    environment = kubectl(tmp_path / "bin", f'echo "$@" > "{asked}"')
-    subprocess.run([sys.executable, str(PODS), "a", "b"], env=environment, check=True)
-    assert asked.read_text() == "delete job --wait=false --ignore-not-found a b\n"
+    calls = tmp_path / "calls"
+    variables = environment(**kubectl(tmp_path / "bin", f'echo "$@" > "{calls}"'))
+    subprocess.run([sys.executable, str(PODS), "a", "b"], env=variables, check=True)
+    assert calls.read_text() == "delete job --wait=false --ignore-not-found a b\n"

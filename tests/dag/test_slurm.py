@@ -1,8 +1,7 @@
-"""A small benchmark on a real Slurm of one node with two stand-ins for GPUs, with a job cancelled on the way."""
+"""A small run on a real Slurm of one node with two stand-ins for GPUs, with a job cancelled on the way."""
 
 import itertools
 import json
-import os
 import subprocess
 import sys
 import time
@@ -16,16 +15,18 @@ import yaml
 
 from neuspring.core.job_records import Attempt, read_jobs
 from tests.support import slurm
-from tests.support.project import ROOT, SCENE, config_with, copy_workflow
+from tests.support.project import SCENE, config_with, copy_workflow, environment
 
+pytestmark = pytest.mark.slow
+"""Small versions: what a profile asks of a cluster in test_profiles and, with a stand-in for the cluster, in test_kubernetes."""
 GPU_RULES = {"search", "fit", "rollout"}
 PATIENCE = 600
-"""s for the whole benchmark; it took 225 on two cores that five processes shared."""
+"""s for the whole run; it took 225 on two cores that five processes shared."""
 
 
 @pytest.fixture(scope="module")
-def benchmark(tmp_path_factory):
-    """A benchmark's results (two methods), what Slurm knows of its jobs, and the records there were when its fit was cancelled."""
+def slurm_run(tmp_path_factory):
+    """The results of a run of two methods, what Slurm knows of its jobs, and the records there were when its fit was cancelled."""
     project = copy_workflow(tmp_path_factory.mktemp("slurm") / "project")
     # On the CPU, but asking for GPUs as on a cluster that has some.
     overlay = config_with({"device": "auto", "fit": {"epochs": 40}})
@@ -40,7 +41,7 @@ def benchmark(tmp_path_factory):
                     *("--configfile", "config/data/demo.yaml", "overlay.yaml"),
                 ],
                 cwd=project,
-                env=os.environ | {"PYTHONPATH": str(ROOT)},
+                env=environment(),
                 stdout=file,
                 stderr=subprocess.STDOUT,
             )
@@ -71,7 +72,7 @@ def records(results: Path) -> set[str]:
     return {path.relative_to(results / SCENE).as_posix() for path in (results / SCENE).rglob("*.json") if path.parent.name == "0"}
 
 
-def named(submissions: list[dict[str, str]], name: str) -> list[dict[str, str]]:
+def submissions_of(submissions: list[dict[str, str]], name: str) -> list[dict[str, str]]:
     return [job for job in submissions if job["Comment"].startswith(f"rule_{name}")]
 
 
@@ -79,8 +80,8 @@ def attempts(results: Path) -> dict[str, list[Attempt]]:
     return {job.name: job.attempts for job in read_jobs(results)}
 
 
-def test_a_benchmark_on_slurm_ends_with_all_runs_tables_and_records(benchmark):
-    results, submissions, before = benchmark
+def test_a_run_on_slurm_ends_with_all_runs_tables_and_records(slurm_run):
+    results, submissions, before = slurm_run
     assert "search-uniform/0/search.json" in before
     assert not {"baseline/0/fit.json", "baseline/0/run.json"} & before
     runs = {f"{method}/0/{name}.json" for method in ("search_only", "baseline") for name in ("rollout", "run")}
@@ -94,33 +95,33 @@ def test_a_benchmark_on_slurm_ends_with_all_runs_tables_and_records(benchmark):
     assert sorted(job["JobState"] for job in submissions) == ["CANCELLED"] + ["COMPLETED"] * 7
 
 
-def test_gpu_jobs_ask_for_one_device_and_cpu_jobs_for_none(benchmark):
-    _, submissions, _ = benchmark
-    asked = {job["Comment"].removeprefix("rule_").split("_")[0]: job.get("TresPerJob") for job in submissions}
+def test_gpu_jobs_ask_for_one_device_and_cpu_jobs_for_none(slurm_run):
+    _, submissions, _ = slurm_run
+    devices = {job["Comment"].removeprefix("rule_").split("_")[0]: job.get("TresPerJob") for job in submissions}
     gpu = "gres:gpu:1"
-    assert asked == {"observe": None, "search": gpu, "fit": gpu, "prediction": gpu, "scores": None}
+    assert devices == {"observe": None, "search": gpu, "fit": gpu, "prediction": gpu, "scores": None}
     assert {job["Partition"] for job in submissions} == {"main"}
 
 
-def test_jobs_use_the_device_that_slurm_gave_them_and_share_none(benchmark):
-    results, _, _ = benchmark
+def test_jobs_use_the_device_that_slurm_gave_them_and_share_none(slurm_run):
+    results, _, _ = slurm_run
     jobs = attempts(results)
-    held: dict[str, list[tuple[datetime, datetime]]] = {}
+    leases: dict[str, list[tuple[datetime, datetime]]] = {}
     for name, tries in jobs.items():
         for attempt in tries:
             assert len(attempt.devices) == (name.split("/")[0] in GPU_RULES), name
             start = datetime.fromisoformat(attempt.started)
             for device in attempt.devices:
-                held.setdefault(device, []).append((start, start + timedelta(seconds=attempt.seconds)))
-    assert set(held) == {"0", "1"}
-    for spans in held.values():
+                leases.setdefault(device, []).append((start, start + timedelta(seconds=attempt.seconds)))
+    assert set(leases) == {"0", "1"}
+    for spans in leases.values():
         spans.sort()
         assert all(end <= start for (_, end), (start, _) in itertools.pairwise(spans))
 
 
-def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_its_checkpoint(benchmark):
-    results, submissions, _ = benchmark
-    first, second = named(submissions, "fit")
+def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_its_checkpoint(slurm_run):
+    results, submissions, _ = slurm_run
+    first, second = submissions_of(submissions, "fit")
     assert (first["JobState"], second["JobState"]) == ("CANCELLED", "COMPLETED")
     assert [int(job["MinMemoryNode"].removesuffix("M")) for job in (first, second)] == [8000, 16000]
     name = f"{SCENE}/baseline/0"

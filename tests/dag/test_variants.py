@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from neuspring import config
 from neuspring.experiments.tracking import log as tracking
-from tests.support.project import SCENE, jobs, run
+from tests.support.project import SCENE, plan, run
 
 
-def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(place):
+@pytest.mark.slow
+def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(project):
     changes = {
         "methods": ["neuspring", "plus_carry_over", "plus_average"],
         "seeds": [0, 1],
@@ -21,15 +23,13 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(plac
         "only": "seed=0",
     }
     # Averages need both seeds, which is seen by two of them; of the other methods one seed is enough.
-    result = run(place, changes, "--", "all", f"results/{SCENE}/plus_average/1/run.json")
-    text = result.stdout + result.stderr
-    assert result.returncode == 0, text
-    results = place / "results"
+    run(project, changes, "--", "all", f"results/{SCENE}/plus_average/1/run.json")
+    results = project / "results"
     summary = (results / "tables" / "summary.md").read_text()
     assert all(f"| {name} " in summary for name in changes["methods"])
     assert "## Transfer" in summary
     transfers = pd.read_csv(results / "tables" / "transfers.csv")
-    # Averaging and carrying over concern a recording's own future; the other recording is no source, since it is not chosen.
+    # Averages and carry-over concern a recording's own future. The other recording is no source, since it is not a scenario.
     assert set(transfers["method"]) == {"neuspring"}
     assert set(transfers["scenario"]) == {SCENE}
     averaged = [pd.read_parquet(results / SCENE / "plus_average" / seed / "scores.parquet")["value"] for seed in "01"]
@@ -37,20 +37,19 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(plac
     record = json.loads((results / SCENE / "neuspring" / "0" / "run.json").read_text())
     assert record["variant"]["clusters"] == 5
     assert record["variant"]["field.plane_learning_rate"] == 0.01
-    # The job that logs is test_workflow's; what these runs give it to log is the same from here, without a start for each.
+    # test_workflow runs the job that logs. Here the records are logged from this process, which saves a start for each.
     tracking.init(results, config.Tracking())
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"logged": 4}
     assert {Path(name).name for name in record["artifacts"]["plots"]} >= {"topology.png", "stiffness.png", "motion.png"}
 
     changes |= {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}, "only": ""}
-    more = run(place, changes, "--", f"results/{SCENE}/pt_only/0/run.json")
-    text = more.stdout + more.stderr
-    assert more.returncode == 0, text
-    assert "continuing the search after 11 rollouts" in text
+    output = run(project, changes, "--", f"results/{SCENE}/pt_only/0/run.json")
+    assert "continuing the search after 11 rollouts" in output
     assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
 
 
-def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_apply(place):
+@pytest.mark.slow
+def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_apply(project):
     changes = {
         "methods": ["search_only", "static", "controller_lbs", "spring_gaus", "spring_gaus_points", "gs_dynamics"],
         "baselines": {
@@ -64,13 +63,11 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
         "tracking": {"enabled": False},
     }
     # Table 1 without PhysTwin and NeuSpring, whose runs it would add.
-    table1 = config.read_yaml(place / "config" / "studies.yaml")["table1"]
+    table1 = config.read_yaml(project / "config" / "studies.yaml")["table1"]
     rows = {label: method for label, method in table1["rows"].items() if method in changes["methods"]}
-    (place / "config" / "systems.yaml").write_text(json.dumps({"table1": table1 | {"baseline": "GS-Dynamics", "rows": rows}}))
-    result = run(place, changes)
-    text = result.stdout + result.stderr
-    assert result.returncode == 0, text
-    results = place / "results"
+    (project / "config" / "systems.yaml").write_text(json.dumps({"table1": table1 | {"baseline": "GS-Dynamics", "rows": rows}}))
+    run(project, changes)
+    results = project / "results"
     summary = (results / "tables" / "summary.md").read_text()
     assert f"Left out: spring_gaus on {SCENE}: it needs images" in summary
     runs = pd.read_csv(results / "tables" / "runs.csv")
@@ -85,20 +82,19 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
     assert "spring_gaus_points" in (results / "tables" / "report.html").read_text()
     # A model's own settings train it alone again.
     changes["baselines"]["gs_dynamics"]["epochs"] = 2
-    again = jobs(run(place, changes, "--dry-run"))
-    assert {name: again[name] for name in ("train", "predict", "score")} == {"train": 1, "predict": 1, "score": 1}
-    assert "search" not in again
+    jobs = plan(project, changes)
+    assert {name: jobs[name] for name in ("train", "predict", "score")} == {"train": 1, "predict": 1, "score": 1}
+    assert "search" not in jobs
 
 
 def names(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 
 
-def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(place):
+def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(project):
     # No candidate can be integrated with a single substep, so the search fails numerically.
     changes = {"simulation": {"max_substeps": 1}, "methods": ["search_only"], "tracking": {"enabled": False}}
-    result = run(place, changes, "--", "results/tables/summary.md")
-    text = result.stdout + result.stderr
-    assert result.returncode == 0, text
-    assert "0/1 (1 failed)" in text
-    assert "none of 11 candidates could be simulated" in text
+    assert "0/1 (1 failed)" in run(project, changes, "--", "results/tables/summary.md")
+    (row,) = pd.read_csv(project / "results" / "tables" / "runs.csv").to_dict("records")
+    assert row["status"] == "failed"
+    assert "none of 11 candidates could be simulated" in row["reason"]

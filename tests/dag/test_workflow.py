@@ -18,23 +18,34 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark, read_scenarios
 from neuspring.experiments.tracking import log as tracking
-from tests.support.project import ROOT, SCENE, arguments, config_with, copy_finished, copy_workflow, jobs, run
+from tests.support.project import (
+    ROOT,
+    SCENE,
+    arguments,
+    config_with,
+    copy_project,
+    copy_workflow,
+    environment,
+    jobs_in,
+    output_of,
+    plan,
+    run,
+    start,
+)
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """One finished run of two methods."""
+def tiny_run(tmp_path_factory):
+    """The project folder of a run of two methods, and what the run said."""
     project = copy_workflow(tmp_path_factory.mktemp("dag") / "project")
-    result = run(project)
-    assert result.returncode == 0, result.stdout + result.stderr
-    return project, result
+    return project, run(project)
 
 
-def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(finished):
-    project, result = finished
+def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
+    project, output = tiny_run
     results = project / "results"
-    assert "| baseline " in result.stdout + result.stderr
-    assert "neuspring ui --results results" in result.stdout + result.stderr
+    assert "| baseline " in output
+    assert "neuspring ui --results results" in output
     scores = pd.read_parquet(results / "tables" / "scores.parquet")
     assert len(scores) == 8
     assert np.isfinite(scores["value"]).all()
@@ -43,51 +54,46 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(finished):
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"already logged": 2}
 
 
-def test_the_search_is_shared_and_nothing_reruns_without_a_change(finished):
-    project, result = finished
-    assert (result.stdout + result.stderr).count("localrule search:") == 1
-    again = run(project, None, "--dry-run")
-    assert "Nothing to be done" in again.stdout + again.stderr
+def test_the_search_is_shared_and_nothing_reruns_without_a_change(tiny_run):
+    project, output = tiny_run
+    assert jobs_in(output)["search"] == 1
+    assert plan(project) == {}
 
 
-def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(finished):
-    project, _ = finished
-    planned = jobs(run(project, {"fit": {"epochs": 4}}, "--dry-run"))
-    assert planned == {"fit": 1, "rollout": 1, "score": 1, "log_run": 1, "tables": 1, "report": 1, "all": 1}
-    planned = jobs(run(project, {"tracking": {"experiment": "other"}}, "--dry-run"))
-    assert planned == {"track_init": 1, "log_run": 2, "all": 1}
-    planned = jobs(run(project, {"seeds": [0, 1]}, "--dry-run"))
-    assert planned == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
+def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):
+    project, _ = tiny_run
+    assert plan(project, {"fit": {"epochs": 4}}) == dict.fromkeys(
+        ["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1
+    )
+    assert plan(project, {"tracking": {"experiment": "other"}}) == {"track_init": 1, "log_run": 2, "all": 1}
+    both_seeds = plan(project, {"seeds": [0, 1]})
+    assert both_seeds == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
 
 
-def test_methods_share_searches_and_fits(finished):
-    project, _ = finished
+def test_methods_share_searches_and_fits(project):
     names = ["search_only", "baseline", "phystwin", "model_a", "model_b", "neuspring", "pt_only", "clusters_1", "clusters_5"]
-    changes = {"methods": [*names, "plus_carry_over", "plus_average"], "seeds": [0, 1], "results": "variants"}
-    planned = jobs(run(project, changes, "--dry-run"))
+    jobs = plan(project, {"methods": [*names, "plus_carry_over", "plus_average"], "seeds": [0, 1]})
     # Uniform and five regions; baseline, model_a, model_b and neuspring; two seeds each.
-    assert (planned["search"], planned["fit"]) == (2 * 2, 4 * 2)
-    assert planned["rollout"] == planned["score"] == 11 * 2
+    assert (jobs["search"], jobs["fit"]) == (2 * 2, 4 * 2)
+    assert jobs["rollout"] == jobs["score"] == 11 * 2
 
 
-def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finished, tmp_path):
+def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_run, tmp_path):
     changes = {"methods": ["baseline"], "fit": {"epochs": 30}, "tracking": {"enabled": False}}
     target = f"results/{SCENE}/baseline/0/fit.json"
     # Both begin with the search that is there.
-    project, place = (copy_finished(finished[0], tmp_path / name) for name in ("whole", "killed"))
-    whole = run(project, changes, "--", target)
-    assert whole.returncode == 0, whole.stdout + whole.stderr
-    assert jobs(whole) == {"fit": 1}
+    undisturbed, project = (copy_project(tiny_run[0], tmp_path / name) for name in ("undisturbed", "killed"))
+    assert jobs_in(run(undisturbed, changes, "--", target)) == {"fit": 1}
 
     process = subprocess.Popen(
-        arguments(place, changes, "--", target),
-        cwd=place,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        arguments(project, changes, "--", target),
+        cwd=project,
+        env=environment(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    folder = place / "results" / SCENE / "baseline" / "0"
+    folder = project / "results" / SCENE / "baseline" / "0"
     deadline = time.monotonic() + 120
     while not (folder / "fit.partial.npz").exists():
         assert process.poll() is None, "the run ended before its first checkpoint"
@@ -97,25 +103,23 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(finis
     process.wait()
     assert not (folder / "fit.json").exists()
 
-    run(place, changes, "--unlock")
-    continued = run(place, changes, "--", target)
-    assert continued.returncode == 0, continued.stdout + continued.stderr
-    assert "continuing the fit after epoch" in continued.stdout + continued.stderr
+    run(project, changes, "--unlock")
+    assert "continuing the fit after epoch" in run(project, changes, "--", target)
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
-    expected = Twin.load(project / "results" / SCENE / "baseline" / "0" / "twin.npz")
+    expected = Twin.load(undisturbed / "results" / SCENE / "baseline" / "0" / "twin.npz")
     np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)
 
 
-def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(place, tmp_path):
+def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(project, tmp_path):
     results = tmp_path / "my 'best' results; echo"
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(place / "Snakefile"), "--cores", "1"]
+    arguments(project)
+    overlays = [str(project / name) for name in ("config/data/demo.yaml", "overlay.yaml")]
     target = f"{results}/{SCENE}/observations.npz"
-    arguments(place)
-    command += ["--configfile", str(place / "config/data/demo.yaml"), str(place / "overlay.yaml"), "--config", f"results={results}"]
-    done = subprocess.run([*command, "--", target], cwd=elsewhere, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stdout + done.stderr
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(project / "Snakefile"), "--cores", "1"]
+    command += ["--configfile", *overlays, "--config", f"results={results}", "--", target]
+    output_of(start(command, elsewhere))
     assert Path(target).is_file()
     assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
 
@@ -128,13 +132,11 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
         ({"scenarios": ["a;touch hacked"]}, "scenarios.0: string should match pattern"),
     ],
 )
-def test_bad_configuration_is_explained_before_any_job(place, changes, message):
-    result = run(place, changes, "--dry-run")
-    text = result.stdout + result.stderr
-    assert result.returncode != 0
-    assert message in text
-    assert "Traceback" not in text
-    assert not list(place.rglob("hacked"))
+def test_bad_configuration_is_explained_before_any_job(project, changes, message):
+    output = run(project, changes, "--dry-run", fails=True)
+    assert message in output
+    assert "Traceback" not in output
+    assert not list(project.rglob("hacked"))
 
 
 @pytest.mark.parametrize(
@@ -155,9 +157,9 @@ def test_bad_configuration_is_explained_before_any_job(place, changes, message):
     ],
 )
 def test_what_the_workflow_checks_first(changes, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError) as error:
         Benchmark.of(config_with(changes), ROOT)
-    assert message in str(caught.value)
+    assert message in str(error.value)
 
 
 def test_the_pinned_conda_environment_has_the_versions_of_the_constraints():

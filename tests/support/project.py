@@ -1,4 +1,4 @@
-"""The workflow's own files in a folder of their own, and a configuration small enough for a test."""
+"""The workflow in a folder of its own, with a configuration small enough for a test, and Snakemake run in it."""
 
 import json
 import os
@@ -22,10 +22,12 @@ TINY = {
     "device": "cpu",
 }
 SCENE = TINY["scenarios"][0]
+PATIENCE = 600
+"""s for one run of the workflow; the longest takes about 100 on two idle cores."""
 
 
 def copy_workflow(project: Path) -> Path:
-    """A working copy of the workflow's own files, so that locks and metadata of tests do not meet."""
+    """A new project folder with the workflow's own files, so that locks and records of two tests do not meet."""
     project.mkdir()
     for name in ("Snakefile", "workflow", "config"):
         source = ROOT / name
@@ -33,35 +35,78 @@ def copy_workflow(project: Path) -> Path:
     return project
 
 
-def copy_finished(finished: Path, project: Path) -> Path:
-    """A finished project's copy, to change at will; with its times, so that nothing in it is to be done."""
-    return Path(shutil.copytree(finished, project))
+def copy_project(project: Path, copy: Path) -> Path:
+    """A copy of a project to change at will. File times are kept, so that nothing in it has to run again."""
+    return Path(shutil.copytree(project, copy))
 
 
-def arguments(project: Path, changes=None, *extra: str) -> list[str]:
-    overlay = project / "overlay.yaml"
-    overlay.write_text(yaml.safe_dump(config_with(changes or {})))
-    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2"]
-    return [*command, "--configfile", "config/data/demo.yaml", str(overlay), *extra]
+def add_scenario(project: Path, name: str, source: str) -> None:
+    """A row in the project's table of scenarios; its data are in the folder `name` of data_root."""
+    table = project / "config" / "scenarios.tsv"
+    table.write_text(table.read_text() + f"{name}\t{source}\ttoy\t{name}\tfalse\ttrue\n")
 
 
 def config_with(changes: dict) -> dict:
+    """The tiny configuration with some of its values changed."""
     values = json.loads(json.dumps(TINY))
     config.merge(values, changes)
     return values
 
 
-def run(project: Path, changes=None, *extra: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        arguments(project, changes, *extra), cwd=project, env=environment, capture_output=True, text=True, timeout=600, check=False
+def arguments(
+    project: Path, changes: dict | None = None, *extra: str, profile: str = "default", cores: int | None = 2
+) -> list[str]:
+    """The command line of a run. `cores` None: a cluster's scheduler counts them."""
+    overlay = project / "overlay.yaml"
+    overlay.write_text(yaml.safe_dump(config_with(changes or {})))
+    command = [sys.executable, "-m", "snakemake", "--profile", f"workflow/profiles/{profile}"]
+    command += [] if cores is None else ["--cores", str(cores)]
+    return [*command, "--configfile", "config/data/demo.yaml", str(overlay), *extra]
+
+
+def environment(**variables: str) -> dict[str, str]:
+    """The environment of a run, in which jobs import the package from here."""
+    return os.environ | {"PYTHONPATH": str(ROOT)} | variables
+
+
+def start(command: list[str], project: Path, **variables: str) -> subprocess.Popen[str]:
+    """Start a run; its output is that of stdout and stderr."""
+    return subprocess.Popen(
+        command, cwd=project, env=environment(**variables), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 
-def jobs(result: subprocess.CompletedProcess[str]) -> dict[str, int]:
-    return planned_jobs(result.stdout + result.stderr)
+def output_of(process: subprocess.Popen[str], fails: bool = False) -> str:
+    """What a run says until its end. Asserts that it succeeds, or that it fails if `fails`."""
+    try:
+        output, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    assert (process.returncode != 0) == fails, output
+    return output
 
 
-def planned_jobs(output: str) -> dict[str, int]:
+def run(
+    project: Path,
+    changes: dict | None = None,
+    *extra: str,
+    fails: bool = False,
+    cores: int = 2,
+    profile: str = "default",
+    **variables: str,
+) -> str:
+    """Run the workflow to its end; returns its output. Asserts that it succeeds, or that it fails if `fails`."""
+    return output_of(start(arguments(project, changes, *extra, profile=profile, cores=cores), project, **variables), fails)
+
+
+def plan(project: Path, changes: dict | None = None, *extra: str, **options) -> dict[str, int]:
+    """How many jobs of each rule a dry run plans."""
+    return jobs_in(run(project, changes, "--dry-run", *extra, **options))
+
+
+def jobs_in(output: str) -> dict[str, int]:
+    """How many jobs of each rule Snakemake's output names; none where nothing is to be done."""
+    if "Nothing to be done" in output:
+        return {}
     lines = output.split("Job stats:")[1].split("\n\n")[0].splitlines()[3:]
     return {name: int(count) for name, count in (line.split() for line in lines) if name != "total"}

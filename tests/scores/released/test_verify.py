@@ -25,6 +25,7 @@ from neuspring.data.released import (
     visible_pixels,
 )
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
+from neuspring.scores.metrics import METRICS
 from neuspring.scores.released.findings import MEAN, Finding, Published, of_means
 from neuspring.scores.released.images import RELEASED, frame_scores
 from neuspring.scores.released.run import CHECKS, Report, read_observations, verify_released
