@@ -22,6 +22,8 @@ SABOTAGE = '''
 """Lets chosen `neuspring` commands fail when they are first called; counts the calls of all."""
 import json, os, sys
 from pathlib import Path
+if "neuspring.experiments.jobs.warm" in sys.orig_argv:
+    sys.exit()  # without the warm process every job is a new interpreter, which reads this file
 if sys.orig_argv[1:3] == ["-m", "neuspring"] and "FAULTS" in os.environ:
     line = " ".join(sys.orig_argv[3:])
     for name, (words, message) in json.loads(os.environ["FAULTS"]).items():
@@ -170,7 +172,7 @@ def test_a_full_and_a_read_only_disk_stop_a_run_that_then_continues(project, tmp
         output = run(project, changes, *target, fails=True, **variables)
         assert "no space left on the disk. Free some space; the same command continues." in output
         calls = {job.rule: sabotage.count(job.rule) for job in read_jobs(results) if job.last.outcome == "ok"}
-        assert calls
+        assert calls and set(calls.values()) == {1}
 
         remount(disk, "size=100m")
         remount(disk, "ro")
