@@ -66,7 +66,7 @@ class Baseline:
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
     """From its settings: keys of the configuration that training reads beside its own section."""
     work: Callable[[Any, int], int] = lambda section, frames: frames
-    """From its settings and the number of training frames: how much training has to do."""
+    """From its settings and the number of training frames: the cost of a training, which estimates its time."""
     own_splats: bool = False
     """Whether a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False

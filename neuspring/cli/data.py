@@ -24,7 +24,7 @@ def fetch_options(parser: ArgumentParser) -> None:
 
 
 def fetch(a: Namespace) -> int:
-    """`neuspring fetch`: 2 where what came is broken."""
+    """`neuspring fetch`: exit status 2 if a fetched file is damaged."""
     from neuspring.data.fetch import fetch
     from neuspring.scores.released.check_data import check
 

@@ -95,7 +95,7 @@ def explain_options(parser: ArgumentParser) -> None:
 
 
 def explain(a: Namespace) -> int:
-    """`neuspring explain`: 1 where a run behind the cell is not what it was."""
+    """`neuspring explain`: exit status 1 if a run behind the cell has changed."""
     from neuspring.report import explain, explain_text
 
     explanation = explain.explain(a.cell, a.results, a.results / a.tables / "studies", a.configfile)

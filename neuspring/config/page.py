@@ -7,74 +7,44 @@ import dataclasses
 import inspect
 import types
 import typing
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from pydantic.fields import FieldInfo
 
-from neuspring.config import (
-    baselines,
-    data,
-    gpus,
-    gs_dynamics,
-    images,
-    perception,
-    rows,
-    settings,
-    simulation,
-    spring_gaus,
-    tuning,
-    twin,
-)
+from neuspring.config import rows, settings
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
 """What stands above it is written by hand, what stands below from the declarations."""
-KEYS = {
-    "(top level)": settings.Config,
-    "gpus": gpus.Gpus,
-    "simulation": simulation.Simulation,
-    "losses": twin.Losses,
-    "search": twin.Search,
-    "search.clusters": twin.Clusters,
-    "search.ranges": twin.SearchRanges,
-    "search.start": twin.SearchStart,
-    "fit": twin.Fit,
-    "fit.field": twin.SpringField,
-    "released_quirks": simulation.ReleasedQuirks,
-    "toy": data.Toy,
-    "mocap": data.Mocap,
-    "synthetic": data.Synthetic,
-    "perception": perception.Perception,
-    "perception.segment": perception.Segmentation,
-    "perception.segment.opencv": perception.OpenCvSegmentation,
-    "perception.segment.grounded_sam2": perception.GroundedSam2,
-    "perception.track": perception.PointTracking,
-    "perception.track.opencv": perception.OpenCvTracking,
-    "perception.track.cotracker3": perception.CoTracker3,
-    "perception.lift": perception.Lift,
-    "perception.shape": perception.ShapePriorSettings,
-    "perception.sample": perception.Sampling,
-    "images": images.Images,
-    "images.appearance": images.Appearance,
-    "images.lpips": images.LpipsWeights,
-    "images.released_quirks": images.ImageQuirks,
-    "baselines": baselines.Baselines,
-    "baselines.spring_gaus": spring_gaus.SpringGaus,
-    "baselines.gs_dynamics": gs_dynamics.GsDynamics,
-    "tracking": settings.Tracking,
-    "tune": tuning.Tune,
-    "tune.space": tuning.Dimension,
-}
 ROWS = {"rows of scenarios.tsv": rows.ScenarioRow, "rows of methods.yaml": rows.Method, "rows of searches.yaml": rows.SearchRow}
 BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 PLAIN = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
 
 
+def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
+    """Path -> dataclass of every section, in the order of their declarations."""
+    found = {path or "(top level)": kind}
+    hints = get_type_hints(kind)
+    for spec in dataclasses.fields(kind):
+        for part in (hints[spec.name], *_parts(hints[spec.name])):
+            if dataclasses.is_dataclass(part) and isinstance(part, type):
+                found |= sections(part, f"{path}.{spec.name}" if path else spec.name)
+    return found
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """All types inside a type: the members of a union, the values of a mapping."""
+    for part in get_args(hint):
+        yield part
+        yield from _parts(part)
+
+
 def text() -> str:
     """The page: its introduction as it is, its tables anew."""
     parts = [PAGE.read_text(encoding="utf-8").partition(HEADING)[0] + HEADING]
-    parts += [section(title, kind) for title, kind in KEYS.items()]
+    parts += [section(title, kind) for title, kind in sections().items()]
     parts += ["## Rows of the tables\n"]
     parts += [section(title, kind) for title, kind in ROWS.items()]
     return "\n".join(parts)

@@ -140,6 +140,8 @@ class Artifact:
                 if not optional or prefix + spec.name in arrays:
                     values[spec.name] = arrays[prefix + spec.name]
                 continue
+            if spec.name not in plain and spec.default is not dataclasses.MISSING:
+                continue  # a file of an older version, which did not know this field
             kind, value = hints[spec.name], plain[spec.name]
             if isinstance(kind, type) and issubclass(kind, Artifact):
                 value = kind._build(arrays, value, f"{prefix}{spec.name}.")

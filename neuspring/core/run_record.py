@@ -85,7 +85,7 @@ class RunRecord:
     scores_file: str | None = None
     """None or empty where a failed run has no scores."""
     held_file: str | None = None
-    """Of a failed run: its scores with the last frame held that it reached."""
+    """Of a failed run: the file of its scores with its last finite frame repeated to the end."""
     histories: dict[str, str] = field(default_factory=dict)
     """Stage -> Parquet file of values per step."""
     artifacts: dict[str, list[str]] = field(default_factory=dict)

@@ -34,7 +34,7 @@ class Source:
     observations: Callable[[Any, ScenarioRow, Config, Path], Observations] | None = None
     """(module, row, settings, output) -> observations, of sources that are not filmed."""
     write_capture: Callable[[Any, ScenarioRow, Config, Path], None] | None = None
-    """(module, row, settings, folder): write a capture folder; None where the user's folder is the capture, or there is none."""
+    """(module, row, settings, folder): write a capture folder. None if the user supplies the capture, or there are no images."""
     capture_module: str = ""
     """Writes captures, where that is another module."""
     needs_data: bool = True

@@ -16,7 +16,7 @@ TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 
 
 class Arguments:
-    """Arguments of the commands, for one benchmark: always the whole of it, whatever part is run now."""
+    """Arguments of the commands, for the whole of one benchmark, whatever part runs now."""
 
     def __init__(self, benchmark: Benchmark, root: Path) -> None:
         self._benchmark, self._root = benchmark, root
@@ -52,7 +52,7 @@ class Arguments:
         ]
 
     def _runs(self, output: str) -> list[str]:
-        """The results folder, and which runs it is to hold in the end."""
+        """The results folder and the full list of its runs, whatever part runs now."""
         whole = self._whole
         return [
             *("--results", self._config.results, "--output", output),

@@ -1,6 +1,6 @@
 """What this machine can do: interpreter, libraries, devices, weights, disk, MLflow; and the next move where one is missing.
 
-What a configuration asks for and cannot have here is broken; what it does not ask for is merely absent.
+broken: the configuration needs it and it is missing. absent: it is missing and not needed.
 """
 
 from __future__ import annotations

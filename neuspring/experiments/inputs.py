@@ -136,7 +136,7 @@ class Inputs:
         try:
             cameras = self.benchmark.cameras(job.scenario)
         except InputError:
-            # Damaged data of one scenario end its own jobs, which say what is wrong, and nobody else's: not the planning of all.
+            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
             cameras = ("0",)
         return [f"{self.results}/{job.scenario}/perception/{camera}/{name}" for camera in cameras]
 
@@ -196,7 +196,7 @@ class Inputs:
         return [self._record(job, job.method, "train")] if model and BASELINES[model].trained else []
 
     def learned(self, job: Any) -> str:
-        """The record that names what was learned: a stage left out is a shorter path, not a branch in code."""
+        """The record that names what was learned: train.json, else fit.json, else search.json."""
         return (self.train(job) or self.fit(job) or self.search(job))[0]
 
     def rolled_out(self, job: Any) -> list[str]:
@@ -245,7 +245,7 @@ class Inputs:
 
     def settings(self, stage: str, job: Any) -> str:
         """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
-        # What they depend on beside the configuration: so few different texts for thousands of jobs.
+        # Thousands of jobs share a few texts: those of one source and one row.
         source = self.benchmark.scenarios[job.scenario].source
         own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage)
         return self._settings(stage, source, getattr(job, own) if own else "")

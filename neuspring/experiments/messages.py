@@ -22,7 +22,7 @@ def failed(benchmark: Benchmark, arguments: Arguments) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
     results = Path(benchmark.config.results)
     print("\nThe run did not finish. What is done so far:", flush=True)
-    # In a folder of their own: had the tables a file in place, the next run would find nothing to be done.
+    # In a folder of their own: otherwise Snakemake would take the tables as finished.
     so_far = f"{arguments.folder}/so_far"
     command = [sys.executable, "-m", "neuspring"]
     subprocess.run([*command, "tables", *arguments.tables(so_far)], check=False)

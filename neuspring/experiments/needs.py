@@ -25,26 +25,11 @@ TRAIN = 0.7
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
-ON_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu == "always")})
+ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu == "always")})
 """Rules that take a GPU where there is one."""
-EITHER = frozenset(name for name, stage in STAGES.items() if stage.gpu == "backend")
-"""Rules whose backend decides."""
-FIRST_GUESS = {
-    "capture": (4000, 120),
-    "segment": (8000, 120),
-    "track": (8000, 120),
-    "lift": (8000, 60),
-    "judge": (4000, 30),
-    "observe": (4000, 30),
-    "search": (8000, 240),
-    "fit": (8000, 480),
-    "train": (8000, 480),
-    "rollout": (4000, 60),
-    "predict": (4000, 60),
-    "transfer": (4000, 60),
-    "appearance": (8000, 240),
-    "render": (8000, 120),
-    "score": (4000, 30),
+BACKEND_DECIDES = frozenset(name for name, stage in STAGES.items() if stage.gpu == "backend")
+"""Rules whose backend decides whether they take a GPU."""
+FIRST_GUESS = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGES.items()} | {
     "tables": (2000, 10),
     "study": (2000, 10),
     "report": (4000, 20),
@@ -55,7 +40,7 @@ FIRST_GUESS = {
     "sweep": (4000, 20),
     "log_sweep": (2000, 30),
 }
-"""Rule -> MB and minutes to ask for while no earlier job tells."""
+"""Rule -> MB and minutes to ask for, before any job of it was measured."""
 
 
 def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[str, ...]:
@@ -106,7 +91,7 @@ def check_gpus(rules: Mapping[str, Mapping[str, Any]], pool: tuple[str, ...]) ->
 def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:
     """The GPUs of this machine that jobs lease, which Snakemake is told of. Raises InputError.
 
-    Too large a wish is an error here, before any job: Snakemake would clamp it.
+    A request above the limit is an error here, before any job: Snakemake would clamp it.
     """
     wish = workflow.global_resources.get("gpu")
     limit = wish.value if wish else None
@@ -208,10 +193,10 @@ class Needs:
         return needed
 
     def _kinds(self, rule: str) -> tuple[Kind, ...]:
-        """The jobs that tell something of a rule's next ones: a GPU takes other memory and time than the CPU."""
-        if self._kind == "gpu" and rule in ON_GPU:
+        """Which earlier jobs predict the next ones of a rule: memory and time on a GPU differ from those on the CPU."""
+        if self._kind == "gpu" and rule in ALWAYS_GPU:
             return ("gpu",)
-        return ("cpu", "gpu") if rule in EITHER else ("cpu",)
+        return ("cpu", "gpu") if rule in BACKEND_DECIDES else ("cpu",)
 
 
 def _asked(wildcards: Any, attempt: int, default: int, known: Callable[[str], float], least: int) -> int:

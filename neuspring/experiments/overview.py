@@ -56,7 +56,7 @@ class Overview:
                 count = self._counts[rule]
                 self._print(f"{rule:<17} {count:>5} job{'s' if count > 1 else ' '} {self._seconds[rule]:>8.0f} s")
         if self._stream.isatty():
-            self._move(_moving(self._counts, {rule: len(paths) for rule, paths in self._waiting.items()}))
+            self._move(_status_line(self._counts, {rule: len(paths) for rule, paths in self._waiting.items()}))
 
     def _ended(self, path: Path) -> float | None:
         """Seconds that a job of this run took; None while it has not succeeded."""
@@ -79,7 +79,7 @@ class Overview:
             print("\r\x1b[K", end="", file=self._stream, flush=True)
 
 
-def _moving(counts: Mapping[str, int], waiting: Mapping[str, int]) -> str:
+def _status_line(counts: Mapping[str, int], waiting: Mapping[str, int]) -> str:
     """Jobs that have ended, of all and of the rules that have begun."""
     total = sum(counts.values())
     begun = [f"{rule} {counts[rule] - left}/{counts[rule]}" for rule, left in waiting.items() if left < counts[rule]]

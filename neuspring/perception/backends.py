@@ -1,6 +1,7 @@
 """The backends of segmentation and tracking: `BACKENDS` declares them, and stages and workflow ask it.
 
-To add a backend: its module with the function `segment` or `track`, its settings in neuspring/config/perception.py, its line here.
+To add a backend: its module with the function `segment` or `track`; its name and its settings in neuspring/config/perception.py;
+its line here.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Backend:
     gpu: bool = False
     """Whether it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
-    """Whether it reads the truth of a synthetic scene: to measure by, never a method."""
+    """Whether it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
 
     def _own(self, section: Any) -> tuple[Any, ...]:
         return (getattr(section, self.section),) if self.section else ()
@@ -39,7 +40,7 @@ class Backend:
         return (resolve_device(device),) if self.gpu else ()
 
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
-        """Labels [T, H, W] uint8 of one camera."""
+        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands (`data.capture.OBJECT`, `HANDS`)."""
         function = import_module(self.module).segment
         labels: np.ndarray = function(capture, camera, *self._own(settings.segment), *self._device(device))
         return labels

@@ -57,14 +57,16 @@ class Metric:
     Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another
     drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie between.
     """
-    paper_name: str
-    """In paper_tables.csv."""
-    paper_heading: str
-    paper_unit: str
+    explained: str = ""
+    """In words, below the heading of summaries; empty: the title."""
+    paper_name: str = ""
+    """In paper_tables.csv; empty for metrics that the paper does not have. Those that it has are named in `IN_PAPER` too."""
+    paper_heading: str = ""
+    paper_unit: str = ""
     """Empty for plain numbers."""
     paper_factor: float = 1.0
     """From the stored unit to the paper's."""
-    paper_digits: int
+    paper_digits: int = 3
     """After the point, for our values beside the paper's."""
 
     @property
@@ -94,6 +96,7 @@ class Metric:
 _ALL = (
     Metric(
         name="chamfer", title="Chamfer distance", heading="CD", unit="m", factor=1e3, digits=2, tolerance=1e-6,
+        explained="single-directional L1 Chamfer",
         paper_name="cd", paper_heading="CD", paper_unit="m", paper_digits=5,
     ),
     Metric(

@@ -25,29 +25,55 @@ class Stage:
     """Whether its jobs take a GPU where there is one; `backend`: its backend decides."""
     learns: bool = False
     """Whether it learns the model of a run."""
+    memory_mb: int = 4000
+    minutes: int = 30
+    """What its first jobs ask for, before any was measured."""
 
 
 COMMON = ("simulation", "losses", "released_quirks")
 """Sections that search and fit share."""
 STAGES = {
-    "capture": Stage(about="synthetic scene or PhysTwin's raw layout -> capture folder"),
-    "segment": Stage(about="one camera of a capture -> masks", gpu="backend"),
-    "track": Stage(about="masks of one camera -> tracks of pixels", reads=("perception.seed",), gpu="backend"),
+    "capture": Stage(about="synthetic scene or PhysTwin's raw layout -> capture folder", minutes=120),
+    "segment": Stage(about="one camera of a capture -> masks", gpu="backend", memory_mb=8000, minutes=120),
+    "track": Stage(
+        about="masks of one camera -> tracks of pixels", reads=("perception.seed",), gpu="backend", memory_mb=8000, minutes=120
+    ),
     "lift": Stage(
-        about="masks and tracks of all cameras -> points in the world, shape prior", reads=("perception.lift", "perception.shape")
+        about="masks and tracks of all cameras -> points in the world, shape prior",
+        reads=("perception.lift", "perception.shape"),
+        memory_mb=8000,
+        minutes=60,
     ),
     "judge": Stage(about="perception of a synthetic capture -> its errors against the truth", reads=("perception.shape",)),
     "observe": Stage(about="capture -> observations.npz"),
-    "search": Stage(about="observations -> coarse twin, by CMA-ES", reads=("search", *COMMON), gpu="always", learns=True),
-    "fit": Stage(about="coarse twin -> fitted twin, by gradients", reads=("fit", *COMMON), gpu="always", learns=True),
-    "train": Stage(about="observations -> trained model of a baseline", gpu="always", learns=True),
-    "rollout": Stage(about="twin -> trajectory over all frames", gpu="always"),
-    "predict": Stage(about="model of a baseline -> trajectory over all frames", gpu="always"),
-    "transfer": Stage(about="learned model -> scores on other recordings of the object", reads=("simulation",), gpu="always"),
+    "search": Stage(
+        about="observations -> coarse twin, by CMA-ES",
+        reads=("search", *COMMON),
+        gpu="always",
+        learns=True,
+        memory_mb=8000,
+        minutes=240,
+    ),
+    "fit": Stage(
+        about="coarse twin -> fitted twin, by gradients",
+        reads=("fit", *COMMON),
+        gpu="always",
+        learns=True,
+        memory_mb=8000,
+        minutes=480,
+    ),
+    "train": Stage(about="observations -> trained model of a baseline", gpu="always", learns=True, memory_mb=8000, minutes=480),
+    "rollout": Stage(about="twin -> trajectory over all frames", gpu="always", minutes=60),
+    "predict": Stage(about="model of a baseline -> trajectory over all frames", gpu="always", minutes=60),
+    "transfer": Stage(
+        about="learned model -> scores on other recordings of the object", reads=("simulation",), gpu="always", minutes=60
+    ),
     "appearance": Stage(
         about="frame 0 of a capture -> splats",
         reads=("images.backend", "images.appearance", "images.released_quirks.corner_pixels"),
         gpu="always",
+        memory_mb=8000,
+        minutes=240,
     ),
     "render": Stage(
         about="splats and trajectory -> pictures, scored and filmed",
@@ -61,8 +87,10 @@ STAGES = {
             "images.released_quirks",
         ),
         gpu="always",
+        memory_mb=8000,
+        minutes=120,
     ),
     "score": Stage(about="trajectory -> scores, plots and run.json"),
 }
 LEARNING = tuple(name for name, stage in STAGES.items() if stage.learns)
-"""In order; the last of them that a run has made its model."""
+"""Stages that produce a model, in order. A run's model is from the last of these that it has."""

@@ -1,4 +1,4 @@
-"""Splats moved as a trajectory says -> pictures of every frame, scored and filmed."""
+"""Move splats along a trajectory, draw every frame, score it, write videos."""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ def command(a: Namespace) -> None:
 def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, device: str, output: Path) -> None:
     """Write trajectory.npz and the record `output`. A rollout that diverges is recorded as a failure.
 
-    Of several records, the mean of their trajectories. `carry` corrects the state at the last training frame by what was observed
-    there, where training frames say that it helps.
+    With several records, the result is the mean of their trajectories. `carry` corrects the state at the last training frame by
+    what was observed there, where training frames say that it helps.
     """
     device = resolve_device(device)
     before = {path: StageRecord.load(path) for path in twin_records}

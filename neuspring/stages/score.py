@@ -199,7 +199,7 @@ def _write_frozen(
     seed: int,
     folder: Path,
 ) -> str:
-    """held.parquet, and its name: scores with the last frame frozen, or frame 0 where there is none."""
+    """Write held.parquet: scores with the last finite frame repeated, or frame 0 where there is none. Returns the file's name."""
     frozen = metrics.last_frame_frozen(trajectory, observations)
     scores = metrics.score(frozen, observations, method, seed)
     if pictures is not None:

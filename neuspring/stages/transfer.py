@@ -1,4 +1,4 @@
-"""What one recording taught -> scores on other recordings of the same object."""
+"""A learned model -> its scores on other recordings of the same object."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ def command(a: Namespace) -> None:
 def run(targets: Sequence[Path], learned_record: Path, method: str, seed: int, settings: Config, device: str, output: Path) -> None:
     """Write transfer.parquet (task `transfer`) and the record `output`.
 
-    `learned_record` names a twin, or a trained baseline that can be transferred. All frames after the first of a target count; with
-    observed initial velocities the first two of them also set the start. A twin's rest lengths are re-based on the target's rest
-    shape, unless they were trained. A rollout that diverges leaves out its target.
+    `learned_record` names a twin, or a trained baseline that can be transferred. All frames after the first of a target count. With
+    `simulation.initial_velocity: observed`, frames 1 and 2 also set the initial velocity. A twin's rest lengths are
+    re-based on the target's rest shape, unless they were trained. A rollout that diverges leaves out its target.
     """
     before, device = StageRecord.load(learned_record), resolve_device(device)
     inputs = {before.stage: learned_record} | {f"target{index}": path for index, path in enumerate(targets)}
     record = Recorder("transfer", output, inputs=inputs, device=device)
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
     if before.status == "ok":
-        predict = _model_elsewhere if before.stage == "train" else _twin_elsewhere
+        predict = _baseline_predictor if before.stage == "train" else _twin_predictor
         predicts = predict(before, learned_record, settings, device)
         for path in targets:
             observations = Observations.load(path)
@@ -64,13 +64,13 @@ def run(targets: Sequence[Path], learned_record: Path, method: str, seed: int, s
     record.save(files, {"diverged": diverged, "targets": len(targets)}, failure=before.reason)
 
 
-def _model_elsewhere(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+def _baseline_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
     """How a baseline's model predicts another recording."""
     baseline = BASELINES[record.settings["model"]]
     return lambda observations: baseline.predict(observations, record.file("model", path), None, device).trajectory
 
 
-def _twin_elsewhere(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+def _twin_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
     """How a twin predicts another recording."""
     twin = Twin.load(record.file("twin", path))
     keep_lengths = bool(record.settings.get("fit", {}).get("rest_length_bound"))

@@ -1,4 +1,4 @@
-"""Writes neuspring/data/timings.csv from the job records of a results folder: python -m tests.benchmarks.timings RESULTS "MACHINE".
+"""Writes data/tables/timings.csv from the job records of a results folder: python -m tests.benchmarks.timings RESULTS "MACHINE".
 
 Run the benchmark alone on the machine before. What we cannot measure is what others published, and says so.
 """
@@ -30,7 +30,9 @@ def main(results: Path, machine: str) -> None:
     ]
     rows += [(rule, "gpu", f"{seconds:.4g}", PUBLISHED) for rule, seconds in GPU.items()]
     text = io.StringIO()
-    text.write("# Seconds per unit of work (neuspring/plan.py), medians, and where from. Written by tests/benchmarks/timings.py.\n")
+    text.write(
+        "# Seconds per unit of work (experiments/plan.py), medians, and where from. Written by tests/benchmarks/timings.py.\n"
+    )
     csv.writer(text, lineterminator="\n").writerows([("rule", "kind", "seconds", "source"), *rows])
     SHIPPED.write_text(text.getvalue(), encoding="utf-8")
 

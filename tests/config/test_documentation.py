@@ -28,9 +28,9 @@ def sections(kind: type) -> set[type]:
 
 
 def test_every_section_is_on_the_page():
-    assert set(config_page.KEYS.values()) == sections(config.Config)
+    assert set(config_page.sections().values()) == sections(config.Config)
     page = config_page.text()
-    for title in config_page.KEYS:
+    for title in config_page.sections():
         assert f"### {title}\n" in page
         # Titles are reached by the anchors that fields name.
         assert title == "(top level)" or f"](#{title.replace('.', '')})" in page
@@ -39,7 +39,7 @@ def test_every_section_is_on_the_page():
 def test_shown_defaults_are_accepted_as_they_are_written():
     """Read as YAML by the strict configuration, they are the defaults (but for sigma, which is shown rounded)."""
     written = {}
-    for title, kind in config_page.KEYS.items():
+    for title, kind in config_page.sections().items():
         if title.startswith("tune"):
             continue  # null unless it is set
         place = written

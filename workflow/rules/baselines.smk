@@ -2,9 +2,9 @@
 rule train:
     input:
         observations=rules.observe.output,
-        capture=where(INPUTS.pictured, INPUTS.capture),
-        masks=where(INPUTS.pictured, masks_of),
-        appearance=where(INPUTS.pictured, INPUTS.appearance),
+        capture=files_if(INPUTS.pictured, INPUTS.capture),
+        masks=files_if(INPUTS.pictured, masks_of),
+        appearance=files_if(INPUTS.pictured, INPUTS.appearance),
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/train.json",
     log:
@@ -38,7 +38,7 @@ rule predict:
     input:
         observations=rules.observe.output,
         train=INPUTS.train,
-        appearance=where(INPUTS.pictured, INPUTS.appearance),
+        appearance=files_if(INPUTS.pictured, INPUTS.appearance),
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:

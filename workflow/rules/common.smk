@@ -1,4 +1,4 @@
-# Checks the configuration before any job exists, and holds the words that rules are written in.
+# Checks the configuration before any job exists, and defines the helper functions of the rules.
 import atexit
 import gc
 import json
@@ -23,15 +23,15 @@ gc.set_threshold(100_000, 50, 100)
 atexit.register(gc.freeze)
 
 ROOT = Path(workflow.basedir)
-# On a cluster its scheduler hands out GPUs; Snakemake then counts jobs (--jobs), not cores, but for a dry run, where it makes cores 1.
-# Inside one of its jobs nothing is counted. Which executor was asked for is not known yet.
+# On a cluster the scheduler hands out GPUs, and Snakemake limits jobs (--jobs), not cores. A dry run sets cores to 1; inside a job of
+# the cluster neither is set. Which executor was asked for is not known yet.
 CLUSTER = workflow.remote_exec or (
     workflow.resource_settings.nodes is not None
     and (workflow.resource_settings.cores is None or workflow.output_settings.dryrun)
 )
 
 
-def told(check, *arguments, **named):
+def or_workflow_error(check, *arguments, **named):
     """What a check returns; a clear message and no traceback where it refuses."""
     try:
         return check(*arguments, **named)
@@ -39,11 +39,11 @@ def told(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
-BENCHMARK = told(checked, config, ROOT, cluster=CLUSTER)
+BENCHMARK = or_workflow_error(checked, config, ROOT, cluster=CLUSTER)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 INPUTS = Inputs(BENCHMARK)
-POOL = () if CLUSTER else told(needs.pool_of, CONFIG, workflow)
+POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
 GPU = int(
     CONFIG.device == "cuda" or (CONFIG.device == "auto" and (CLUSTER or bool(POOL)))
 )
@@ -127,9 +127,9 @@ def tracks_of(wildcards):
     return INPUTS.of_cameras(wildcards, "tracks.json")
 
 
-def where(condition, ask):
+def files_if(applies, ask):
     """Files of a job, where a condition holds for it; none otherwise."""
-    return lambda wildcards: ask(wildcards) if condition(wildcards) else []
+    return lambda wildcards: ask(wildcards) if applies(wildcards) else []
 
 
 def section(name):

@@ -74,4 +74,4 @@ if CONFIG.tune:
 
 rule sweep:
     input:
-        lambda wildcards: told(ARGUMENTS.sweep_targets),
+        lambda wildcards: or_workflow_error(ARGUMENTS.sweep_targets),

@@ -1,4 +1,4 @@
-"""A process that has imported the libraries already, and forks one child per job, which then starts in tenths of a second.
+"""A process that has already imported the heavy libraries. It forks one child per job, which then starts in tenths of a second.
 
 `python -m neuspring.experiments.jobs.warm SOCKET` runs it, for as long as its standard input is open: the workflow holds the other
 end, so it ends with the workflow. Jobs of one run use it; where it is not there (yet), the wrapper starts a process of its own. The
@@ -168,7 +168,7 @@ class _Server:
                         self._selector.unregister(self._stdin)
                         self._selector.unregister(self._listener)
                 else:
-                    self._left(int(key.data))
+                    self._wrapper_gone(int(key.data))
 
     def _accept(self) -> None:
         connection, _ = self._listener.accept()
@@ -185,7 +185,7 @@ class _Server:
             return
         pid = os.fork()
         if pid == 0:
-            self._become(request, connection, files)
+            self._run_child(request, connection, files)
         for file in files:
             os.close(file)
         self._connections[pid] = connection
@@ -193,7 +193,7 @@ class _Server:
         with contextlib.suppress(OSError):
             connection.sendall(json.dumps({"pid": pid}).encode() + b"\n")
 
-    def _left(self, pid: int) -> None:
+    def _wrapper_gone(self, pid: int) -> None:
         """The wrapper of a job has gone: its job ends too."""
         if pid not in self._connections:
             return  # the job ended in the same moment
@@ -212,7 +212,7 @@ class _Server:
                     connection.sendall(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode() + b"\n")
                 connection.close()
 
-    def _become(self, request: Mapping[str, Any], connection: socket.socket, files: Sequence[int]) -> None:
+    def _run_child(self, request: Mapping[str, Any], connection: socket.socket, files: Sequence[int]) -> None:
         """In the child: run the command and end."""
         status = 1
         try:
@@ -235,7 +235,7 @@ class _Server:
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
-            # No exit handlers of the parent's libraries: what a job has to finish it has finished.
+            # Skip the exit handlers that were inherited from the parent.
             os._exit(status)
 
 

@@ -20,6 +20,7 @@ from neuspring.scores.failures import both_averages, failures_text, left_out_lin
 from neuspring.scores.metrics import (
     COLUMNS,
     DASH,
+    DISTANCES,
     HEADINGS,
     IMAGE_HEADINGS,
     METRICS,
@@ -55,7 +56,8 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     scenarios, seeds = runs["scenario"].nunique(), runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
     spread = ", ± standard deviation over seeds" if several else ""
-    lines = [f"Errors in mm, lower is better ({size}; CD: single-directional L1 Chamfer; TE: track error).", ""]
+    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES)
+    lines = [f"Errors in mm, lower is better ({size}; {explained}).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
     if removed := removed_lines(runs, collected.left_out):
         lines += [" ".join([_kept_line(scores, runs), *removed]), ""]

@@ -1,0 +1,42 @@
+"""Pages name files, folders, headings and configurations that there are."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    path for place in (ROOT, ROOT / ".github", ROOT / "config", ROOT / "results", ROOT / "workflow") for path in place.glob("*.md")
+) + sorted((ROOT / "neuspring").rglob("*.md"))
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+PATH = re.compile(
+    r"(?<![\w/.])((?:neuspring|workflow|config|tests|results/published)/[\w/.-]*\w\.(?:py|yaml|tsv|smk|csv|md|txt))\b"
+)
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings of a page, as code hosts make them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    plain = [re.sub(r"[`*]|\[([^\]]*)\]\([^)]*\)", r"\1", title).lower() for title in titles]
+    return {re.sub(r"[^\w\- ]", "", title).replace(" ", "-") for title in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_and_paths_of_a_page_lead_somewhere(page):
+    text, dead = page.read_text(), []
+    for target in LINK.findall(text):
+        if re.match(r"https?:|mailto:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+            dead.append(target)
+    dead += [name for name in PATH.findall(text) if not (ROOT / name).exists()]
+    assert not dead
+
+
+def test_every_room_has_a_page_or_a_map():
+    for room in (ROOT / "neuspring").iterdir():
+        if room.is_dir() and any(room.glob("*.py")):
+            assert len((room / "__init__.py").read_text()) > 40
