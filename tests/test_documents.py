@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    path for place in (ROOT, ROOT / ".github", ROOT / "config", ROOT / "results", ROOT / "workflow") for path in place.glob("*.md")
-) + sorted((ROOT / "neuspring").rglob("*.md"))
+PLACES = ("", ".github", "config", "results", "workflow")
+PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PATH = re.compile(
     r"(?<![\w/.])((?:neuspring|workflow|config|tests|results/published)/[\w/.-]*\w\.(?:py|yaml|tsv|smk|csv|md|txt))\b"
