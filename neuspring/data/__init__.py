@@ -1,5 +1,6 @@
 """Data: captures and readers, which end in Observations, and the checks of their files.
 
+- `sources`: `SOURCES` declares every kind of data; the table of scenarios.
 - `capture`: the capture folder (cameras, frames, masks) and its writer; `check_capture`: its checks.
 - `phystwin`, `phystwin_raw`, `mocap`: readers; `released`, `cases`: what PhysTwin released, and the table of its 22 cases.
 - `check`, `departure`, `calibration`: checks of a layout, what they report, the rules for cameras.

@@ -150,7 +150,7 @@ class Benchmark:
     whole: Config
     """As it was given: what tables are laid out for, and whose seeds are averaged, whatever part of it is run now."""
     scenarios: dict[str, ScenarioRow]
-    """Chosen ones, those that twins are transferred to, those of the tuning study."""
+    """Chosen ones, those that twins are transferred to, those of the sweep."""
     whole_scenarios: dict[str, ScenarioRow]
     """Those of the whole configuration."""
     methods: dict[str, Method]
@@ -243,7 +243,7 @@ class Benchmark:
 
     @property
     def tuned(self) -> tuple[str, ...]:
-        """The scenarios of the tuning study: a study keeps them, whatever part of the runs is made now."""
+        """The scenarios of the sweep: it keeps them, whatever part of the runs is made now."""
         return _tuned(self.whole)
 
     @property
@@ -328,7 +328,7 @@ def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], metho
 
 
 def _tuned(whole: Config) -> tuple[str, ...]:
-    """The scenarios of the tuning study; none without one."""
+    """The scenarios of the sweep; none without one."""
     return whole.tune.scenarios or whole.scenarios if whole.tune else ()
 
 
