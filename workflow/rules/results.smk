@@ -108,7 +108,7 @@ rule track_init:
         runtime=NEEDS.minutes("track_init"),
     params:
         settings=section("tracking"),
-        results=RESULTS,
+        results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
         common_job(
             "track-init --results {params.results:q} --settings {params.settings:q} --output {output:q}"
@@ -131,7 +131,7 @@ rule log_run:
         runtime=NEEDS.minutes("log_run"),
     params:
         settings=section("tracking"),
-        results=RESULTS,
+        results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
         scenario_job(
             "log --record {input.record:q} --results {params.results:q} --settings {params.settings:q} --output {output:q}"

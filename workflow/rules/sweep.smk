@@ -64,8 +64,8 @@ if CONFIG.tune:
             runtime=NEEDS.minutes("log_sweep"),
         params:
             settings=section("tracking"),
-            results=RESULTS,
-            folder=SWEEP,
+            results=lambda wildcards, input: str(Path(input.store[0]).parent),
+            folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
         shell:
             common_job(
                 "sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
