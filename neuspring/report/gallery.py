@@ -38,7 +38,7 @@ def write(results: Path, scenarios: Iterable[str], methods: Iterable[str], seed:
         splats = [Picture(caption="", alt=path.stem, data=_link(path, folder)) for path in learned]
         blocks: list[Block] = [Text(text="No pictures: no images, or no finished run.")]
         if figures:
-            blocks = [Fold(summary="Splats of frame 0", blocks=splats), Grid(blocks=figures, least=34)]
+            blocks = [Fold(summary="Splats of frame 0", blocks=splats), Grid(blocks=figures, least=28)]
         sections.append(Section(key=scenario, title=scenario, blocks=blocks))
     path = folder / NAME
     write_text(path, html_page("NeuSpring: pictures", f"{ABOUT} Seed {seed}.", sections, embedded=False))
