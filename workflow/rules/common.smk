@@ -2,11 +2,14 @@
 import atexit
 import gc
 import json
+import logging
 import shlex
 import sys
 import tempfile
 import uuid
 from pathlib import Path
+
+from snakemake.logging import logger
 
 from neuspring import config as settings
 from neuspring.core.errors import InputError
@@ -31,6 +34,15 @@ CLUSTER = workflow.remote_exec or (
 )
 
 
+# `--quiet all`: jobs write to their logs alone, and a line per rule is told. Snakemake would then hide errors too.
+QUIET = "all" in {level.name.lower() for level in workflow.output_settings.quiet or ()}
+if QUIET:
+    errors = logging.StreamHandler()
+    errors.setLevel(logging.ERROR)
+    errors.setFormatter(next(each.formatter for each in logger.handlers))
+    logger.addHandler(errors)
+
+
 def or_workflow_error(check, *arguments, **named):
     """What a check returns; a clear message and no traceback where it refuses."""
     try:
@@ -52,8 +64,6 @@ NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 GPU_FIRST = 10 * GPU
 # Only for `--software-deployment-method conda`; without it the running environment is used.
 ENVIRONMENT = str(ROOT / "workflow" / "envs" / "neuspring.yaml")
-# `--quiet all`: jobs write to their logs alone, and a line per rule is told.
-QUIET = "all" in {level.name.lower() for level in workflow.output_settings.quiet or ()}
 # Where jobs find the warm process of this run.
 WARM = Path(tempfile.gettempdir()) / f"neuspring-{uuid.uuid4().hex[:16]}" / "socket"
 TABLE_FOLDER = f"{RESULTS}/{CONFIG.tables}"

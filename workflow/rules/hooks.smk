@@ -1,5 +1,4 @@
 # What is told before, during and after a run; the warm process of its jobs.
-import shutil
 import time
 from types import SimpleNamespace
 
@@ -58,7 +57,6 @@ def end():
     if RUN.warm:
         RUN.warm.stdin.close()
         RUN.warm.wait()
-        shutil.rmtree(WARM.parent)
 
 
 def plan_of_dry_run():

@@ -253,4 +253,10 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    try:
+        main(sys.argv[1])
+    finally:
+        # The folder is this socket's alone; one that holds anything else stays.
+        with contextlib.suppress(OSError):
+            Path(sys.argv[1]).unlink(missing_ok=True)
+            Path(sys.argv[1]).parent.rmdir()
