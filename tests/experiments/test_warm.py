@@ -81,6 +81,7 @@ def test_what_the_warm_process_cannot_run_starts_by_itself(server, tmp_path):
     assert warm.start([*warm.COMMAND, "--version"], [], environment | {"OMP_NUM_THREADS": "4"}) is None
     assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: str(tmp_path / "none")}) is None
     assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: ""}) is None
+    assert warm.start([*warm.COMMAND, "--version"], [], environment | {"CUDA_VISIBLE_DEVICES": "0"}) is None
 
 
 def test_files_that_a_job_must_hold_are_inherited(server, tmp_path):

@@ -26,6 +26,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from neuspring.experiments.jobs.gpus import VISIBLE
+
 SOCKET = "NEUSPRING_WARM"
 """Environment: the socket of the warm process."""
 COMMAND = ("python", "-m", "neuspring")
@@ -81,6 +83,8 @@ def start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[
     path = environment.get(SOCKET, "")
     if not path or tuple(command[: len(COMMAND)]) != COMMAND or any(environment.get(name, "1") != "1" for name in THREADS):
         return None
+    if environment.get(VISIBLE):
+        return None  # CUDA in a forked process was never tried, and a job on a GPU takes longer than its start
     connection = socket.socket(socket.AF_UNIX)
     try:
         connection.connect(path)
@@ -109,16 +113,22 @@ def start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[
 
 def serve_while_running(path: Path) -> subprocess.Popen[bytes]:
     """Start the warm process; it ends when this process does. The folder of the socket must be private."""
-    environment = os.environ | dict.fromkeys(THREADS, "1") | {"CUDA_VISIBLE_DEVICES": ""}
+    environment = os.environ | dict.fromkeys(THREADS, "1") | {VISIBLE: ""}
     command = [sys.executable, "-m", __name__, str(path)]
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def main(path: str) -> None:
     """Import the libraries, then fork a child per request until standard input is closed and no job is left."""
-    for name in LIBRARIES:
+    # Here, because every job imports this module for its own side.
+    from neuspring.experiments.tracking.store import ENVIRONMENT
+
+    # MLflow reads some of these when it is imported: no telemetry, no tracebacks.
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    for library in LIBRARIES:
         with contextlib.suppress(ImportError):
-            importlib.import_module(name)
+            importlib.import_module(library)
     if threading.active_count() > 1 or set(_native_threads()) - SAFE_THREADS:
         return  # a fork of several threads is not safe: every job starts a process of its own
     gc.collect()
