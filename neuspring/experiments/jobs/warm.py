@@ -2,8 +2,8 @@
 
 `python -m neuspring.experiments.jobs.warm SOCKET` runs it, for as long as its standard input is open: the workflow holds the other
 end, so it ends with the workflow. Jobs of one run use it; where it is not there (yet), the wrapper starts a process of its own. The
-results are the same: a child has its own environment, folder and output, and no library has started a thread or a device before the
-fork.
+results are the same: a child has its own environment, folder and output. Before the fork no library has touched a device, or started a
+thread that does not prepare for a fork. Linux alone: elsewhere a fork after these imports is not safe.
 """
 
 from __future__ import annotations
@@ -120,6 +120,8 @@ def serve_while_running(path: Path) -> subprocess.Popen[bytes]:
 
 def main(path: str) -> None:
     """Import the libraries, then fork a child per request until standard input is closed and no job is left."""
+    if sys.platform != "linux":
+        return
     # Here, because every job imports this module for its own side.
     from neuspring.experiments.tracking.store import ENVIRONMENT
 
