@@ -2,8 +2,8 @@
 
 `python -m neuspring.experiments.jobs.warm SOCKET` runs it, for as long as its standard input is open: the workflow holds the other
 end, so it ends with the workflow. Jobs of one run use it; where it is not there (yet), the wrapper starts a process of its own. The
-results are the same: a child has its own environment, folder and output. Before the fork no library has touched a device, or started a
-thread that does not prepare for a fork. Linux alone: elsewhere a fork after these imports is not safe.
+results are the same: a child has its own environment, folder and output. Before the fork no library has touched a device, or
+started a thread that does not prepare for a fork. Linux alone: elsewhere a fork after these imports is not safe.
 """
 
 from __future__ import annotations
