@@ -91,17 +91,35 @@ class FrameSolver:
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move linearly from begin to end [C, 3]."""
-        b = self.buffers
+        self.start(x, v)
+        self.advance(begin, end)
+        return self._one(self.buffers.get_vectors("x", self.last)), self._one(self.buffers.get_vectors("v", self.last))
+
+    def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
+        """Put the state at the start of a frame into the buffers."""
         for name, values in (("x", x), ("v", v)):
-            b.set_vectors(name, self._stacked(values), slot=0)
+            self.buffers.set_vectors(name, self._stacked(values), slot=0)
+
+    def advance(self, begin: torch.Tensor, end: torch.Tensor) -> None:
+        """Simulate a frame from the state in slot 0; it ends in slot `last`."""
+        b = self.buffers
         for name, values in (("begin", begin), ("end", end)):
             b.set_vectors(name, self._stacked(values))
         if self.simulation.self_collision:
             collision.find_candidates(b, self._reach)
         self._run("forward", self.launch_forward)
         self.frame_token += 1
-        last = b.slot(b.substeps)
-        return self._one(b.get_vectors("x", last)), self._one(b.get_vectors("v", last))
+
+    def go_on(self) -> None:
+        """Take the end of the last frame for the start of the next."""
+        if self.last:
+            for name in ("x", "v"):
+                self.buffers.tensors[name][0].copy_(self.buffers.tensors[name][self.last])
+
+    @property
+    def last(self) -> int:
+        """The slot that holds the end of a frame."""
+        return self.buffers.slot(self.buffers.substeps)
 
     def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
