@@ -27,7 +27,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
-from neuspring.physics.lanes import WIDTHS
+from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.topology import isolated, piecewise_topology, regions
@@ -182,12 +182,40 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 
 
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
-    """Which candidates are simulated together: alike in cost, so that few wait for the slowest, and a group for each thread."""
-    on_gpu = problem.device != "cpu"
-    most = problem.together or (len(twins) if on_gpu else WIDTHS[-1])
-    count = max(-(-len(twins) // most), 1 if on_gpu else min(problem.threads, len(twins)))
-    by_cost = sorted(range(len(twins)), key=lambda k: (twins[k].simulation.substeps, len(twins[k].topology.springs)))
-    return [part.tolist() for part in np.array_split(by_cost, count) if len(part)]
+    """Which candidates are simulated together, the slowest group first.
+
+    On CUDA all. On a CPU lanes wait for their group's largest number of substeps, and work on all springs of their group: alike ones are
+    put together, such that the expected time of `threads` is least.
+    """
+    if problem.device != "cpu":
+        size = problem.together or len(twins)
+        return [list(range(first, min(first + size, len(twins)))) for first in range(0, len(twins), size)]
+    substeps = [twin.simulation.substeps for twin in twins]
+    springs = [len(twin.topology.springs) for twin in twins]
+    order = sorted(range(len(twins)), key=lambda k: -substeps[k])
+    most = min(problem.together or WIDTHS[-1], WIDTHS[-1])
+
+    def time_of(members: Sequence[int]) -> float:
+        return COST[width_for(len(members))] * substeps[members[0]] * max(springs[k] for k in members)
+
+    parts = [order[first:last] for first in range(len(order)) for last in range(first + 1, min(first + most, len(order)) + 1)]
+    times = {(part[0], len(part)): time_of(part) for part in parts}
+
+    def split(limit: float) -> tuple[float, float, list[list[int]]]:
+        """(expected time of all threads, sum, groups) of the split with the least sum, in which no group of several takes longer."""
+        best: list[tuple[float, float, list[list[int]]]] = [(0.0, 0.0, [])]
+        for first in reversed(range(len(order))):
+            choices = []
+            for size in range(1, min(most, len(order) - first) + 1):
+                own = times[order[first], size]
+                total, longest, rest = best[len(order) - first - size]
+                if size == 1 or own <= limit:
+                    choices.append((total + own, max(longest, own), [order[first : first + size], *rest]))
+            best.append(min(choices, key=lambda choice: choice[0]))
+        total, longest, split_parts = best[-1]
+        return max(total / problem.threads, longest), total, split_parts
+
+    return min(map(split, set(times.values())), key=lambda choice: choice[:2])[2]
 
 
 @dataclass(frozen=True)

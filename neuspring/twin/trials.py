@@ -48,9 +48,7 @@ class Kernels(NamedTuple):
     look: Any
 
 
-def outcomes(
-    twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str
-) -> list[Outcome]:
+def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
     """Roll twins of the same nodes out over hands [T, C, 3] from velocity [N, 3], m/s, and judge the frames that the loss holds."""
     solver = solver_of(twins, device, differentiable=False)
     count = len(twins)
@@ -65,7 +63,8 @@ def outcomes(
         if frame % LOOK_EVERY[device.partition(":")[0]] == 0 and not sums.present:
             break
     return [
-        Outcome(cost, left, overflow) for cost, left, overflow in zip(sums.costs(len(hands) - 1), sums.left, solver.overflows, strict=True)
+        Outcome(cost, left, overflow)
+        for cost, left, overflow in zip(sums.costs(len(hands) - 1), sums.left, solver.overflows, strict=True)
     ]
 
 
@@ -83,7 +82,9 @@ class LossSums:
         self._total = torch.zeros((b.groups, b.width), dtype=torch.float64, device=b.device)
         self._view = wp.from_torch(self._total, dtype=wp.types.vector(b.width, wp.float64))
         self._points = wp.from_torch(loss.points.contiguous(), dtype=wp.vec3)
-        self._visible, self._valid = (wp.from_torch(flags.to(torch.int32).contiguous()) for flags in (loss.visible, loss.motion_valid))
+        self._visible, self._valid = (
+            wp.from_torch(flags.to(torch.int32).contiguous()) for flags in (loss.visible, loss.motion_valid)
+        )
         self._counts = loss.counts()
 
     def add(self, frame: int) -> None:
