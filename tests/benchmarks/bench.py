@@ -30,7 +30,9 @@ def main(arguments: list[str] | None = None) -> None:
     start_warp()
     facts = machine.facts()
     kind = machine.kind(facts)
-    rows, notes, measured = [], [], {}
+    rows: list[table.Row] = []
+    notes: list[str] = []
+    measured: dict[str, limits.Limits] = {}
     for device in ("cpu", *(["cuda:0"] if torch.cuda.is_available() else [])):
         peer = PhysTwin(options.peer, device) if options.peer else None
         measured[device] = limits.measure(device)
@@ -66,4 +68,5 @@ if __name__ == "__main__":
     try:
         main()
     except InputError as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -62,7 +62,7 @@ class Ours:
         raise NotImplementedError("several twins together, since the engine simulates one at a time")
 
     def chain(self, twin: Twin, path: np.ndarray) -> Callable[[], object]:
-        """A gradient through all frames of a path of the hands [F + 1, C, 3], which the loss sees after every frame."""
+        """The gradient of the loss after all frames of a path of the hands [F + 1, C, 3]."""
         solver = solver_for(twin, self.device, differentiable=True)
         steps = torch.tensor(path, dtype=torch.float32, device=self.device)
         start, rest, *_ = self._start(twin, path[:2])
@@ -70,11 +70,10 @@ class Ours:
 
         def run() -> None:
             packed.springs.grad = None
-            x, v, total = start, rest, start.new_zeros(())
+            x, v = start, rest
             for k in range(len(steps) - 1):
                 x, v = simulate_frame(solver, packed, x, v, steps[k], steps[k + 1])
-                total = total + smooth_l1_loss(x, torch.zeros_like(x))
-            total.backward()
+            smooth_l1_loss(x, torch.zeros_like(x)).backward()
 
         return run
 

@@ -104,7 +104,7 @@ class PhysTwin:
         """A twin as it takes one: unit masses, the logarithm of the stiffness, one dashpot for all springs."""
         topology, material, simulation = twin.topology, twin.material, twin.simulation
         dashpot = single_dashpot(twin)
-        options = {"dtype": torch.float32, "device": self.device}
+        options: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
         path = torch.tensor(hands, **options)
         count = len(topology.nodes)
         # It records its own graph of its own loss where this is set.

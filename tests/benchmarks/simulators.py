@@ -102,9 +102,10 @@ def take_turns(
     return {name: Times(tuple(times)) for name, times in spent.items()}
 
 
-def disagreement(frame: Frame, other: Frame) -> float:
-    """The largest distance between the nodes of two frames that ran, m."""
-    return float(np.linalg.norm(frame.positions().astype(np.float64) - other.positions(), axis=1).max())
+def distances(frame: Frame, other: Frame) -> np.ndarray:
+    """Between the nodes of two frames that ran, [N], m."""
+    apart: np.ndarray = np.linalg.norm(frame.positions().astype(np.float64) - other.positions(), axis=1)
+    return apart
 
 
 def gradient_difference(frame: Frame, other: Frame) -> float:
