@@ -11,41 +11,15 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 import warp as wp
 
-from neuspring.core.artifacts import Material, Simulation, Twin
-from neuspring.physics import reference, stability
+from neuspring.physics import reference
 from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
-from neuspring.twin.topology import uniform_topology
-
-HANDS = 8
-FRAME_TIME = 1 / 30
-CASES = {"a": (400, 67, 22), "b": (2000, 667, 31)}
-"""Nodes, substeps, neighbours asked for (self included). Radius below: never the limit."""
-
-
-def box(nodes: int, substeps: int, neighbours: int, *, self_collision: bool = False) -> tuple[Twin, np.ndarray]:
-    """A box of random points just above the ground, held by hands at its top, and the hands of one frame [2, C, 3]."""
-    rng = np.random.default_rng(0)
-    edge = 0.01 * nodes ** (1 / 3)
-    points = rng.uniform(0, edge, (nodes, 3)) + np.array([0, 0, 0.001])
-    hands = rng.uniform(0, edge, (HANDS, 3)) * [1, 1, 0] + [0, 0, edge + 0.005]
-    topology = uniform_topology(points, hands, 10 * edge, neighbours, 10 * edge, 20)
-    count = len(topology.springs)
-    scalars = dict.fromkeys(("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction"), 0.5)
-    simulation = Simulation(frame_time=FRAME_TIME, substeps=substeps, self_collision=self_collision)
-    # As stiff as the substep allows with a margin: lambda <= twice the largest row sum of Y / l0.
-    unit = Material(stiffness=topology.rest_lengths, dashpot=np.zeros(count), drag=3.0, contact_distance=0.005, **scalars)
-    spectrum = stability.twin_spectrum(Twin(topology=topology, material=unit, simulation=simulation))
-    stiffness = topology.rest_lengths * min(3e6, 1.0 / (spectrum.stiffness * simulation.substep**2))
-    material = Material(stiffness=stiffness, dashpot=np.full(count, 0.5), drag=3.0, contact_distance=0.005, **scalars)
-    twin = Twin(topology=topology, material=material, simulation=simulation)
-    stability.check(twin)
-    return twin, np.stack([hands, hands + np.array([0, 0, 0.005])])
+from tests.benchmarks.memory import peak_mib, reset_peak
+from tests.benchmarks.scenes import CASES, box
 
 
 def timed(action: Callable[[], object], repeats: int, device: str) -> tuple[float, float]:
@@ -108,16 +82,6 @@ def bench(name: str, device: str, repeats: int) -> dict[str, float]:
     if "float64 NumPy reference" in medians:
         print(f"    forward is {medians['float64 NumPy reference'] / captured:.1f} x as fast as the NumPy reference")
     return medians
-
-
-def peak_mib() -> float:
-    """Largest resident memory since `reset_peak` (Linux)."""
-    status = Path("/proc/self/status").read_text()
-    return float(status.split("VmHWM:")[1].split()[0]) / 1024
-
-
-def reset_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
 
 
 def memory(device: str) -> None:

@@ -18,7 +18,8 @@ from neuspring.core.errors import InputError
 from neuspring.splats.rasterise import Backend, choose_backend, rasterise
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
-from tests.benchmarks.bench_frame import peak_mib, reset_peak, timed
+from tests.benchmarks.bench_frame import timed
+from tests.benchmarks.memory import peak_mib, reset_peak
 
 SIZES = ((212, 120), (424, 240), (848, 480))
 COUNTS = (2_000, 10_000, 50_000)

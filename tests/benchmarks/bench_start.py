@@ -34,33 +34,42 @@ def tiny(folder: Path) -> list[str]:
     return ["rollout", "--observations", str(observations), "--twin", str(search), "--device", "cpu", "--output"]
 
 
+def alone(folder: Path, command: list[str], times: int) -> list[float]:
+    """Seconds of a job from start to end, alone on the machine and with warm kernels, each time."""
+    seconds = []
+    for _ in range(times):
+        start = time.perf_counter()
+        run = [sys.executable, "-m", "neuspring", *command, str(folder / "alone.json")]
+        subprocess.run(run, check=True, capture_output=True)
+        seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def crowd(folder: Path, command: list[str], jobs: int = 16) -> tuple[float, str]:
+    """Seconds until all of `jobs` that start at once with an empty kernel cache have ended, and what they printed."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(folder / "cache")}
+    start = time.perf_counter()
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", ONE, *command, str(folder / f"{index}.json")],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )
+        for index in range(jobs)
+    ]  # fmt: skip
+    outputs = [process.communicate()[0] for process in processes]
+    assert all(process.returncode == 0 for process in processes), outputs[0]
+    return time.perf_counter() - start, "".join(outputs)
+
+
 def main() -> None:
     """Print both."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         command = tiny(folder)
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            run = [sys.executable, "-m", "neuspring", *command, str(folder / "alone.json")]
-            subprocess.run(run, check=True, capture_output=True)
-            times.append(time.perf_counter() - start)
-        print(
-            f"a job alone, warm kernels: {statistics.median(times):.1f} s from start to end ({min(times):.1f} to {max(times):.1f})"
-        )
-        environment = os.environ | {"WARP_CACHE_PATH": str(folder / "cache")}
-        start = time.perf_counter()
-        crowd = [
-            subprocess.Popen(
-                [sys.executable, "-c", ONE, *command, str(folder / f"{index}.json")],
-                env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            )
-            for index in range(16)
-        ]  # fmt: skip
-        outputs = [process.communicate()[0] for process in crowd]
-        assert all(process.returncode == 0 for process in crowd), outputs[0]
-        text = "".join(outputs)
-        took = time.perf_counter() - start
+        times = alone(folder, command, 5)
+        spread = f"{min(times):.1f} to {max(times):.1f}"
+        print(f"a job alone, warm kernels: {statistics.median(times):.1f} s from start to end ({spread})")
+        took, text = crowd(folder, command)
         compiled, found = text.count("(compiled)"), text.count("(cached)")
         print(f"16 at once, no kernels: {took:.1f} s; {compiled} compiled, {found} found in the cache")
 

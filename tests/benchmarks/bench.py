@@ -1,0 +1,72 @@
+"""The table of times of the simulator: python -m tests.benchmarks.bench [--quick] [--only SECTION] [--peer CHECKOUT] [--save]
+
+On the CPU, one thread, and on the first GPU where there is one. Prints one table and this machine's limits, and how every row
+changed since the table of the same kind of machine that was committed last. Writes results/bench/<kind of machine>.json, or with
+--save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes; --quick less than one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from neuspring.core.device import start_warp
+from neuspring.core.errors import InputError
+from tests.benchmarks import limits, machine, table
+from tests.benchmarks.ours import Ours
+from tests.benchmarks.phystwin import PhysTwin
+from tests.benchmarks.sections import SECTIONS, Bench
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure, print, write."""
+    options = parsed(arguments)
+    torch.set_num_threads(1)
+    start_warp()
+    facts = machine.facts()
+    kind = machine.kind(facts)
+    rows: list[table.Row] = []
+    notes: list[str] = []
+    measured: dict[str, limits.Limits] = {}
+    for device in ("cpu", *(["cuda:0"] if torch.cuda.is_available() else [])):
+        peer = PhysTwin(options.peer, device) if options.peer else None
+        measured[device] = limits.measure(device)
+        bench = Bench(device, measured[device], Ours(device), peer, options.quick, notes)
+        for section in options.only or SECTIONS:
+            begin = time.perf_counter()
+            rows += SECTIONS[section](bench)
+            print(f"{section}, {device}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+    committed = table.last_committed(kind)
+    print(", ".join(f"{name} {value}" for name, value in facts.items() if value))
+    for device, its in measured.items():
+        print(*(f"{device} {line}" for line in its.lines()), sep="\n")
+    print("", table.text(rows, committed), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
+    print(f"compared with commit {committed['machine']['commit']}" if committed else f"no table of {kind} is committed")
+    record = table.as_record(facts, {device: asdict(its) for device, its in measured.items()}, rows, notes)
+    print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
+
+
+def parsed(arguments: list[str] | None) -> argparse.Namespace:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="fewer rows and rounds; not to be saved")
+    parser.add_argument("--only", action="append", choices=list(SECTIONS), metavar="SECTION", help=", ".join(SECTIONS))
+    parser.add_argument("--peer", type=Path, metavar="CHECKOUT", help="a checkout of PhysTwin, whose simulator is then timed too")
+    parser.add_argument("--save", action="store_true", help=f"write into {table.COMMITTED}")
+    options = parser.parse_args(arguments)
+    if options.save and (options.quick or options.only):
+        parser.error("--save keeps a whole table: without --quick and --only")
+    return options
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

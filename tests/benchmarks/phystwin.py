@@ -1,0 +1,224 @@
+"""The released PhysTwin simulator as the table times it, from a checkout of the user's: `--peer PATH`.
+
+The checkout stays as it is. Its simulator and the settings that it reads are copied to a temporary folder, where the name of the
+device is replaced, and are imported from there: this runs code of the checkout. Nothing of it is part of this project.
+
+A frame is recorded as a graph, as its trainer does: the substeps alone, or the substeps, a loss and the tape's backward pass. What
+the trainer does at every frame is timed with it: the state, the hands, the tape's gradients set to zero. The optimizer is left out.
+The loss is the plain one that it has for synthetic data (`simulators.LOSS`): the Chamfer distance is no part of the simulation.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.device import start_warp
+from neuspring.core.errors import InputError
+from tests.benchmarks.simulators import Frame
+
+PACKAGE = "qqtt"
+SIMULATOR = Path(PACKAGE, "model", "diff_simulator", "spring_mass_warp.py")
+SETTINGS = [Path(PACKAGE, "utils", name) for name in ("config.py", "misc.py")]
+DEVICE = 'wp.set_device("cuda:0")'
+SYSTEM = "SpringMassSystemWarp"
+UTILITIES = """import logging
+from .config import cfg
+logger = logging.getLogger("peer")
+"""
+"""In the place of the checkout's own, which also import viewers."""
+ANY_STIFFNESS = (0.0, 1e9)
+"""Its clamp of the stiffness, N: no limit here."""
+
+
+class PhysTwin:
+    """The simulator of a checkout on a device.
+
+    Raises InputError where the folder is no checkout of it, or of a version whose text this file does not know.
+    """
+
+    name = "PhysTwin"
+
+    def __init__(self, checkout: Path, device: str = "cpu") -> None:
+        self.device = device
+        self._folder = tempfile.TemporaryDirectory(prefix="peer-")
+        stem = "simulator_" + device.replace(":", "_")
+        copy(checkout, Path(self._folder.name), stem, device)
+        self._module, self._settings = imported(Path(self._folder.name), stem, device)
+        if not hasattr(self._module, SYSTEM):
+            raise InputError(checkout / SIMULATOR, f"must define {SYSTEM}", None, "Give --peer another version of the checkout.")
+
+    def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
+        """One frame, as in its inference."""
+        system = self._system(twin, hands)
+        with wp.ScopedCapture(device=self.device) as capture:
+            system.step()
+
+        def run() -> None:
+            with wp.ScopedDevice(self.device):
+                self._begin(system, inference=True)
+                wp.capture_launch(capture.graph)
+
+        return Frame(run, lambda: positions(system))
+
+    def forward_backward(self, twin: Twin, hands: np.ndarray) -> Frame:
+        """One frame and its gradient, as in its training."""
+        system = self._system(twin, hands)
+        with wp.ScopedCapture(device=self.device) as capture:
+            tape = wp.Tape()
+            with tape:
+                system.step()
+                system.calculate_simple_loss()
+            tape.backward(system.loss)
+
+        def run() -> None:
+            with wp.ScopedDevice(self.device):
+                # Its trainer does this after a frame. Before, it leaves the gradient readable after the run.
+                tape.zero()
+                system.clear_loss()
+                self._begin(system, inference=False)
+                wp.capture_launch(capture.graph)
+
+        return Frame(run, lambda: positions(system), lambda: system.wp_spring_Y.grad.numpy().copy())
+
+    def _begin(self, system: Any, *, inference: bool) -> None:
+        """The state at rest and the hands of the frame."""
+        system.set_init_state(system.wp_init_vertices, system.wp_init_velocities, pure_inference=inference)
+        system.set_controller_target(1, pure_inference=inference)
+        if system.object_collision_flag:
+            system.update_collision_graph()
+
+    def _system(self, twin: Twin, hands: np.ndarray) -> Any:
+        """A twin as it takes one: unit masses, the logarithm of the stiffness, one dashpot for all springs."""
+        topology, material, simulation = twin.topology, twin.material, twin.simulation
+        dashpot = single_dashpot(twin)
+        options: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
+        path = torch.tensor(hands, **options)
+        count = len(topology.nodes)
+        # It records its own graph of its own loss where this is set.
+        self._settings.use_graph = False
+        low, high = ANY_STIFFNESS
+        with wp.ScopedDevice(self.device):
+            return getattr(self._module, SYSTEM)(
+                torch.cat([torch.tensor(topology.nodes, **options), path[0]]),
+                torch.tensor(topology.springs, dtype=torch.int32, device=self.device),
+                torch.tensor(topology.rest_lengths, **options),
+                torch.ones(count + path.shape[1], **options),
+                simulation.substep,
+                simulation.substeps,
+                np.array(material.stiffness),
+                material.ground_elasticity,
+                material.ground_friction,
+                dashpot,
+                material.drag,
+                collide_object_elas=material.contact_elasticity,
+                collide_object_fric=material.contact_friction,
+                collision_dist=material.contact_distance,
+                self_collision=simulation.self_collision,
+                num_object_points=count,
+                num_surface_points=count,
+                num_original_points=count,
+                controller_points=path,
+                reverse_z=simulation.up == "-z",
+                spring_Y_min=low,
+                spring_Y_max=high,
+                gt_object_points=torch.zeros((2, count, 3), **options),
+                gt_object_visibilities=torch.ones((2, count), **options),
+                gt_object_motions_valid=torch.ones((2, count), **options),
+            )
+
+
+def copy(checkout: Path, folder: Path, stem: str, device: str) -> None:
+    """Copy what the simulator needs into a package in `folder`, its simulator as module `stem` for a device."""
+    for name in (SIMULATOR, *SETTINGS):
+        if not (checkout / name).is_file():
+            rule = f"must be a checkout of PhysTwin, with {name}"
+            raise InputError("--peer", rule, checkout, "Give the folder that git clone made.")
+    text = (checkout / SIMULATOR).read_text(encoding="utf-8")
+    if DEVICE not in text:
+        raise InputError(checkout / SIMULATOR, f"must name its device by {DEVICE}", None, "Adapt DEVICE in this adapter to it.")
+    utilities = folder / PACKAGE / "utils"
+    utilities.mkdir(parents=True)
+    (folder / PACKAGE / "__init__.py").touch()
+    (utilities / "__init__.py").write_text(UTILITIES, encoding="utf-8")
+    for name in SETTINGS:
+        shutil.copy(checkout / name, utilities)
+    (folder / PACKAGE / f"{stem}.py").write_text(text.replace(DEVICE, f'wp.set_device("{device}")'), encoding="utf-8")
+
+
+def imported(folder: Path, stem: str, device: str) -> tuple[ModuleType, Any]:
+    """The module and its settings, with all kernels and their adjoints compiled: a capture must load none."""
+    start_warp()
+    with _search(folder), _adjoints(), _default_device():
+        module = importlib.import_module(f"{PACKAGE}.{stem}")
+        settings = sys.modules[f"{PACKAGE}.utils"].cfg
+        settings.device = device
+        wp.load_module(module.__name__, device=device)
+    return module, settings
+
+
+@contextmanager
+def _search(folder: Path) -> Iterator[None]:
+    """Import the package from `folder` alone, and forget its names afterwards: a copy for another device has the same ones."""
+
+    def forget() -> dict[str, ModuleType]:
+        return {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == PACKAGE}
+
+    before = forget()
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        forget()
+        sys.modules.update(before)
+
+
+@contextmanager
+def _adjoints() -> Iterator[None]:
+    """Let Warp generate adjoints, which the kernels of this project carry themselves."""
+    kept, wp.config.enable_backward = wp.config.enable_backward, True
+    try:
+        yield
+    finally:
+        wp.config.enable_backward = kept
+
+
+@contextmanager
+def _default_device() -> Iterator[None]:
+    """Give the process its default device back: the module sets it when it is imported."""
+    before = wp.get_device()
+    try:
+        yield
+    finally:
+        wp.set_device(before)
+
+
+def single_dashpot(twin: Twin) -> float:
+    """The dashpot of all springs, N s/m. Raises InputError where the peer cannot simulate the twin."""
+    simulation, dashpot = twin.simulation, twin.material.dashpot
+    if np.ptp(dashpot) > 0:
+        raise InputError("material.dashpot", "the peer has one for all springs", f"{dashpot.min()} to {dashpot.max()}")
+    if not simulation.ground or simulation.gravity != 9.8 or simulation.controller_velocity:
+        rule = "the peer has a ground, a gravity of 9.8 m/s^2 and no controller velocity in dashpots"
+        raise InputError("simulation", rule, simulation)
+    return float(dashpot[0])
+
+
+def positions(system: Any) -> np.ndarray:
+    """At the end of the frame, [N, 3], m."""
+    after: np.ndarray = system.wp_states[-1].wp_x.numpy().copy()
+    return after

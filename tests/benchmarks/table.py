@@ -1,0 +1,124 @@
+"""The rows of the table, its text, its file, and its change against the table that was committed last."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from neuspring.core.markdown import markdown
+
+ROOT = Path(__file__).parents[2]
+COMMITTED = "results/published/bench"
+"""Tables that are part of the repository, a file per kind of machine."""
+SCRATCH = "results/bench"
+"""Where a table goes that nobody asked to keep."""
+HEADER = ["section", "row", "device", "nodes", "springs", "substeps", "batch", "median", "least", "ns", "ratio", "to"]
+HEADER += ["bandwidth", "arithmetic", "change"]
+LEGEND = """ns: median per spring, substep and twin. ratio: of ns to the row named after it, median of the rounds.
+bandwidth, arithmetic: the least time by this machine's limits, as a share of the median.
+change: of the median since the committed table of this kind of machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One measurement. Names are unique within a section and device."""
+
+    section: str
+    name: str
+    device: str
+    median: float
+    least: float
+    unit: str = "ms"
+    """Of median and least."""
+    nodes: int = 0
+    springs: int = 0
+    substeps: int = 0
+    batch: int = 1
+    ratio: float | None = None
+    """To the row `reference` of the same section and device, in time per spring, substep and twin (or in the unit)."""
+    least_ratio: float | None = None
+    reference: str = ""
+    bandwidth: float | None = None
+    """Share of the machine's bandwidth: the least time for the bytes over the median."""
+    arithmetic: float | None = None
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Which row of another table is this one."""
+        return self.section, self.name, self.device
+
+    @property
+    def nanoseconds(self) -> float | None:
+        """Median per spring, substep and twin."""
+        return 1e6 * self.median / (self.springs * self.substeps * self.batch) if self.unit == "ms" and self.springs else None
+
+
+def as_record(machine: dict[str, Any], limits: dict[str, Any], rows: Sequence[Row], notes: Sequence[str]) -> dict[str, Any]:
+    """What a file holds."""
+    table = [asdict(row) | {"nanoseconds": row.nanoseconds} for row in rows]
+    return {"machine": machine, "limits": limits, "rows": table, "notes": list(notes)}
+
+
+def save(record: dict[str, Any], kind: str, *, committed: bool) -> Path:
+    """Write a table into one of the two folders; returns its path."""
+    path = ROOT / (COMMITTED if committed else SCRATCH) / f"{kind}.json"
+    write_text(path, json.dumps(record, indent=1) + "\n")
+    return path
+
+
+def last_committed(kind: str, root: Path = ROOT) -> dict[str, Any] | None:
+    """The table of a kind of machine in the commit that is checked out; None where there is none.
+
+    Raises InputError if it is no table.
+    """
+    name = f"{COMMITTED}/{kind}.json"
+    try:
+        shown = subprocess.run(["git", "show", f"HEAD:./{name}"], cwd=root, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    try:
+        record: dict[str, Any] = json.loads(shown.stdout)
+        medians(record)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(name, "must be a table that --save wrote", repr(error), "Run with --save and commit the file.") from error
+    return record
+
+
+def medians(record: dict[str, Any]) -> dict[tuple[str, str, str], tuple[float, str]]:
+    """(median, unit) of every row of a file, by `Row.key`."""
+    return {(row["section"], row["name"], row["device"]): (float(row["median"]), str(row["unit"])) for row in record["rows"]}
+
+
+def change(row: Row, before: dict[tuple[str, str, str], tuple[float, str]]) -> float | None:
+    """Relative change of the median: -0.1 is a tenth less. None for a row that is new."""
+    median, unit = before.get(row.key, (0.0, ""))
+    return row.median / median - 1 if median > 0 and unit == row.unit else None
+
+
+def text(rows: Sequence[Row], committed: dict[str, Any] | None) -> str:
+    """The table as it is printed."""
+    before = medians(committed) if committed else {}
+    cells = [[*_facts(row), *_shares(row), _signed(change(row, before))] for row in rows]
+    return "\n".join(markdown(HEADER, cells))
+
+
+def _facts(row: Row) -> list[str]:
+    counts = [str(count) if count else "" for count in (row.nodes, row.springs, row.substeps)]
+    batch = str(row.batch) if row.springs else ""
+    ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
+    times = [f"{row.median:.4g} {row.unit}", f"{row.least:.4g}", "" if row.nanoseconds is None else f"{row.nanoseconds:.2f}"]
+    return [row.section, row.name, row.device, *counts, batch, *times, ratio, row.reference]
+
+
+def _shares(row: Row) -> list[str]:
+    return ["" if share is None else f"{100 * share:.2g} %" for share in (row.bandwidth, row.arithmetic)]
+
+
+def _signed(relative: float | None) -> str:
+    return "" if relative is None else f"{100 * relative:+.0f} %"

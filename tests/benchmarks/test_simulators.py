@@ -1,0 +1,266 @@
+"""The simulators of the benchmark table, its scenes, and a run of its command."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.distance import cdist
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.physics import reference
+from tests.benchmarks import bench, limits, sections, table
+from tests.benchmarks.limits import Limits
+from tests.benchmarks.ours import Ours
+from tests.benchmarks.phystwin import DEVICE, PACKAGE, SETTINGS, SIMULATOR, PhysTwin, single_dashpot
+from tests.benchmarks.scenes import GAP, SPACING, box, sheet, shortened
+from tests.benchmarks.sections import Bench, Entry, timed
+from tests.benchmarks.simulators import Frame, distances, gradient_difference
+
+LIMITS = Limits({2**20: 1e11}, 3e10, 2e9)
+STAND_IN = f"""
+import warp as wp
+from qqtt.utils import logger, cfg
+wp.init()
+{DEVICE}
+where = wp.get_device()
+
+
+@wp.kernel
+def lift(x: wp.array(dtype=wp.vec3), y: wp.array(dtype=float), after: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    after[i] = x[i] + wp.vec3(0.0, 0.0, y[i])
+
+
+@wp.kernel
+def heights(x: wp.array(dtype=wp.vec3), total: wp.array(dtype=float)):
+    z = x[wp.tid()][2]
+    wp.atomic_add(total, 0, 0.5 * z * z)
+
+
+class State:
+    pass
+
+
+class SpringMassSystemWarp:
+    def __init__(self, points, springs, lengths, masses, dt, substeps, stiffness, *scalars, num_object_points, **options):
+        assert where == wp.get_device("cpu") and str(cfg.device) == "cpu" and len(scalars) == 4
+        self.count, self.object_collision_flag = num_object_points, options["self_collision"]
+        logger.info("made")
+        self.wp_init_vertices = wp.array(points[: self.count].numpy(), dtype=wp.vec3)
+        self.wp_init_velocities = None
+        self.wp_spring_Y = wp.array(stiffness[: self.count], dtype=float, requires_grad=True)
+        self.start, last = wp.zeros(self.count, dtype=wp.vec3), State()
+        last.wp_x = wp.zeros(self.count, dtype=wp.vec3, requires_grad=True)
+        self.wp_states, self.loss = [last], wp.zeros(1, dtype=float, requires_grad=True)
+
+    def set_init_state(self, x, v, pure_inference):
+        wp.copy(self.start, x)
+
+    def set_controller_target(self, frame, pure_inference):
+        assert frame == 1
+
+    def step(self):
+        wp.launch(lift, self.count, [self.start, self.wp_spring_Y], [self.wp_states[-1].wp_x])
+
+    def calculate_simple_loss(self):
+        wp.launch(heights, self.count, [self.wp_states[-1].wp_x], [self.loss])
+
+    def clear_loss(self):
+        self.loss.zero_()
+"""
+"""Made up: node i rises by the stiffness of spring i, and the loss is half the sum of the squared heights."""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A folder with the files and the names of the peer, and another simulator."""
+    contents = {
+        SIMULATOR: STAND_IN,
+        SETTINGS[0]: "from .misc import single\n\n\nclass Settings:\n    pass\n\n\ncfg = single(Settings)\n",
+        SETTINGS[1]: "def single(kind):\n    return kind()\n",
+    }
+    for name, text in contents.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    # The checkout's own utilities import what is not here: they must not be used.
+    (tmp_path / PACKAGE / "utils" / "__init__.py").write_text("import viewers_that_nobody_has\n")
+    return tmp_path
+
+
+def tiny() -> tuple[Twin, np.ndarray]:
+    return box(30, 10, 8)
+
+
+def test_a_peer_runs_from_a_copy_of_its_checkout(checkout):
+    twin, hands = tiny()
+    count, stiffness = len(twin.topology.nodes), twin.material.stiffness
+    files = {path: path.read_text() for path in checkout.rglob("*.py")}
+    device, peer = wp.get_device(), PhysTwin(checkout)
+    ahead, learning = peer.forward(twin, hands), peer.forward_backward(twin, hands)
+    wanted = twin.topology.nodes + np.pad(stiffness[:count, None], ((0, 0), (2, 0)))
+    for frame in (ahead, learning, learning):
+        frame.run()
+        np.testing.assert_allclose(frame.positions(), wanted, rtol=1e-6)
+    assert learning.gradient is not None
+    # Run twice: gradients do not add up. d(z^2 / 2) / dY = z.
+    np.testing.assert_allclose(learning.gradient(), wanted[:, 2], rtol=1e-6)
+    assert {path: path.read_text() for path in checkout.rglob("*.py")} == files
+    # The process is as it was: for another copy, and for kernels that carry their own adjoints.
+    assert not [name for name in sys.modules if name.split(".")[0] == PACKAGE]
+    assert wp.get_device() == device and wp.config.enable_backward is False
+
+
+def test_a_folder_that_is_no_checkout_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"--peer: must be a checkout of PhysTwin.*Give the folder that git clone made"):
+        PhysTwin(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        (STAND_IN.replace(DEVICE, "wp.set_device('cuda:1')"), "must name its device by"),
+        (STAND_IN.replace("class SpringMassSystemWarp", "class Other"), "must define SpringMassSystemWarp"),
+    ],
+)
+def test_another_version_of_the_peer_is_refused(checkout, text, rule):
+    (checkout / SIMULATOR).write_text(text)
+    with pytest.raises(InputError, match=rule):
+        PhysTwin(checkout)
+
+
+def test_a_twin_that_the_peer_cannot_simulate_is_refused():
+    twin, _ = tiny()
+    assert single_dashpot(twin) == 0.5
+    uneven = replace(twin.material, dashpot=np.linspace(0, 1, len(twin.material.dashpot)))
+    with pytest.raises(InputError, match=r"material\.dashpot: the peer has one for all springs"):
+        single_dashpot(replace(twin, material=uneven))
+    for other in ({"gravity": 1.6}, {"ground": False}, {"controller_velocity": True}):
+        with pytest.raises(InputError, match="simulation: the peer has a ground"):
+            single_dashpot(replace(twin, simulation=replace(twin.simulation, **other)))
+
+
+def test_our_frame_is_that_of_the_reference_and_its_gradient_is_that_of_the_loss():
+    twin, hands = tiny()
+    ahead, learning = Ours().forward(twin, hands), Ours().forward_backward(twin, hands)
+    ahead.run()
+    learning.run()
+    nodes = twin.topology.nodes.astype(np.float64)
+
+    def after(scale: float = 1.0) -> np.ndarray:
+        body = replace(twin, material=replace(twin.material, stiffness=scale * twin.material.stiffness))
+        return reference.frame(reference.Scene.of(body), nodes, np.zeros_like(nodes), *hands)[0]
+
+    # A few roundings of positions of 0.1 m.
+    assert np.abs(ahead.positions() - after()).max() < 1e-7
+    assert not distances(ahead, learning).any()
+    # Log stiffness up and down by a hundredth for all springs; positions are below 1 m, so the loss is half the mean square.
+    up, down = (np.mean(after(scale) ** 2) / 2 for scale in (np.exp(0.01), np.exp(-0.01)))
+    assert learning.gradient is not None
+    assert learning.gradient().sum() == pytest.approx((up - down) / 0.02, rel=1e-3)
+    learning.run()
+    assert gradient_difference(learning, learning) == 0
+
+
+def test_a_shortened_twin_has_the_same_substep():
+    twin, _ = tiny()
+    short = shortened(twin, 3)
+    assert short.simulation.substeps == 3 and short.simulation.substep == pytest.approx(twin.simulation.substep)
+
+
+def test_a_folded_sheet_has_two_layers_in_contact_and_no_spring_between_them():
+    twin, hands = sheet(500, 67)
+    nodes, springs = twin.topology.nodes, twin.topology.springs[: twin.topology.object_spring_count]
+    columns = int(500**0.5)
+    column = np.arange(len(nodes)) // (len(nodes) // columns)
+    lower, upper = column < columns // 2 - 2, column > columns // 2 + 2
+    np.testing.assert_allclose(nodes[upper, 2].mean() - nodes[lower, 2].mean(), GAP, rtol=1e-3)
+    nearest = cdist(nodes[upper], nodes[lower]).min(axis=1)
+    assert np.mean(nearest < twin.material.contact_distance) > 0.9
+    assert np.abs(np.diff(column[springs], axis=1)).max() <= 3
+    # Rest lengths are those of the flat sheet: at its corners, nodes ask along the edges.
+    assert twin.topology.rest_lengths[: len(springs)].max() < 4 * SPACING
+    assert hands.shape == (2, len(twin.topology.controllers), 3)
+
+
+class InTurn:
+    """An engine whose frames take no time; `together` for all but the counts that it lacks."""
+
+    name = "stand-in"
+
+    def __init__(self, device: str = "cpu", lacks: tuple[int, ...] = ()) -> None:
+        self.device, self.lacks = device, lacks
+
+    def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
+        return Frame(lambda: None, lambda: twin.topology.nodes)
+
+    def forward_backward(self, twin: Twin, hands: np.ndarray) -> Frame:
+        return replace(self.forward(twin, hands), gradient=lambda: np.ones(3))
+
+    def together(self, twins: list[Twin], hands: np.ndarray, *, gradient: bool) -> Frame:
+        if len(twins) in self.lacks:
+            raise NotImplementedError("several together")
+        scales = [twin.material.stiffness[0] / twins[0].material.stiffness[0] for twin in twins]
+        assert len(twins) == 1 or (scales[0], scales[-1]) == pytest.approx((1, 0.5))
+        return self.forward_backward(twins[0], hands) if gradient else self.forward(twins[0], hands)
+
+
+def test_what_an_engine_cannot_do_together_is_left_out_with_a_note():
+    able, unable = (Bench("cpu", LIMITS, InTurn(lacks=lacks), quick=True) for lacks in ((), (1, 16)))
+    rows = sections.by_batch(able)
+    assert [(row.name, row.batch, row.reference) for row in rows[:2]] == [
+        ("1 together, forward", 1, ""), ("16 together, forward", 16, "1 together, forward"),
+    ]  # fmt: skip
+    assert len(rows) == 4 and not able.notes
+    assert sections.by_batch(unable) == []
+    assert unable.notes and set(unable.notes) == {"left out on cpu: several together"}
+
+
+def test_the_first_section_sets_everybody_beside_the_twin_alone():
+    found = Bench("cpu", LIMITS, InTurn(), InTurn(), quick=True)
+    rows = sections.frames(found)
+    alone = ["a: forward"] * 3 + ["a: forward + backward"] * 3
+    company = ("", ", 16 together", ", stand-in") * 2
+    assert [row.name for row in rows] == [name + end for name, end in zip(alone, company, strict=True)]
+    assert [row.reference for row in rows] == ["", *alone[:2], "", *alone[3:5]]
+    assert len(found.notes) == 4
+    assert found.notes[-1].endswith("agree with those of the twin alone to 0.0e+00 m, gradients to 0.0e+00 of their norm")
+
+
+def test_ratios_are_per_twin_and_contacts_have_no_share(monkeypatch):
+    twin, _ = tiny()
+    seconds = {"alone": (1.0, 2.0, 3.0), "four": (2.0, 4.0, 60.0)}
+    monkeypatch.setattr(sections, "take_turns", lambda actions, *_, **__: {name: sections.Times(seconds[name]) for name in actions})
+    frame = InTurn().forward(twin, np.zeros((2, 8, 3)))
+    touching = replace(twin, simulation=replace(twin.simulation, self_collision=True))
+    alone, four = timed(
+        Bench("cpu", LIMITS, InTurn()), "x", [Entry("alone", twin, frame), Entry("four", touching, frame, "alone", batch=4)]
+    )
+    assert (four.ratio, four.least_ratio, four.median) == (0.5, 0.5, 4000.0)
+    assert alone.ratio is None and alone.bandwidth and alone.arithmetic and four.bandwidth is None
+
+
+def test_the_command_prints_and_writes_the_table(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(table, "ROOT", tmp_path)
+    monkeypatch.setattr(limits, "measure", lambda device: LIMITS)
+    monkeypatch.setitem(bench.SECTIONS, "nodes", lambda its: sections._scaling(its, "nodes", [("30 nodes", tiny())]))
+    bench.main(["--quick", "--only", "nodes"])
+    printed = capsys.readouterr().out
+    assert "| nodes   | 30 nodes, forward + backward | cpu " in printed and "is committed" in printed
+    (file,) = (tmp_path / table.SCRATCH).glob("*.json")
+    assert file.name in printed
+    names = {row[1] for row in table.medians(json.loads(file.read_text()))}
+    assert names == {"30 nodes, forward", "30 nodes, forward + backward"}
+
+
+@pytest.mark.slow
+def test_limits_are_within_what_a_processor_can_do():
+    """A chain that a compiler removed would be far above: no core has 64 multiply-adds at 6 GHz."""
+    found = limits.measure()
+    assert 1e8 < found.roots < found.fused < 64 * 6e9
+    assert all(1e9 < rate < 1e13 for rate in found.bandwidth.values())
+    text = " ".join(found.lines())
+    assert f"{found.fused / 1e9:.1f} billion fused" in text
