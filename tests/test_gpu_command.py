@@ -13,7 +13,9 @@ import numpy as np
 import psutil
 import pytest
 import torch
+import warp as wp
 
+from tests.gpu import __main__ as command
 from tests.gpu import parity
 from tests.gpu.__main__ import main
 from tests.gpu.chain import ABSENT, DONE, FAILED, Part, report, run
@@ -54,6 +56,11 @@ def test_without_a_gpu_it_says_what_to_do(tmp_path, monkeypatch, capsys):
     assert main(["--results", str(tmp_path)]) == 2
     said = capsys.readouterr().out
     assert "needs a GPU, its driver and a CUDA build of torch" in said and "--device cpu" in said
+    # A driver older than Warp's CUDA: torch sees the GPU, Warp does not.
+    monkeypatch.setattr(command, "resolve_device", lambda device: device)
+    monkeypatch.setattr(wp, "get_cuda_devices", list)
+    assert main(["--results", str(tmp_path)]) == 2
+    assert "Warp must find the GPU too" in capsys.readouterr().out
     assert not list(tmp_path.iterdir())
 
 

@@ -1,13 +1,24 @@
 """Every kernel of the package compiles for GPUs, also where there is none: machine code for two architectures, by NVRTC."""
 
 import ast
+from typing import Any
 
 import pytest
 import warp as wp
 
 from neuspring.core.device import start_warp
 from tests.support.cubin import resources
-from tests.support.cuda_kernels import ARCHITECTURES, FORWARD, PACKAGE, compile_for_gpus, declared, kernels, modules
+from tests.support.cuda_kernels import (
+    ARCHITECTURES,
+    FORWARD,
+    PACKAGE,
+    VARIANTS,
+    compile_for_gpus,
+    declared,
+    kernels,
+    modules,
+    variants,
+)
 
 NO_KERNELS_HERE: set[str] = set()
 """Modules that name `wp.kernel` for the kernels of others."""
@@ -55,6 +66,40 @@ if True:
         def plain(a): ...
 """
     assert declared(text) == {"bare": {"bare"}, "factory": {"inner", "other"}}
+
+
+def test_factories_are_asked_for_every_variant(monkeypatch):
+    def with_switch(real: Any, batched: bool): ...
+
+    def with_number(real: Any, columns: int): ...
+
+    both = (wp.float32, wp.float64)
+    assert set(variants("m.with_switch", with_switch)) == {(real, batched) for real in both for batched in (False, True)}
+    with pytest.raises(AssertionError, match="takes `columns`: list its arguments in VARIANTS"):
+        variants("m.with_number", with_number)
+    monkeypatch.setitem(VARIANTS, "m.with_number", ((wp.float32, 8),))
+    assert variants("m.with_number", with_number) == [(wp.float32, 8)]
+
+
+MODULE = """
+import warp as wp
+def kernels(real):
+    def first(values: wp.array(dtype=real)):
+        values[wp.tid()] = real(1.0)
+    def second(values: wp.array(dtype=real)):
+        values[wp.tid()] = real(2.0)
+    unique = wp.kernel(module="unique", enable_backward=False)
+    return unique(first), {"second": unique(second)}
+"""
+
+
+def test_a_kernel_that_its_factory_keeps_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "module_that_gives.py").write_text(MODULE)
+    assert list(kernels("module_that_gives")) == ["first float32", "second float32", "first float64", "second float64"]
+    (tmp_path / "module_that_hides.py").write_text(MODULE.replace(", {", "  # {"))
+    with pytest.raises(AssertionError, match=r"does not give out \['second'\]"):
+        kernels("module_that_hides")
 
 
 @wp.func_native("this is not C++;")

@@ -88,7 +88,7 @@ def _benchmark(device: str) -> Part:
 
 def read_benchmark(folder: Path, begin: float) -> dict[str, Any]:
     """The files that the benchmark wrote since `begin` (Unix time), with what they hold."""
-    files = [path for path in sorted(folder.glob("*.json")) if path.stat().st_mtime >= begin]
+    files = [path for path in sorted(folder.rglob("*.json")) if path.stat().st_mtime >= begin]
     failures = [] if files else [f"no new file in {folder}"]
-    held = {path.name: json.loads(path.read_text(encoding="utf-8")) for path in files}
+    held = {path.relative_to(folder).as_posix(): json.loads(path.read_text(encoding="utf-8")) for path in files}
     return {"facts": {"files": ", ".join(map(str, files))}, "failures": failures, "rows": held}

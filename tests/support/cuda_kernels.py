@@ -85,7 +85,7 @@ def kernels(module: str) -> dict[str, Any]:
         if isinstance(holder, wp.Kernel):
             made[top] = holder
         else:
-            for arguments in _variants(f"{module}.{top}", holder):
+            for arguments in variants(f"{module}.{top}", holder):
                 made |= {" ".join([k.func.__name__, *map(_word, arguments)]): k for k in _flat(holder(*arguments))}
         missing = names - {kernel.func.__name__ for kernel in made.values()}
         assert not missing, f"{module}.{top} does not give out {sorted(missing)}: return them, or let `kernels` find them"
@@ -93,7 +93,7 @@ def kernels(module: str) -> dict[str, Any]:
     return found
 
 
-def _variants(name: str, factory: Any) -> list[tuple[Any, ...]]:
+def variants(name: str, factory: Any) -> list[tuple[Any, ...]]:
     """Every set of arguments of a factory: both scalar types, both values of each switch."""
     if name in VARIANTS:
         return list(VARIANTS[name])
