@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import torch
 
-from neuspring.physics.buffers import Buffers
+from neuspring.physics.arrays import Buffers
 
 APPROACH = 1e-4
 """Slower approaches do not collide (m/s for the ground; m^2/s, distance times speed, for pairs)."""
@@ -23,9 +23,15 @@ RANGES = {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}
 
 def pack(values: Mapping[str, torch.Tensor], kind: str) -> torch.Tensor:
     """The response (e, mu) [2] of a kind, "ground" or "contact" (between nodes), clamped to its ranges."""
-    return torch.stack([values[f"{kind}_{name}"].clamp(*limits) for name, limits in RANGES.items()])
+    return torch.stack([values[f"{kind}_{name}"].clamp(*limits) for name, limits in RANGES.items()], dim=-1)
+
+
+def fill(b: Buffers, kind: str, packed: torch.Tensor) -> None:
+    """Take the responses [B, 2] of a kind."""
+    for column, name in enumerate(("e", "mu")):
+        b.set_numbers(f"{kind}_{name}", packed[:, column])
 
 
 def gradient(b: Buffers, kind: str) -> torch.Tensor:
-    """dL/d(e, mu) [2] of a kind, summed over nodes."""
-    return torch.stack([b.tensors[f"adj_{kind}_{name}"].sum() for name in ("e", "mu")])
+    """dL/d(e, mu) [B, 2] of a kind, summed over nodes."""
+    return torch.stack([b.get_numbers(f"adj_{kind}_{name}").sum(dim=1) for name in ("e", "mu")], dim=-1)

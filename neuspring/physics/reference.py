@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.physics.contact import APPROACH, MIN_TANGENT
-from neuspring.physics.springs import MIN_LENGTH
+from neuspring.physics.lanes import MIN_LENGTH
 
 
 @dataclass(frozen=True)

@@ -1,27 +1,33 @@
-"""One frame of simulation, forward and backward, each a captured graph on the CPU and on CUDA.
+"""One frame of simulation, forward and backward, of one twin or of several at once, each a captured graph on the CPU and on CUDA.
 
-Memory is substeps x nodes and does not grow with the number of frames: longer gradients run each frame again from its stored
-start (see `autograd.py`).
+Memory is substeps x nodes x twins and does not grow with the number of frames: longer gradients run each frame again from its
+stored start (see `autograd.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Simulation
-from neuspring.physics import collision, contact, position, springs, velocity
-from neuspring.physics.buffers import Buffers, Graphs
+from neuspring.physics import collision, contact, frame, position, springs, velocity
+from neuspring.physics.arrays import Buffers, Graphs
+
+PER_TWIN = ("frame_time", "substeps")
+"""What may differ between the simulations of one solver."""
 
 
 class Parameters(NamedTuple):
-    """Physical parameters as the kernels take them, tensors of the solver's dtype and device. Made by `pack`."""
+    """Physical parameters as the kernels take them, tensors of the solver's dtype and device. Made by `pack`.
+
+    Several twins have a leading axis [B].
+    """
 
     springs: torch.Tensor
-    """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]."""
+    """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent."""
     decay: torch.Tensor
     """[1]: exp(-substep * drag)."""
     ground: torch.Tensor
@@ -37,6 +43,11 @@ class FrameSolver:
 
     spring_pairs [S, 2] index nodes; i >= nodes means controller i - nodes. All tensors that go in and out have `dtype` and
     live on `device`. Float32 is the working precision, float64 serves verification.
+
+    A sequence of simulations makes a solver of as many twins, which may differ in their substeps and in everything that is not the
+    graph; then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and in company.
+
+    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU.
     """
 
     def __init__(
@@ -44,39 +55,71 @@ class FrameSolver:
         spring_pairs: np.ndarray,
         nodes: int,
         controllers: int,
-        simulation: Simulation,
+        simulation: Simulation | Sequence[Simulation],
         *,
         device: str = "cpu",
         dtype: torch.dtype = torch.float32,
         differentiable: bool = True,
+        threads: bool | None = None,
     ) -> None:
-        self.nodes, self.simulation, self.device, self.dtype = nodes, simulation, device, dtype
-        self.buffers = Buffers(nodes, controllers, simulation, device, dtype, differentiable)
+        self.together = not isinstance(simulation, Simulation)
+        simulations = [simulation] if isinstance(simulation, Simulation) else list(simulation)
+        self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
+        threads = device != "cpu" if threads is None else threads
+        self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
         springs.allocate(self.buffers, spring_pairs)
         for term in (velocity, collision, position):
             term.allocate(self.buffers)
+        self._kernels = frame.kernels(self.buffers.real, self.buffers.width)
         self._graphs = Graphs(device)
+        self._reach = 0.0
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Copy packed parameters into the solver's buffers."""
-        for name, tensor in parameters._asdict().items():
-            self.buffers.tensors[name].copy_(tensor.detach())
+        b, values = self.buffers, Parameters(*map(self._stacked, parameters))
+        springs.fill(b, values.springs)
+        b.set_numbers("decay", values.decay[:, 0])
+        for kind in ("ground", "contact"):
+            contact.fill(b, kind, getattr(values, kind))
+        b.set_numbers("distance", values.distance[:, 0])
+        if self.simulation.self_collision:
+            self._reach = float(values.distance.max())
 
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move linearly from begin to end [C, 3]."""
-        t, n = self.buffers.tensors, self.nodes
-        t["x"][0, :n].copy_(x.detach())
-        t["v"][0, :n].copy_(v.detach())
-        t["begin"].copy_(begin)
-        t["end"].copy_(end)
-        self._graphs.run("forward", self._kernels(), self.launch_forward)
+        self.start(x, v)
+        self.advance(begin, end)
+        return self._one(self.buffers.get_vectors("x", self.last)), self._one(self.buffers.get_vectors("v", self.last))
+
+    def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
+        """Put the state at the start of a frame into the buffers."""
+        for name, values in (("x", x), ("v", v)):
+            self.buffers.set_vectors(name, self._stacked(values), slot=0)
+
+    def advance(self, begin: torch.Tensor, end: torch.Tensor) -> None:
+        """Simulate a frame from the state in slot 0; it ends in slot `last`."""
+        b = self.buffers
+        for name, values in (("begin", begin), ("end", end)):
+            b.set_vectors(name, self._stacked(values))
+        if self.simulation.self_collision:
+            collision.find_candidates(b, self._reach)
+        self._run("forward", self.launch_forward)
         self.frame_token += 1
-        last = self.buffers.slot(self.simulation.substeps)
-        return t["x"][last, :n].clone(), t["v"][last, :n].clone()
+
+    def go_on(self) -> None:
+        """Take the end of the last frame for the start of the next."""
+        if self.last:
+            for name in ("x", "v"):
+                self.buffers.tensors[name][0].copy_(self.buffers.tensors[name][self.last])
+
+    @property
+    def last(self) -> int:
+        """The slot that holds the end of a frame."""
+        return self.buffers.slot(self.buffers.substeps)
 
     def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
@@ -87,14 +130,14 @@ class FrameSolver:
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for the contact distance."""
-        t, n = self.buffers.tensors, self.nodes
+        b = self.buffers
         self.clear_adjoints()
-        t["adj_x"][:n].copy_(adj_x)
-        t["adj_v"][:n].copy_(adj_v)
-        self._graphs.run("backward", self._kernels(), self.launch_backward)
-        own = (springs.gradient(self.buffers), velocity.gradient(self.buffers))
-        contacts = (contact.gradient(self.buffers, kind) for kind in ("ground", "contact"))
-        return t["adj_x"][:n].clone(), t["adj_v"][:n].clone(), *own, *contacts, None
+        b.set_vectors("adj_x", self._stacked(adj_x))
+        b.set_vectors("adj_v", self._stacked(adj_v))
+        self._run("backward", self.launch_backward)
+        state = (b.get_vectors("adj_x"), b.get_vectors("adj_v"))
+        own = (springs.gradient(b), velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
+        return *map(self._one, (*state, *own)), None
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""
@@ -103,34 +146,58 @@ class FrameSolver:
                 tensor.zero_()
 
     @property
-    def collision_overflow(self) -> int:
-        """Collision candidates that did not fit the list, summed over nodes and frames so far."""
-        return int(self.buffers.overflow.numpy().sum()) if self.simulation.self_collision else 0
+    def overflows(self) -> list[int]:
+        """Collision candidates that did not fit the lists, summed over nodes and frames so far, of each twin."""
+        return [int(count) for count in collision.overflow(self.buffers)]
 
-    def _kernels(self) -> Iterator[Any]:
-        """What a graph may launch."""
-        for term in (springs, velocity, position, *([collision] if self.simulation.self_collision else [])):
-            yield from term.kernels(self.buffers.real)
+    @property
+    def collision_overflow(self) -> int:
+        """The same of all twins."""
+        return sum(self.overflows)
+
+    def _stacked(self, values: torch.Tensor) -> torch.Tensor:
+        """With a leading axis [B]."""
+        return values if self.together else values[None]
+
+    def _one(self, values: torch.Tensor) -> torch.Tensor:
+        return values if self.together else values[0]
+
+    def _run(self, name: str, launch: Callable[[], None]) -> None:
+        self._graphs.run(name, self._needed(name), launch)
+
+    def _needed(self, name: str) -> Iterator[Any]:
+        """The kernels of a frame forward or backward."""
+        k, b = self._kernels, self.buffers
+        if not b.threads:
+            return iter([k.forward if name == "forward" else k.backward])
+        if name == "forward":
+            return iter([k.begin, k.substep, *([k.collide] if self.simulation.self_collision else [])])
+        return iter([k.settle, k.pull, *([k.hit, k.slow] if self.simulation.self_collision else [])])
 
     def launch_forward(self) -> None:
-        """The substeps of a frame. Numbers in brackets are the paper's equations; n substeps, step k."""
-        b, sim = self.buffers, self.simulation
-        for step in range(sim.substeps):
-            velocity.move_controllers(b, step)  #      x_c = begin + (end - begin) (k + 1) / n
-            if sim.self_collision and step == 0:
-                collision.find_candidates(b)  #        pairs with |x_j - x_i| < contact distance
-            springs.add_forces(b, step)  #      (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
-            velocity.update_velocity(b, step)  #  (4)  v' = delta (v + dt (F + g))
-            if sim.self_collision:
-                collision.collide(b, step)  #          v' += mean impulse from the partners that are hit
-            position.advance(b, step)  #          (4)  x' = x + dt v', reflected at the ground
+        """A frame (`frame.py`)."""
+        b, k = self.buffers, self._kernels
+        model, state, _ = b.arguments()
+        if not b.threads:
+            b.launch(k.forward, b.groups, model, state)
+            return
+        b.launch(k.begin, (b.controllers, b.groups), model, state)
+        for step in range(b.substeps):
+            b.launch(k.substep, (b.nodes + b.controllers, b.groups), model, state, step)
+            if self.simulation.self_collision:
+                b.launch(k.collide, (b.nodes, b.groups), model, state, step)
 
     def launch_backward(self) -> None:
-        """The adjoints of `launch_forward`, last line first."""
-        b, sim = self.buffers, self.simulation
-        for step in reversed(range(sim.substeps)):
-            position.advance_adjoint(b, step)
-            if sim.self_collision:
-                collision.collide_adjoint(b, step)
-            velocity.update_velocity_adjoint(b, step)
-            springs.add_forces_adjoint(b, step)
+        """The adjoint of a frame."""
+        b, k = self.buffers, self._kernels
+        arguments, size = b.arguments(), (b.nodes, b.groups)
+        if not b.threads:
+            b.launch(k.backward, b.groups, *arguments)
+            return
+        for step in reversed(range(b.substeps)):
+            if self.simulation.self_collision:
+                for kernel in (k.settle, k.hit, k.slow):
+                    b.launch(kernel, size, *arguments, step)
+            elif step == b.substeps - 1:
+                b.launch(k.settle, size, *arguments, step)
+            b.launch(k.pull, size, *arguments, step)

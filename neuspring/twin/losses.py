@@ -85,6 +85,14 @@ class FrameLoss:
         valid = torch.tensor(observations.object_motion_valid[:end], device=device)
         return cls(points, visible, valid, observations.surface_count, weights, frozen_counts)
 
+    def counts(self) -> list[tuple[int, int]]:
+        """(visible points, points whose motion is valid) that each frame's terms are divided by; none in frame 0."""
+        visible = self.visible.sum(dim=1).tolist()
+        valid = [0, *self.motion_valid.sum(dim=1).tolist()[:-1]]
+        if self.frozen_counts:
+            visible, valid = [visible[1]] * len(visible), [valid[1]] * len(valid)
+        return list(zip(visible, valid, strict=True))
+
     def terms(self, frame: int, nodes: torch.Tensor) -> dict[str, torch.Tensor]:
         """Weighted terms of a frame >= 1 for nodes [N, 3], by name. Frame t uses visibility[t] but motion_valid[t - 1]."""
         target, visible, valid = self.points[frame], self.visible[frame], self.motion_valid[frame - 1]

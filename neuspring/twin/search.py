@@ -10,6 +10,8 @@ finished one with a larger budget: CMA-ES is replayed with the recorded costs.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,11 +27,11 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
-from neuspring.physics.autograd import solver_for
+from neuspring.physics.lanes import WIDTHS
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
-from neuspring.twin.rollout import Diverged, frames
 from neuspring.twin.topology import isolated, piecewise_topology, regions
+from neuspring.twin.trials import Outcome, outcomes
 
 INTEGERS = ("object_neighbours", "controller_neighbours")
 REGIONAL = ("object_radius", "object_neighbours")
@@ -52,6 +54,10 @@ class SearchProblem:
     quirks: config.ReleasedQuirks
     device: str = "cpu"
     clusters: int = 1
+    together: int = 0
+    """Candidates in one launch at most; 0: as many as pay (`together`). Costs do not depend on it, bit for bit on a CPU."""
+    threads: int = 1
+    """Threads that simulate at the same time, on a CPU."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     velocity: np.ndarray = field(init=False)
@@ -163,15 +169,25 @@ def homogeneous(values: dict[str, float], springs: int) -> Material:
     return Material(**(numbers | arrays))
 
 
-def cost(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> tuple[float, int]:
-    """Mean training loss over frames 1 .. train_end - 1, acceleration term included, and the collision list's overflow.
-
-    Raises Diverged.
-    """
+def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
+    """What becomes of candidates that are rolled out together over the training frames."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
     start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    solver = solver_for(twin, problem.device, differentiable=False)
-    return loss.of_rollout(frames(twin, solver, hands, problem.velocity), start), solver.collision_overflow
+    results = outcomes(twins, hands, start, loss, problem.device)
+    # Where lists of collision partners were full, a candidate is judged by what it finds alone.
+    return [
+        outcomes([twin], hands, start, loss, problem.device)[0] if one.collision_overflow and len(twins) > 1 else one
+        for twin, one in zip(twins, results, strict=True)
+    ]
+
+
+def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
+    """Which candidates are simulated together: alike in cost, so that few wait for the slowest, and a group for each thread."""
+    on_gpu = problem.device != "cpu"
+    most = problem.together or (len(twins) if on_gpu else WIDTHS[-1])
+    count = max(-(-len(twins) // most), 1 if on_gpu else min(problem.threads, len(twins)))
+    by_cost = sorted(range(len(twins)), key=lambda k: (twins[k].simulation.substeps, len(twins[k].topology.springs)))
+    return [part.tolist() for part in np.array_split(by_cost, count) if len(part)]
 
 
 @dataclass(frozen=True)
@@ -202,6 +218,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     budget = problem.search.rollouts
     progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
     start = 0
+    pool = ThreadPoolExecutor(problem.threads)
     # The last generation may be cut short, so that searches of any population size use exactly the same budget.
     while start < budget:
         population = proposals.ask()[: budget - start]
@@ -211,9 +228,10 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
             trace, saved = trace[:start], start
             if not start:
                 attempts, earlier = 1, 0.0
-        for normalized in population[max(len(trace) - start, 0) :]:
-            trace.append(_evaluate(problem, normalized, loss, len(trace), proposals.generation))
-            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
+        fresh = population[max(len(trace) - start, 0) :]
+        if fresh:
+            trace += _evaluate(problem, fresh, loss, len(trace), proposals.generation, pool)
+        progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
         proposals.tell([row["cost"] for row in trace[start:stop]])
         start = stop
         if record is not None and len(trace) > saved:
@@ -282,23 +300,49 @@ def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStr
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
-def _evaluate(problem: SearchProblem, normalized: np.ndarray, loss: FrameLoss, index: int, generation: int) -> dict[str, Any]:
+def _evaluate(
+    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, pool: Executor
+) -> list[dict[str, Any]]:
+    """Rows of the trace for the candidates of a generation, numbered from `index` on."""
+    made = list(pool.map(lambda normalized: _made(problem, normalized), population))
+    for number, (row, _) in enumerate(made):
+        row |= {"rollout": index + number, "generation": generation}
+    rows, twins = [row for row, twin in made if twin], [twin for _, twin in made if twin]
+
+    def simulate(members: list[int]) -> None:
+        start = time.perf_counter()
+        results = judge(problem, [twins[k] for k in members], loss)
+        share = (time.perf_counter() - start) / len(members)
+        for k, result in zip(members, results, strict=True):
+            rows[k]["collision_overflow"] = result.collision_overflow
+            rows[k]["seconds"] += share
+            if result.left:
+                rows[k]["reason"] = f"a node left the scene in frame {result.left}"
+            else:
+                rows[k]["cost"] = min(result.cost, PENALTY)
+
+    list(pool.map(simulate, groups(problem, twins) if twins else []))
+    return [row for row, _ in made]
+
+
+def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any], Twin | None]:
+    """A candidate's row, its cost the penalty, and its twin; none, with the reason in the row, if it cannot be integrated."""
     start = time.perf_counter()
     values = problem.decode(normalized)
-    row: dict[str, Any] = {"rollout": index, "generation": generation, "cost": PENALTY, "reason": ""}
-    row |= {"springs": 0, "substeps": 0, "collision_overflow": 0}
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "cost": PENALTY, "reason": ""}
+    row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
+    row |= values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
+    twin = None
     try:
         twin = candidate(problem, values)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        value, row["collision_overflow"] = cost(problem, twin, loss)
-        row["cost"] = min(value, PENALTY)
-    except (Diverged, NumericalFailure) as failure:
+    except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
         # The candidate is too stiff for a fixed number of substeps.
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
-    return row | values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
+    return row, twin
 
 
 def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:

@@ -14,8 +14,9 @@ from neuspring import config
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.twin import search as module
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.search import PENALTY, SearchProblem, candidate, cost, search
+from neuspring.twin.search import PENALTY, SearchProblem, candidate, judge, search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
+from neuspring.twin.trials import Outcome
 from tests.support import small
 
 RELEASED = {
@@ -185,7 +186,8 @@ def test_the_truth_costs_less_than_its_neighbours():
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
     values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbours": 12.0}
     values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
-    by_stiffness = [cost(problem, candidate(problem, values | {"stiffness": s}), loss)[0] for s in (2e3, 1.2e4, 9e4)]
+    twins = [candidate(problem, values | {"stiffness": s}) for s in (2e3, 1.2e4, 9e4)]
+    by_stiffness = [outcome.cost for outcome in judge(problem, twins, loss)]
     assert by_stiffness[1] == min(by_stiffness)
 
 
@@ -196,7 +198,7 @@ def test_the_best_evaluated_candidate_wins_within_the_budget():
     assert result.cost == result.trace["cost"].min()
     # The returned twin is that candidate: simulating it again gives its cost.
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    assert cost(problem, result.twin, loss) == (result.cost, 0)
+    assert judge(problem, [result.twin], loss) == [Outcome(result.cost, 0, 0)]
 
 
 def test_seeds_decide_the_candidates():
@@ -209,7 +211,7 @@ def test_seeds_decide_the_candidates():
 def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupt a search while it evaluates one more candidate."""
     calls = 0
-    evaluate = module._evaluate
+    evaluate = module._made
 
     def dying(*arguments):
         nonlocal calls
@@ -219,7 +221,7 @@ def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, m
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_evaluate", dying)
+        patch.setattr(module, "_made", dying)
         with pytest.raises(KeyboardInterrupt):
             search(problem, seed, record=record, key="k")
 

@@ -12,7 +12,7 @@ from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.kernels import kernels
 from neuspring.core.device import start_warp
 from neuspring.physics.autograd import Frame
-from neuspring.physics.buffers import Graphs
+from neuspring.physics.arrays import Graphs
 
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them, see `AnchorParameters.tensors`."""

@@ -1,0 +1,254 @@
+"""The arrays of one solver, in the layout that kernels compute in, and sequences of launches captured as graphs.
+
+B twins lie in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors, in memory [points, G, 3,
+W]; one of springs an array [S, G] of Numbers; one of a twin an array [G] of Numbers. Torch tensors with the same storage are at
+hand by name. On a CPU W lanes share one thread's instructions (G = 1); on a GPU W = 1 and a thread is a point of one twin. Lanes
+that no twin needs repeat the last one.
+"""
+# No postponed annotations here: Warp reads the evaluated types of the closures below.
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.core.artifacts import Simulation
+from neuspring.core.device import load, start_warp
+from neuspring.physics.lanes import lanes, width_for
+
+
+@functools.cache
+def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
+    """(Model, State, Adjoint): the arguments of every kernel, for a scalar type and a number of lanes."""
+    lane = lanes(real, width)
+    of_twin: Any = wp.array(dtype=lane.Number)
+    numbers: Any = wp.array2d(dtype=lane.Number)
+    vectors: Any = wp.array2d(dtype=lane.Vector)
+    slots: Any = wp.array3d(dtype=lane.Vector)
+    integers: Any = wp.array(dtype=int)
+    lists: Any = wp.array3d(dtype=int)
+    table: Any = wp.array2d(dtype=int)
+
+    @wp.struct
+    class Model:
+        nodes: int
+        controllers: int
+        substeps: int
+        fewest: int
+        slots: int
+        history: int
+        collide: int
+        capacity: int
+        up: real
+        gravity: lane.Vector
+        inverse_time: real
+        rows: integers
+        partners: integers
+        links: integers
+        link_partners: integers
+        link_springs: integers
+        counts: of_twin
+        substep: of_twin
+        decay: of_twin
+        ground_e: of_twin
+        ground_mu: of_twin
+        contact_e: of_twin
+        contact_mu: of_twin
+        distance: of_twin
+        stiffness: numbers
+        inverse_length: numbers
+        dashpot: numbers
+        near: lists
+        near_lanes: lists
+        near_count: table
+
+    @wp.struct
+    class State:
+        begin: vectors
+        end: vectors
+        x: slots
+        v: slots
+        after: slots
+        moving: slots
+        force: vectors
+
+    @wp.struct
+    class Adjoint:
+        x: vectors
+        v: vectors
+        moving: vectors
+        after: vectors
+        force: slots
+        stiffness: numbers
+        inverse_length: numbers
+        dashpot: numbers
+        decay: numbers
+        ground_e: numbers
+        ground_mu: numbers
+        contact_e: numbers
+        contact_mu: numbers
+
+    return Model, State, Adjoint
+
+
+class Buffers:
+    """Torch tensors by name, each with a Warp view of the same storage.
+
+    State: x, v [slots, N + C], nodes first, then controllers; velocities [history, N] `after` the forces, and those that nodes are
+    `moving` with; begin and end [C] of the controllers' path. Every term adds its own arrays.
+
+    A differentiable solver keeps all substeps of the last frame, slot k before substep k. Otherwise one slot serves where one
+    thread goes through the nodes, and two take turns where each node has a thread.
+    """
+
+    def __init__(
+        self,
+        nodes: int,
+        controllers: int,
+        simulations: Sequence[Simulation],
+        device: str,
+        dtype: torch.dtype,
+        *,
+        differentiable: bool,
+        threads: bool,
+    ) -> None:
+        start_warp()
+        self.nodes, self.controllers, self.simulation = nodes, controllers, simulations[0]
+        self.device, self.dtype, self.differentiable, self.threads = device, dtype, differentiable, threads
+        self.real = wp.float32 if dtype == torch.float32 else wp.float64
+        self.twins = len(simulations)
+        self.width = 1 if threads else width_for(self.twins)
+        self.groups = -(-self.twins // self.width)
+        self.lanes = lanes(self.real, self.width)
+        self.counts = [simulation.substeps for simulation in simulations]
+        self.substeps = max(self.counts)
+        self.tensors: dict[str, torch.Tensor] = {}
+        self.views: dict[str, Any] = {}
+        self.indices: dict[str, torch.Tensor] = {}
+        self._arguments: tuple[Any, Any, Any] | None = None
+        self.history = self.substeps if differentiable else 1
+        self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
+        total = nodes + controllers
+        self.add_vectors(x=(self.slots, total), v=(self.slots, total), after=(self.history, nodes))
+        self.add_vectors(begin=(controllers,), end=(controllers,), adj_x=(total,), adj_v=(total,), adj_after=(nodes,))
+        self.add_vectors(adj_force=(2, total), **({} if threads else {"force": (total,)}))
+        self.add_numbers(counts=None, substep=None)
+        self.set_numbers("counts", torch.tensor(self.counts, dtype=dtype, device=device))
+        self.set_numbers("substep", torch.tensor([s.substep for s in simulations], dtype=dtype, device=device))
+        # Without self-collision nothing changes velocities between the forces and the motion.
+        self.views |= {"moving": self.views["after"]} | ({"adj_moving": self.views["adj_after"]} if differentiable else {})
+
+    def add_vectors(self, **shapes: tuple[int, ...]) -> None:
+        """Add arrays of Vectors, zero at first. Only a differentiable solver has adjoints (adj_...)."""
+        for name, shape in shapes.items():
+            if self.differentiable or not name.startswith("adj_"):
+                tensor = torch.zeros((*shape, self.groups, 3, self.width), dtype=self.dtype, device=self.device)
+                self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Vector)
+
+    def add_numbers(self, **sizes: int | None) -> None:
+        """Add arrays of Numbers: [size, G], or [G] for a number of a twin (None). Adjoints (adj_...) as for Vectors."""
+        for name, size in sizes.items():
+            if self.differentiable or not name.startswith("adj_"):
+                shape = (self.groups, self.width) if size is None else (size, self.groups, self.width)
+                tensor = torch.zeros(shape, dtype=self.dtype, device=self.device)
+                self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
+
+    def add_integers(self, **values: np.ndarray) -> None:
+        """Add constant arrays of integers."""
+        for name, array in values.items():
+            self.indices[name] = torch.tensor(np.ascontiguousarray(array, np.int32), device=self.device)
+            self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
+
+    def set_vectors(self, name: str, values: torch.Tensor, slot: int | None = None) -> None:
+        """Take [B, P, 3] as the first P points of an array, of one slot where it has slots."""
+        target = self.tensors[name] if slot is None else self.tensors[name][slot]
+        padded = self._padded(values.detach())
+        lanes_last = padded.reshape(self.groups, self.width, values.shape[1], 3).permute(2, 0, 3, 1)
+        target[: values.shape[1]].copy_(lanes_last)
+
+    def get_vectors(self, name: str, slot: int | None = None) -> torch.Tensor:
+        """The nodes of an array as [B, N, 3]."""
+        source = (self.tensors[name] if slot is None else self.tensors[name][slot])[: self.nodes]
+        twins = source.permute(1, 3, 0, 2).reshape(self.groups * self.width, self.nodes, 3)
+        return twins[: self.twins].clone()
+
+    def set_numbers(self, name: str, values: torch.Tensor) -> None:
+        """Take [B] numbers of twins, or [B, S] of their springs."""
+        padded = self._padded(values.detach())
+        rest = padded.shape[1:]
+        grouped = padded.reshape(self.groups, self.width, *rest)
+        self.tensors[name].copy_(grouped.permute(2, 0, 1) if rest else grouped)
+
+    def get_numbers(self, name: str) -> torch.Tensor:
+        """Numbers [size, G] as [B, size]."""
+        source = self.tensors[name]
+        twins = source.permute(1, 2, 0).reshape(self.groups * self.width, len(source))
+        # Contiguous, so that the sum over a twin's numbers takes the same order whatever the width.
+        return twins[: self.twins].contiguous()
+
+    def _padded(self, values: torch.Tensor) -> torch.Tensor:
+        spare = self.groups * self.width - self.twins
+        return torch.cat([values, values[-1:].expand(spare, *values.shape[1:])]) if spare else values
+
+    def arguments(self) -> tuple[Any, Any, Any]:
+        """(Model, State, Adjoint) of these arrays, made at the first call, when every term has added its own."""
+        if self._arguments is None:
+            self._arguments = self._assembled()
+        return self._arguments
+
+    def _assembled(self) -> tuple[Any, Any, Any]:
+        sim, kinds = self.simulation, structs(self.real, self.width)
+        plain = {
+            "nodes": self.nodes,
+            "controllers": self.controllers,
+            "substeps": self.substeps,
+            "fewest": min(self.counts),
+            "slots": self.slots,
+            "history": self.history,
+            "collide": int(sim.self_collision),
+            "capacity": sim.collision_capacity,
+            "up": sim.up_sign if sim.ground else 0.0,
+            "gravity": self.lanes.Vector(*[0.0] * (2 * self.width), *[-sim.gravity * sim.up_sign] * self.width),
+            "inverse_time": 1.0 / sim.frame_time if sim.controller_velocity else 0.0,
+        }
+        made = []
+        for kind, prefix in zip(kinds, ("", "", "adj_"), strict=True):
+            struct = kind()
+            for name in kind.vars:
+                if prefix + name in self.views:
+                    setattr(struct, name, self.views[prefix + name])
+                elif name in plain and not prefix:
+                    setattr(struct, name, plain[name])
+            made.append(struct)
+        return tuple(made)
+
+    def slot(self, step: int) -> int:
+        """Where x and v before substep `step` lie."""
+        return step % self.slots
+
+    def launch(self, kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
+        """Run a kernel on `size` threads."""
+        wp.launch(kernel, size, [*arguments], device=self.device)
+
+
+class Graphs:
+    """Sequences of launches by name; each is recorded at its first run and replayed afterwards."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._graphs: dict[str, Any] = {}
+
+    def run(self, name: str, kernels: Iterable[Any], record: Callable[[], None]) -> None:
+        """Replay what `record` launches. All of its kernels are loaded before the capture, which must not load any."""
+        if name not in self._graphs:
+            for kernel in kernels:
+                load(kernel, self.device)
+            with wp.ScopedCapture(device=self.device) as capture:
+                record()
+            self._graphs[name] = capture.graph
+        # Torch orders its own work on its current stream, so the graph must run there too.
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device != "cpu" else None
+        wp.capture_launch(self._graphs[name], stream=stream)

@@ -1,0 +1,194 @@
+"""A frame as kernels, forward and backward, from the terms' functions.
+
+`serial`: one thread goes through all nodes and all substeps, each spring once, the way of a CPU, whose width is in the lanes.
+`threads`: a thread per node of each twin and a launch per substep, each spring gathered at both ends without atomics, the way of
+a GPU. Both sum a node's forces in the same order.
+"""
+# No postponed annotations here: Warp reads the evaluated types of the closures below.
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from neuspring.physics import collision, position, springs, velocity
+from neuspring.physics.arrays import structs
+from neuspring.physics.lanes import lanes
+
+
+class Kernels(NamedTuple):
+    """Kernels of a frame for one scalar type and width."""
+
+    forward: Any
+    """A frame on one thread per group."""
+    backward: Any
+    begin: Any
+    """Controllers at the end of the first substep, by a thread each."""
+    substep: Any
+    """A substep by a thread per point; with self-collision without its second half."""
+    collide: Any
+    """The second half: impulses, motion."""
+    settle: Any
+    """Adjoint of motion, velocity: from dL/d(x', v') to dL/d(x, v, force) of a substep."""
+    pull: Any
+    """Adjoint of the springs of a substep; without self-collision then also that of motion and velocity of the substep before."""
+    hit: Any
+    """Adjoint of the impulses."""
+    slow: Any
+    """Adjoint of the velocity update, after `hit`."""
+
+
+@functools.cache
+def kernels(real: Any, width: int) -> Kernels:
+    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+    lane = lanes(real, width)
+    Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
+    Model, State, Adjoint = structs(real, width)
+    spring, speed, motion = springs.functions(real, width), velocity.functions(real, width), position.functions(real, width)
+    move_controller, updated, updated_adjoint = speed
+    moved, moved_adjoint = motion
+    collided, collided_adjoint = collision.functions(real, width)
+    add_row, add_row_adjoint, gathered, gathered_adjoint = spring[2:]
+
+    @wp.func
+    def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):
+        """x' and v' of node i; a twin that is at the end of its frame stays."""
+        slot = step % model.slots
+        x, v = moved(
+            state.x[slot, i, g],
+            moving,
+            model.substep[g],
+            model.up,
+            model.ground_e[g],
+            model.ground_mu[g],
+        )
+        if step >= model.fewest:
+            x = chosen(step, model.counts[g], x, state.x[slot, i, g])
+            v = chosen(step, model.counts[g], v, state.v[slot, i, g])
+        target = (step + 1) % model.slots
+        state.x[target, i, g] = x
+        state.v[target, i, g] = v
+
+    @wp.func
+    def advance_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
+        """From dL/d(x', v') to dL/d(x) and dL/d(velocity that the node moves with)."""
+        adj_x, adj_v, adj_e, adj_mu = moved_adjoint(
+            state.x[step, i, g],
+            state.moving[step, i, g],
+            model.substep[g],
+            model.up,
+            model.ground_e[g],
+            model.ground_mu[g],
+            adjoint.x[i, g],
+            adjoint.v[i, g],
+        )
+        if step >= model.fewest:
+            adj_x = chosen(step, model.counts[g], adj_x, adjoint.x[i, g])
+            adj_v = chosen(step, model.counts[g], adj_v, Vector())
+            adj_e = chosen_number(step, model.counts[g], adj_e, Number())
+            adj_mu = chosen_number(step, model.counts[g], adj_mu, Number())
+        adjoint.x[i, g] = adj_x
+        adjoint.moving[i, g] = adj_v
+        adjoint.ground_e[i, g] = adjoint.ground_e[i, g] + adj_e
+        adjoint.ground_mu[i, g] = adjoint.ground_mu[i, g] + adj_mu
+
+    @wp.func
+    def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
+        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factor)."""
+        adj_v, adj_force, adj_decay = updated_adjoint(
+            state.after[step, i, g], adjoint.after[i, g], model.substep[g], model.decay[g]
+        )
+        if step >= model.fewest:
+            adj_v = chosen(step, model.counts[g], adj_v, adjoint.v[i, g])
+        adjoint.v[i, g] = adj_v
+        adjoint.force[step % 2, i, g] = adj_force
+        adjoint.decay[i, g] = adjoint.decay[i, g] + adj_decay
+
+    def forward(model: Model, state: State):
+        g = wp.tid()
+        for step in range(model.substeps):
+            slot = step % model.slots
+            inner = step % model.history
+            for c in range(model.controllers):  #  x_c = begin + (end - begin) (k + 1) / n
+                move_controller(model, state, step, slot, c, g)
+            for i in range(model.nodes):  #  (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
+                add_row(model, state, slot, i, g)
+            for i in range(model.nodes):  #    (4)  v' = delta (v + dt (F + g))
+                after = updated(state.v[slot, i, g], state.force[i, g], model.gravity, model.substep[g], model.decay[g])
+                state.force[i, g] = Vector()
+                state.after[inner, i, g] = after
+                if model.collide == 0:  #      (4)  x' = x + dt v', reflected at the ground
+                    advance(model, state, step, i, g, after)
+            if model.collide != 0:
+                for i in range(model.nodes):  #     v' += mean impulse from the partners that are hit
+                    state.moving[inner, i, g] = collided(model, state, slot, inner, i, g)
+                for i in range(model.nodes):
+                    advance(model, state, step, i, g, state.moving[inner, i, g])
+
+    def backward(model: Model, state: State, adjoint: Adjoint):
+        """The adjoints of `forward`, last line first."""
+        g = wp.tid()
+        for done in range(model.substeps):
+            step = model.substeps - 1 - done
+            for i in range(model.nodes):
+                advance_adjoint(model, state, adjoint, step, i, g)
+            if model.collide != 0:
+                for i in range(model.nodes):
+                    adjoint.after[i, g] = Vector()
+                for i in range(model.nodes):
+                    collided_adjoint(model, state, adjoint, step, i, g)
+            for i in range(model.nodes):
+                update_adjoint(model, state, adjoint, step, i, g)
+            for i in range(model.nodes):
+                add_row_adjoint(model, state, adjoint, step, step % 2, i, g)
+
+    def begin(model: Model, state: State):
+        c, g = wp.tid()
+        move_controller(model, state, 0, 0, c, g)
+
+    def substep(model: Model, state: State, step: int):
+        i, g = wp.tid()
+        slot = step % model.slots
+        if i >= model.nodes:
+            # The controllers' place in the next substep, which nobody reads in this one.
+            move_controller(model, state, step + 1, (step + 1) % model.slots, i - model.nodes, g)
+            return
+        inner = step % model.history
+        force = gathered(model, state, slot, i, g)
+        after = updated(state.v[slot, i, g], force, model.gravity, model.substep[g], model.decay[g])
+        state.after[inner, i, g] = after
+        if model.collide == 0:
+            advance(model, state, step, i, g, after)
+
+    def collide(model: Model, state: State, step: int):
+        i, g = wp.tid()
+        inner = step % model.history
+        moving = collided(model, state, step % model.slots, inner, i, g)
+        state.moving[inner, i, g] = moving
+        advance(model, state, step, i, g, moving)
+
+    def settle(model: Model, state: State, adjoint: Adjoint, step: int):
+        i, g = wp.tid()
+        advance_adjoint(model, state, adjoint, step, i, g)
+        if model.collide == 0:
+            update_adjoint(model, state, adjoint, step, i, g)
+        else:
+            adjoint.after[i, g] = Vector()
+
+    def hit(model: Model, state: State, adjoint: Adjoint, step: int):
+        i, g = wp.tid()
+        collided_adjoint(model, state, adjoint, step, i, g)
+
+    def slow(model: Model, state: State, adjoint: Adjoint, step: int):
+        i, g = wp.tid()
+        update_adjoint(model, state, adjoint, step, i, g)
+
+    def pull(model: Model, state: State, adjoint: Adjoint, step: int):
+        i, g = wp.tid()
+        gathered_adjoint(model, state, adjoint, step, step % 2, i, g)
+        if model.collide == 0 and step > 0:
+            advance_adjoint(model, state, adjoint, step - 1, i, g)
+            update_adjoint(model, state, adjoint, step - 1, i, g)
+
+    made = wp.kernel(module="unique", enable_backward=False)
+    return Kernels(*map(made, (forward, backward, begin, substep, collide, settle, pull, hit, slow)))
