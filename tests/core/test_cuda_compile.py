@@ -10,9 +10,9 @@ from neuspring.core.device import start_warp
 from tests.support.cubin import resources
 from tests.support.cuda_kernels import (
     ARCHITECTURES,
+    CHOICES,
     FORWARD,
     PACKAGE,
-    VARIANTS,
     compile_for_gpus,
     declared,
     kernels,
@@ -24,18 +24,14 @@ NO_KERNELS_HERE: set[str] = set()
 """Modules that name `wp.kernel` for the kernels of others."""
 
 
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("module", modules())
-def test_every_kernel_compiles_for_gpus(module, tmp_path):
-    found = kernels(module)
-    paths = compile_for_gpus(found, tmp_path)
-    expected = {kernel.get_mangled_name() + FORWARD for kernel in found.values()}
-    for architecture in ARCHITECTURES:
-        entries = {}
-        for path in paths:
-            if f".sm{architecture}." in path.name:
-                entries |= resources(path.read_bytes())
-        assert entries.keys() == expected
-        assert all(0 < used.registers <= 255 and used.shared < 48 * 1024 for used in entries.values())
+def test_every_kernel_compiles_for_gpus(module, architecture, tmp_path):
+    found, entries = kernels(module), {}
+    for path in compile_for_gpus(found, tmp_path, (architecture,)):
+        entries |= resources(path.read_bytes())
+    assert entries.keys() == {kernel.get_mangled_name() + FORWARD for kernel in found.values()}
+    assert all(0 < used.registers <= 255 and used.shared < 48 * 1024 for used in entries.values())
 
 
 def test_no_module_that_makes_kernels_is_overlooked():
@@ -75,10 +71,10 @@ def test_factories_are_asked_for_every_variant(monkeypatch):
 
     both = (wp.float32, wp.float64)
     assert set(variants("m.with_switch", with_switch)) == {(real, batched) for real in both for batched in (False, True)}
-    with pytest.raises(AssertionError, match="takes `columns`: list its arguments in VARIANTS"):
+    with pytest.raises(AssertionError, match="takes `columns`: say in CHOICES"):
         variants("m.with_number", with_number)
-    monkeypatch.setitem(VARIANTS, "m.with_number", ((wp.float32, 8),))
-    assert variants("m.with_number", with_number) == [(wp.float32, 8)]
+    monkeypatch.setitem(CHOICES, "columns", (8,))
+    assert variants("m.with_number", with_number) == [(real, 8) for real in both]
 
 
 MODULE = """

@@ -23,9 +23,8 @@ from neuspring.core.device import start_warp
 PACKAGE = Path(neuspring.__file__).parent
 ARCHITECTURES = (80, 90)
 """A100 and H100, as compute capability x 10."""
-REALS = {"float32": wp.float32, "float64": wp.float64}
-VARIANTS: dict[str, tuple[tuple[Any, ...], ...]] = {}
-"""Arguments of factories that take more than the scalar type and switches, by "module.factory"."""
+CHOICES: dict[str, tuple[Any, ...]] = {"real": (wp.float32, wp.float64), "width": (1,)}
+"""What factories are asked for, by the name of the parameter. On a GPU a thread has one lane (neuspring/physics/arrays.py)."""
 FORWARD = "_cuda_kernel_forward"
 """What Warp adds to a kernel's mangled name in machine code."""
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -86,7 +85,7 @@ def kernels(module: str) -> dict[str, Any]:
             made[top] = holder
         else:
             for arguments in variants(f"{module}.{top}", holder):
-                made |= {" ".join([k.func.__name__, *map(_word, arguments)]): k for k in _flat(holder(*arguments))}
+                made |= {" ".join([k.func.__name__, *_words(holder, arguments)]): k for k in _flat(holder(*arguments))}
         missing = names - {kernel.func.__name__ for kernel in made.values()}
         assert not missing, f"{module}.{top} does not give out {sorted(missing)}: return them, or let `kernels` find them"
         found |= made
@@ -94,19 +93,20 @@ def kernels(module: str) -> dict[str, Any]:
 
 
 def variants(name: str, factory: Any) -> list[tuple[Any, ...]]:
-    """Every set of arguments of a factory: both scalar types, both values of each switch."""
-    if name in VARIANTS:
-        return list(VARIANTS[name])
+    """Every set of arguments of a factory: all choices of each parameter, both values of a switch."""
     choices: list[tuple[Any, ...]] = []
     for parameter in inspect.signature(factory).parameters.values():
-        switch = parameter.annotation in (bool, "bool")
-        assert switch or parameter.name == "real", f"{name} takes `{parameter.name}`: list its arguments in VARIANTS of {__name__}"
-        choices.append((False, True) if switch else tuple(REALS.values()))
+        switch = (False, True) if parameter.annotation in (bool, "bool") else ()
+        found = CHOICES.get(parameter.name, switch)
+        assert found, f"{name} takes `{parameter.name}`: say in CHOICES of {__name__} what a GPU asks for"
+        choices.append(found)
     return list(itertools.product(*choices))
 
 
-def _word(argument: Any) -> str:
-    return str(getattr(argument, "__name__", argument))
+def _words(factory: Any, arguments: tuple[Any, ...]) -> list[str]:
+    """A factory's arguments in words: a type by its name, others with their parameter's."""
+    names = inspect.signature(factory).parameters
+    return [getattr(value, "__name__", f"{name} {value}") for name, value in zip(names, arguments, strict=True)]
 
 
 def _flat(made: Any) -> Iterator[Any]:
