@@ -1,4 +1,4 @@
-# make install | demo | test | test-all | lint | bench: each makes or reuses .venv by itself.
+# make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself.
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
@@ -9,7 +9,7 @@ CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test test-slow test-all lint format bench clean
+.PHONY: install demo test test-slow test-all lint format bench gpu clean
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
@@ -51,6 +51,10 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
 	$(BIN)/python -m tests.benchmarks.bench_start
 	$(BIN)/python -m tests.benchmarks.bench_workflow
+
+# Needs a GPU; `make gpu GPU_OPTIONS=--again` passes options. See tests/benchmarks/GPU.md.
+gpu: $(INSTALLED)
+	$(BIN)/python -m tests.gpu $(GPU_OPTIONS)
 
 clean:
 	rm -rf .venv .snakemake

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PLACES = ("", ".github", "config", "results", "workflow")
+PLACES = ("", ".github", "config", "results", "tests/benchmarks", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PATH = re.compile(

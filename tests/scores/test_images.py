@@ -9,13 +9,13 @@ import torch
 from neuspring.core.errors import InputError
 from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
 from neuspring.splats.ssim import ssim, ssim_map
+from tests.support.devices import DEVICES
 
 FOLDER = Path(__file__).parents[1] / "golden"
 SINGLE = {"mean": 1e-5, "map": 1e-4, "gradient": 1e-3, "psnr": 1e-4, "relative": 1e-5}
 """The golden README's tolerances for float32: SSIM absolute, its gradient relative to the largest, PSNR in dB."""
 DOUBLE = dict.fromkeys(SINGLE, 1e-9)
 CASES = range(8)
-DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
 
 
 def golden(name: str) -> dict[str, np.ndarray]:

@@ -13,8 +13,8 @@ from neuspring.core.records import digest_file
 from neuspring.scores import lpips_weights
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import Weights, find_weights
+from tests.support.devices import DEVICES
 
-DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
 CHANNELS = (64, 192, 384, 256, 256)
 CONVOLUTIONS = {"0": (64, 3, 11, 11), "3": (192, 64, 5, 5), "6": (384, 192, 3, 3), "8": (256, 384, 3, 3), "10": (256, 256, 3, 3)}
 

@@ -96,6 +96,7 @@ def test_thresholds_that_gsplat_would_not_keep_are_refused(stand_in):
         rasterise(*splats, small_view(), limits=Limits(alpha_max=0.9), backend="gsplat")
 
 
+@pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available() or bool(_gsplat_fault("cuda:0")), reason="needs CUDA and gsplat")
 def test_gsplat_draws_what_we_draw():
     assert choose_backend("auto", "cuda:0") == "gsplat"

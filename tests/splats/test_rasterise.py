@@ -16,6 +16,7 @@ from neuspring.splats import reference
 from neuspring.splats.project import project
 from neuspring.splats.rasterise import choose_backend, rasterise
 from neuspring.splats.view import LIMITS
+from tests.support.devices import DEVICES
 from tests.support.golden_splats import CASES, Golden
 from tests.support.random_splats import random_splats, small_view
 
@@ -25,7 +26,6 @@ SINGLE_CLOSE = {"rgb": 2e-4, "alpha": 2e-4, "depth": 5e-4, "means": 1e-3, "conic
 DOUBLE = dict.fromkeys(SINGLE, 1e-9)
 """float64 reaches 1e-10; a digit is left for the order of sums."""
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
-DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
 ISOTROPIC = ("r01_single_iso", "r07_sh0_iso", "r10_sh_partial")
 
 

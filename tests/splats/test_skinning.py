@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
 from neuspring.splats.skinning import Skin
+from tests.support.devices import DEVICES
 
 FOLDER = Path(__file__).parents[1] / "golden"
 CASES = sorted(path.stem for path in FOLDER.glob("l*.npz"))
 METERS, COMPONENTS = 5e-6, 2e-5
-DEVICES = ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
 
 
 def as_tensor(values: np.ndarray, device: str = "cpu") -> torch.Tensor:

@@ -16,11 +16,8 @@ from neuspring.physics import reference
 from neuspring.physics.autograd import pack
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver, Parameters
+from tests.support.devices import DEVICES as DEVICES
 
-DEVICES = [
-    "cpu",
-    pytest.param("cuda:0", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
-]
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
 Engine = Callable[[Scene, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 

@@ -1,0 +1,76 @@
+"""Registers and memory of every kernel on GPUs, from its machine code: `python -m tests.benchmarks.kernel_resources [--write]`.
+
+Needs no GPU. `--write` puts the table into GPU.md beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import tempfile
+from pathlib import Path
+
+import warp as wp
+
+from tests.support.cubin import Resources, resources
+from tests.support.cuda_kernels import ARCHITECTURES, FORWARD, compile_for_gpus, kernels, modules
+
+PAGE = Path(__file__).with_name("GPU.md")
+BEGIN, END = "<!-- kernel_resources: begin -->", "<!-- kernel_resources: end -->"
+BLOCK = 256
+"""Warp's threads per block."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    text = table()
+    print(text)
+    if options.write:
+        page = PAGE.read_text(encoding="utf-8")
+        section = re.compile(f"{re.escape(BEGIN)}.*{re.escape(END)}", re.DOTALL)
+        assert section.search(page), f"{PAGE.name} lacks the lines {BEGIN} and {END}"
+        PAGE.write_text(section.sub(lambda _: f"{BEGIN}\n{text}{END}", page), encoding="utf-8")
+
+
+def table() -> str:
+    """A row per kernel, in Markdown."""
+    both = " / ".join(f"sm_{architecture}" for architecture in ARCHITECTURES)
+    lines = [f"Warp {wp.__version__}, {both}, blocks of {BLOCK} threads.", ""]
+    lines += ["| kernel | registers | local, B | shared, B | blocks |", "|---|---:|---:|---:|---:|"]
+    for module in modules():
+        lines.append(f"| **{module.removeprefix('neuspring.')}** | | | | |")
+        found = kernels(module)
+        taken = measure(found)
+        for name, kernel in found.items():
+            rows = [_row(*taken[architecture, kernel.get_mangled_name()]) for architecture in ARCHITECTURES]
+            lines.append(f"| {name} | {' | '.join(' / '.join(map(str, cells)) for cells in zip(*rows, strict=True))} |")
+    return "\n".join(lines) + "\n"
+
+
+def _row(used: Resources, dynamic: int) -> tuple[int, int, int, int]:
+    return used.registers, used.stack, used.shared + dynamic, blocks_by_registers(used.registers)
+
+
+def measure(found: dict) -> dict[tuple[int, str], tuple[Resources, int]]:
+    """Resources, and dynamic shared memory in bytes, by architecture and the kernel's mangled name."""
+    taken = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for path in compile_for_gpus(found, Path(folder)):
+            stem, architecture = re.fullmatch(r"(.+)\.sm(\d+)\.cubin", path.name).groups()
+            dynamic = json.loads((path.parent / f"{stem}.meta").read_text())
+            for entry, used in resources(path.read_bytes()).items():
+                taken[int(architecture), entry.removesuffix(FORWARD)] = (used, dynamic[f"{entry}_smem_bytes"])
+    return taken
+
+
+def blocks_by_registers(registers: int) -> int:
+    """Blocks that the 65,536 registers of a multiprocessor hold; a warp takes multiples of 256. Its 2,048 threads are 8 blocks."""
+    per_warp = -(-registers * 32 // 256) * 256
+    return min(65536 // per_warp // (BLOCK // 32), 2048 // BLOCK)
+
+
+if __name__ == "__main__":
+    main()
