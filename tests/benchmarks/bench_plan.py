@@ -1,0 +1,91 @@
+"""Does the plan predict? `python -m tests.benchmarks.bench_plan RESULTS [--spacing 0.01]`, with RESULTS that of config/data/toy.yaml.
+
+The median rates of the toy jobs in RESULTS predict a search and a fit of a cloth with nodes every `spacing` meters, from its settings
+alone and from the springs and substeps that turned out. Both then run here, in one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from neuspring import config
+from neuspring.config import Config, ScenarioRow
+from neuspring.core.job_records import SPRING_UPDATES
+from neuspring.core.records import StageRecord
+from neuspring.data.expected import Expected
+from neuspring.data.synthetic import toy
+from neuspring.experiments.plan import History
+from neuspring.experiments.size import expected_size
+from neuspring.stages import fit, observe, search
+
+FRAMES, ROLLOUTS, EPOCHS = 30, 22, 5
+SIDE = 0.28
+
+
+def cloth(spacing: float) -> toy.Shape:
+    """The toy cloth with other distances between its nodes."""
+    whole, count = toy.cloth(), round(SIDE / spacing) + 1
+    across, down = np.meshgrid(np.linspace(-0.14, 0.14, count), np.linspace(0.4, 0.12, count), indexing="ij")
+    nodes = np.stack([across.ravel(), np.zeros(across.size), down.ravel()], axis=1)
+    seen = np.add.outer(np.arange(count), np.arange(count)).ravel() % 2 == 0
+    return replace(whole, tracked=nodes[seen], surface=nodes[~seen], radius=2.25 * spacing)
+
+
+def main() -> None:
+    """Print predicted and actual seconds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--spacing", type=float, default=0.01)
+    a = parser.parse_args()
+    rates = History.of(a.results).rates
+    shape = cloth(a.spacing)
+    toy.SHAPES["dense"] = lambda: shape
+    # Radii go with the distance between nodes, as in config/data/toy.yaml.
+    radius = 2.25 * a.spacing
+    values = {
+        "search": {
+            "rollouts": ROLLOUTS,
+            "ranges": {"object_radius": [a.spacing / 2, 2.5 * a.spacing]},
+            "start": {"object_radius": radius, "stiffness": 1e4},
+        },
+        "fit": {"epochs": EPOCHS},
+        "toy": {"frames": FRAMES},
+    }
+    settings = config.parse(Config, values, "bench_plan")
+    nodes = len(shape.tracked) + len(shape.surface)
+    body = Expected(nodes=nodes, spacing=a.spacing, frames=FRAMES, controllers=len(shape.hands))
+    springs, substeps = expected_size(body, settings.search, settings.simulation)
+    print(f"{nodes} nodes; from the settings {springs:.0f} springs, {substeps:.0f} substeps")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        row = ScenarioRow(scenario="dense", source="toy", category="cloth", path="dense/shake/smooth", self_collision=False, ground=True)
+        observe.run(row, settings, folder / "observations.npz")
+        (folder / "search").mkdir()
+        (folder / "fit").mkdir()
+        train = int(toy.TRAIN_FRACTION * FRAMES) - 1
+        for stage, count in (("search", ROLLOUTS), ("fit", EPOCHS)):
+            record = folder / stage / f"{stage}.json"
+            clock = time.perf_counter()
+            if stage == "search":
+                search.run(folder / "observations.npz", settings, 1, 0, "cpu", record)
+            else:
+                fit.run(folder / "observations.npz", folder / "search" / "search.json", settings, "springs", "cpu", record)
+            seconds = time.perf_counter() - clock
+            facts = StageRecord.load(record).facts
+            rate = rates[stage, "cpu", ""]
+            planned = rate * count * train * springs * substeps / 1e9
+            counted = rate * facts[SPRING_UPDATES] / 1e9
+            print(
+                f"{stage}: {facts['springs']} springs, {facts['substeps']} substeps; {seconds:.1f} s, of which the plan says"
+                f" {planned:.1f} s ({planned / seconds:.2f}) from the settings, {counted:.1f} s ({counted / seconds:.2f}) as counted"
+            )
+
+
+if __name__ == "__main__":
+    main()
