@@ -1,30 +1,35 @@
 """Does the plan predict? `python -m tests.benchmarks.bench_plan RESULTS [--spacing 0.01]`, RESULTS made with config/data/toy.yaml.
 
-The median rates of the toy jobs predict a search and a fit of a cloth with a node every `spacing` meters: from its settings alone,
-and from the springs and substeps that turned out. Both then run here, in one thread. Seconds are those of the CPU, so that other
-work on the machine counts less.
+First each toy job is predicted from the rates of the other scenes. Then the rates of all predict a search and a fit of a cloth with a
+node every `spacing` meters: from its settings alone, and from the springs and substeps that turned out. Both run here, in one
+thread. Their seconds are those of the CPU, so that other work on the machine counts less.
 """
 
 from __future__ import annotations
 
 import argparse
+import statistics
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 
 from neuspring import config
 from neuspring.config import Config, ScenarioRow
-from neuspring.core.job_records import SPRING_UPDATES
+from neuspring.core.job_records import SPRING_UPDATES, read_jobs
 from neuspring.core.records import StageRecord
 from neuspring.data.expected import Expected
 from neuspring.data.synthetic import toy
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.needs import Needs
 from neuspring.experiments.plan import History
 from neuspring.experiments.size import expected_size
 from neuspring.stages import fit, observe, search
+from tests.support.project import ROOT
 
 FRAMES, ROLLOUTS, EPOCHS = 30, 22, 5
 SIDE = 0.28
@@ -39,6 +44,26 @@ def cloth(spacing: float) -> toy.Shape:
     return replace(whole, tracked=nodes[seen], surface=nodes[~seen], radius=2.25 * spacing)
 
 
+def toys(results: Path) -> None:
+    """Print expected over actual seconds of each toy job, from the median rate of the other scenes: median and range."""
+    values = config.read_yaml(ROOT / "config" / "config.yaml")
+    config.merge(values, config.read_yaml(ROOT / "config" / "data" / "toy.yaml"))
+    jobs = [job for job in read_jobs(results) if job.unit]
+    with tempfile.TemporaryDirectory() as empty:
+        needs = Needs(Benchmark.of(values | {"results": empty}, ROOT), "cpu")
+        for rule in ("search", "fit", "rollout"):
+            settings, counts = [], []
+            for job in (each for each in jobs if each.rule == rule):
+                others = [each for each in jobs if each.rule == rule and each.scenario != job.scenario]
+                rate = statistics.median(each.last.seconds / each.work for each in others)
+                _, scenario, name, _ = job.name.split("/")
+                work, _ = needs.amount(rule, SimpleNamespace(scenario=scenario, search=name, method=name))
+                settings.append(rate * (work or 0.0) / job.last.seconds)
+                counts.append(rate * job.work / job.last.seconds)
+            texts = (f"{statistics.median(each):.2f} ({min(each):.2f} to {max(each):.2f})" for each in (settings, counts))
+            print(f"toy {rule}, {len(counts)} jobs: {' from the settings, '.join(texts)} from the counts")
+
+
 def main() -> None:
     """Print predicted and actual seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -46,6 +71,7 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, default=0.01)
     a = parser.parse_args()
     torch.set_num_threads(1)
+    toys(a.results)
     rates = History.of(a.results).rates
     shape = cloth(a.spacing)
     toy.SHAPES["dense"] = lambda: shape
