@@ -1,7 +1,7 @@
 """Does the plan predict? `python -m tests.benchmarks.bench_plan RESULTS [--spacing 0.01]`, RESULTS made with config/data/toy.yaml.
 
-First each toy job is predicted from the rates of the other scenes. Then the rates of all predict a search and a fit of a cloth with a
-node every `spacing` meters: from its settings alone, and from the springs and substeps that turned out. Both run here, in one
+First each toy job is predicted from the rates of the other scenes. Then the rates of all predict a search and a fit of a cloth with
+a node every `spacing` meters: from its settings alone, and from the springs and substeps that turned out. Both run here, in one
 thread. Their seconds are those of the CPU, so that other work on the machine counts less.
 """
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.core.artifacts import Observations
-from neuspring.core.job_records import SIMULATING, SPRING_UPDATES
 from neuspring.core.npz import DamagedFile
 from neuspring.core.npz_head import read_head
 from neuspring.core.records import StageRecord
@@ -206,7 +205,3 @@ def test_the_head_of_a_file_is_what_loading_it_says(tmp_path):
         read_head(path)
     with pytest.raises(FileNotFoundError):
         read_head(tmp_path / "none.npz")
-
-
-def test_every_rule_that_simulates_is_one_of_the_stages_that_count():
-    assert SIMULATING == ("search", "fit", "rollout", "transfer") and SPRING_UPDATES == "spring_updates"
