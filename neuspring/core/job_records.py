@@ -25,6 +25,12 @@ RUN = ".run"
 """File in FOLDER that names the current run of the workflow, or the last one."""
 GPU_NOTES = ".gpus"
 """File in FOLDER in which the jobs of that run note which GPUs failed."""
+SIMULATING = ("search", "fit", "rollout", "transfer")
+"""Rules whose work is spring updates (`neuspring.experiments.size`)."""
+SPRING_UPDATES = "spring_updates"
+"""The fact of their stages' records that counts them."""
+GIGA_UPDATES = "1e9 spring updates"
+"""The unit of their work: a rate in seconds is one in nanoseconds per spring, substep and twin."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
 """How an attempt ended. transient: trying again may help. running: it runs, or its wrapper was killed."""
 
@@ -78,6 +84,8 @@ class JobRecord:
     scenario: str = ""
     work: float = 1.0
     """Amount of work, in units of its rule (see `neuspring.experiments.plan`)."""
+    unit: str = ""
+    """GIGA_UPDATES for a job whose stage counted its spring updates; empty: frames, iterations, or whatever its rule counts."""
 
     @property
     def last(self) -> Attempt:

@@ -1,6 +1,7 @@
 """Where scenarios come from: `SOURCES` declares every kind of data, and the workflow asks it.
 
-To add a source: a reader (`observations`) or an importer to the capture format (`write_capture`), and its line here.
+To add a source: a reader (`observations`) or an importer to the capture format (`write_capture`), and its line here; for the
+plan of a run also its body in `neuspring.data.expected`.
 """
 
 from __future__ import annotations

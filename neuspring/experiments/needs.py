@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,16 @@ from neuspring.baselines import BASELINES
 from neuspring.config import Config
 from neuspring.config.gpus import Gpus
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import JobRecord
+from neuspring.core.job_records import SIMULATING, JobRecord
 from neuspring.experiments import benchmark as benchmarks
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.plan import History, Kind, Planned
+from neuspring.experiments.size import TRAIN, Size, Sizes
 from neuspring.stages import STAGES
 
-TRAIN = 0.7
-"""Part of the frames that is for training, where only the count of frames is known."""
+CARRY_OVER = 4
+"""Rollouts that carrying over the state costs: the prediction, the training frames again, and 12 continuations of some of them."""
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
@@ -105,18 +106,17 @@ def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:
     return pool
 
 
-def planned(jobs: Iterable[Any], results: Path) -> list[Planned]:
+def planned(jobs: Iterable[Any], needs: Needs) -> list[Planned]:
     """Jobs of Snakemake's DAG as `neuspring.experiments.plan` takes them; targets, which have no log, do nothing."""
-    return [
-        Planned(
-            rule=JobRecord.of_log(results, Path(job.log[0])).rule,
-            scenario=getattr(job.wildcards, "scenario", ""),
-            kind="gpu" if job.resources.get("gpu") else "cpu",
-            work=float(job.resources.get("work", 1)),
-        )
-        for job in jobs
-        if len(job.log)
-    ]
+    results, found = needs.results, []
+    for job in jobs:
+        if not len(job.log):
+            continue
+        rule = JobRecord.of_log(results, Path(job.log[0])).rule
+        work, size = needs.amount(rule, job.wildcards) if rule in SIMULATING else (float(job.resources.get("work", 1)), None)
+        kind: Kind = "gpu" if job.resources.get("gpu") else "cpu"
+        found.append(Planned(rule=rule, scenario=getattr(job.wildcards, "scenario", ""), kind=kind, work=work, size=size))
+    return found
 
 
 class Needs:
@@ -124,11 +124,17 @@ class Needs:
 
     def __init__(self, benchmark: Benchmark, kind: Kind) -> None:
         self._benchmark, self._kind = benchmark, kind
+        self.results = Path(benchmark.config.results)
+        self.sizes = Sizes(benchmark)
+        # Thousands of jobs share a few rows.
+        config = benchmark.config
+        self._rollouts = cache(lambda name: benchmarks.search_of(config, benchmark.searches[name], name).rollouts)
+        self._epochs = cache(lambda name: benchmarks.fit_of(config, benchmark.fits[name], name).epochs)
 
     @cached_property
     def history(self) -> History:
         """Earlier jobs of the results folder."""
-        return History.of(Path(self._benchmark.config.results))
+        return History.of(self.results)
 
     def frames(self, scenario: str) -> int:
         """Frames of a scenario, as far as they are known before its data are read; 1 otherwise."""
@@ -136,12 +142,15 @@ class Needs:
         return self._benchmark.source(scenario).frames(row, self._benchmark.config)
 
     def work(self, rule: str, wildcards: Any) -> int:
-        """How much a job has to do, in units of its rule.
+        """How much a job has to do, as a whole number.
 
-        search: rollouts x training frames; fit: epochs x training frames; train: see `Baseline.work`; appearance: iterations; other
-        jobs of a scenario: frames; jobs of no scenario: 1.
+        Jobs that simulate: frames, of which a search has its rollouts x training frames, a fit its epochs x training frames, a
+        rollout those of all its seeds, a transfer those of all its recordings. train: see `Baseline.work`; appearance: iterations;
+        other jobs of a scenario: frames; jobs of no scenario: 1.
         """
         benchmark, config = self._benchmark, self._benchmark.config
+        if rule in SIMULATING:
+            return self._simulated(rule, wildcards)
         if rule == "appearance":
             owner = wildcards.looks.removeprefix("appearance-")
             own = benchmark.splats.get(owner)
@@ -150,17 +159,42 @@ class Needs:
         if not hasattr(wildcards, "scenario"):
             return 1
         frames = self.frames(wildcards.scenario)
-        train_frames = math.ceil(TRAIN * frames)
-        if rule == "search":
-            row = benchmark.searches[wildcards.search]
-            return benchmarks.search_of(config, row, wildcards.search).rollouts * train_frames
-        if rule == "fit":
-            return benchmarks.fit_of(config, benchmark.fits[wildcards.method], wildcards.method).epochs * train_frames
         if rule == "train":
             method = benchmark.methods[wildcards.method]
             section = benchmarks.section_of(config, method, wildcards.method)
-            return BASELINES[method.model or ""].work(section, train_frames)
+            return BASELINES[method.model or ""].work(section, math.ceil(TRAIN * frames))
         return frames
+
+    def _simulated(self, rule: str, wildcards: Any) -> int:
+        """Frames that a job simulates; frame 0 is given."""
+        benchmark, body = self._benchmark, self.sizes.body(wildcards.scenario)
+        if rule == "search":
+            return int(self._rollouts(wildcards.search) * (body.train_end - 1))
+        if rule == "fit":
+            return int(self._epochs(wildcards.method) * (body.train_end - 1))
+        if rule == "transfer":
+            return sum(self.sizes.body(name).frames - 1 for name in benchmark.transfers[wildcards.scenario])
+        method = benchmark.methods[wildcards.method]
+        seeds = len(benchmark.whole.seeds) if method.average_seeds else 1
+        return (body.frames - 1) * seeds * (CARRY_OVER if method.carry_over else 1)
+
+    def amount(self, rule: str, wildcards: Any) -> tuple[float | None, Size | None]:
+        """A job's work in the unit of its times, and, if it simulates, the size of its twins.
+
+        Jobs that simulate: 1e9 spring updates; None for the transfer of a baseline, which has no springs. Others: see `work`.
+        """
+        work = self.work(rule, wildcards)
+        if rule not in SIMULATING:
+            return work, None
+        if rule == "search":
+            search = wildcards.search
+        else:
+            rows = self._benchmark.fits if rule == "fit" else self._benchmark.methods
+            search = rows[wildcards.method].search
+        if search is None:
+            return None, None
+        size = self.sizes.of(wildcards.scenario, search, rule == "search")
+        return work * size.updates / 1e9, size
 
     def memory(self, rule: str) -> Callable[..., int]:
         """MB to ask for: half as much again as earlier jobs of the rule needed with the same scenario.
@@ -185,7 +219,7 @@ class Needs:
 
         def expected(scenario: str, wildcards: Any) -> float:
             rate = max(self.history.rates.get((rule, kind, scenario), 0.0) for kind in self._kinds(rule))
-            return HEADROOM_TIME * rate * self.work(rule, wildcards) / 60 if rate else 0.0
+            return HEADROOM_TIME * rate * (self.amount(rule, wildcards)[0] or 0.0) / 60 if rate else 0.0
 
         def needed(wildcards: Any, attempt: int) -> int:
             return _asked(wildcards, attempt, default, lambda scenario: expected(scenario, wildcards), LEAST_MINUTES)

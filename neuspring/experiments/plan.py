@@ -1,8 +1,9 @@
 """What jobs will cost, from the times that earlier jobs took: for the plan of a dry run, and for what a cluster is asked for.
 
-Times are rates, seconds per unit of a job's work (rollouts x training frames, epochs x training frames, iterations, frames), so
-that a record made with another budget still tells something. Records of the results folder come first, then those that ship with
-the package (data/timings.csv, each with where it is from).
+Times are rates, seconds per unit of a job's work, so that a record made with another budget or of another scene still tells
+something. The work of a job that simulates is its spring updates (`neuspring.experiments.size`), in 1e9, so that its rate is in
+nanoseconds per spring, substep and twin; that of others is iterations or frames. Records of the results folder come first, then
+those that ship with the package (data/tables/timings.csv, each with where it is from).
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from neuspring.core.job_records import Attempt, JobRecord, read_jobs
+from neuspring.core.job_records import GIGA_UPDATES, SIMULATING, Attempt, JobRecord, read_jobs
+from neuspring.experiments.size import Size
 
 SHIPPED = Path(__file__).parents[1] / "data" / "tables" / "timings.csv"
 Kind = Literal["cpu", "gpu"]
@@ -28,7 +30,10 @@ class Planned:
     rule: str
     scenario: str = ""
     kind: Kind = "cpu"
-    work: float = 1.0
+    work: float | None = 1.0
+    """In units of its rule; None where it cannot be told."""
+    size: Size | None = None
+    """Of the twins of a job that simulates."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +52,8 @@ class History:
     """(rule, kind, scenario or "" for all) -> median seconds per unit of work."""
     memory: Mapping[tuple[str, Kind, str], float] = field(default_factory=dict)
     """(rule, kind, scenario or "" for all) -> largest resident memory, MiB."""
+    uncounted: frozenset[str] = frozenset()
+    """Rules that simulate, of which there are jobs whose spring updates nobody counted; their times are not used."""
 
     @classmethod
     def of(cls, results: Path) -> History:
@@ -58,6 +65,7 @@ class History:
         """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
         seconds: dict[tuple[str, Kind, str], list[float]] = defaultdict(list)
         memory: dict[tuple[str, Kind, str], float] = defaultdict(float)
+        uncounted = set()
         for record in records:
             for attempt in record.attempts:
                 for scenario in {"", record.scenario}:
@@ -66,11 +74,15 @@ class History:
             ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
             if len(ends) == 1:
                 continue
+            if record.rule in SIMULATING and record.unit != GIGA_UPDATES:
+                uncounted.add(record.rule)
+                continue
             kind = _kind(record.attempts[ends[-1]])
             took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
             for scenario in {"", record.scenario}:
                 seconds[record.rule, kind, scenario].append(took / record.work)
-        return cls(rates={key: statistics.median(times) for key, times in seconds.items()}, memory=dict(memory))
+        rates = {key: statistics.median(times) for key, times in seconds.items()}
+        return cls(rates=rates, memory=dict(memory), uncounted=frozenset(uncounted))
 
 
 def _kind(attempt: Attempt) -> Kind:
@@ -105,14 +117,18 @@ def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int])
     counts: dict[tuple[str, Kind], int] = defaultdict(int)
     sources: dict[str, set[str]] = defaultdict(set)
     unknown = set()
+    bases: dict[tuple[str, str], set[str]] = defaultdict(set)
     for job in jobs:
         counts[job.rule, job.kind] += 1
         known = rate(job, history, shipped)
-        if known is None:
+        if known is None or job.work is None:
             unknown.add(job.rule)
             continue
         hours[job.rule, job.kind] += known.seconds * job.work / 3600
         sources[known.source].add(job.rule)
+        if job.size:
+            bases["springs", job.size.springs_from].add(job.scenario)
+            bases["substeps", job.size.substeps_from].add(job.scenario)
     if not counts:
         return ""
     totals: dict[Kind, float] = {kind: sum(v for (_, k), v in hours.items() if k == kind) for kind in ("gpu", "cpu")}
@@ -125,6 +141,14 @@ def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int])
     if least:
         lines.append(f"  with {places}: at least {least:.1f} h")
     lines += [f"  times of {', '.join(sorted(rules))}: {source}" for source, rules in sorted(sources.items())]
+    lines += [f"  {what} from {source}: {_scenarios(names)}" for (what, source), names in sorted(bases.items())]
+    if history.uncounted:
+        rules = ", ".join(sorted(history.uncounted))
+        lines.append(f"  times of earlier jobs without a count of spring updates are not used: {rules}")
     if unknown:
         lines.append(f"  no time on record, not counted: {', '.join(sorted(unknown))}")
     return "\n".join(lines)
+
+
+def _scenarios(names: set[str]) -> str:
+    return f"{len(names)} scenarios" if len(names) > 1 else next(iter(names))

@@ -75,13 +75,16 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     result.twin.save(files["twin"])
     columns = {name: result.history[name] for name in ("loss", "tail_loss", "gradient_norm", "learning_rate")}
     write_history(result.history["epoch"], columns, files["history"])
+    counts = result.twin.counts
+    frames = len(result.history) * (problem.observations.scenario.train_end - 1)
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
         "epochs": len(result.history),
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
-        **result.twin.counts,
+        "spring_updates": frames * counts["springs"] * counts["substeps"],
+        **counts,
     }
     record.save(files, facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)
     partial.unlink(missing_ok=True)

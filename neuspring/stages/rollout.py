@@ -55,11 +55,12 @@ def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, devi
         record.save(failure=f"{failed.stage}: {failed.reason}")
         return
     observations = Observations.load(observations_path)
-    trajectories, corrections = [], []
+    trajectories, corrections, updates = [], [], 0
     for path, stage in before.items():
         twin = Twin.load(stage.file("twin", path))
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
         trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity)
+        updates += (len(trajectory.positions) - 1) * twin.counts["springs"] * twin.counts["substeps"]
         if carry:
             trajectory, correction = carry_over(trajectory, twin, observations, velocity, device)
             corrections.append(correction)
@@ -70,6 +71,9 @@ def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, devi
     facts: dict[str, Any] = {"frames": len(trajectory.positions), "averaged": len(trajectories)}
     if corrections:
         facts |= {f"carry_over_{name}": float(np.mean([one[name] for one in corrections])) for name in corrections[0]}
+    else:
+        # Carrying over simulates more, which nobody counts.
+        facts["spring_updates"] = updates
     facts["collision_overflow"] = trajectory.collision_overflow
     if trajectory.collision_overflow:
         print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")

@@ -74,6 +74,8 @@ def run(observations_path: Path, settings: Config, clusters: int, seed: int, dev
         "rollouts": len(result.trace),
         "failed_rollouts": int((result.trace["reason"] != "").sum()),
         "collision_overflow": int(result.trace["collision_overflow"].max()),
+        "spring_updates": int((result.trace["springs"] * result.trace["substeps"]).sum())
+        * (problem.observations.scenario.train_end - 1),
         **result.twin.counts,
     }
     record.save(files, facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)

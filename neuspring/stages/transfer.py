@@ -20,6 +20,9 @@ from neuspring.twin.motion import initial_velocity
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import rebase
 
+Predictor = Callable[[Observations], tuple[Trajectory, int]]
+"""Another recording -> its prediction, and the spring updates per frame that it took (0 for a model without springs)."""
+
 
 def options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring transfer`."""
@@ -49,37 +52,41 @@ def run(targets: Sequence[Path], learned_record: Path, method: str, seed: int, s
     inputs = {before.stage: learned_record} | {f"target{index}": path for index, path in enumerate(targets)}
     record = Recorder("transfer", output, inputs=inputs, device=device)
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    updates = 0
     if before.status == "ok":
         predict = _baseline_predictor if before.stage == "train" else _twin_predictor
         predicts = predict(before, learned_record, settings, device)
         for path in targets:
             observations = Observations.load(path)
-            trajectory = predicts(observations)
+            trajectory, per_frame = predicts(observations)
+            updates += (len(trajectory.positions) - 1) * per_frame
             if trajectory.diverged_frame is not None:
                 diverged.append(observations.scenario.name)
             frames = range(1, observations.scenario.frame_count)
             tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
     files = record.beside(scores="transfer.parquet")
     write_table(pd.concat([table for table in tables if len(table)] or tables), files["scores"])
-    record.save(files, {"diverged": diverged, "targets": len(targets)}, failure=before.reason)
+    facts = {"diverged": diverged, "targets": len(targets)} | ({"spring_updates": updates} if updates else {})
+    record.save(files, facts, failure=before.reason)
 
 
-def _baseline_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+def _baseline_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Predictor:
     """How a baseline's model predicts another recording."""
     baseline = BASELINES[record.settings["model"]]
-    return lambda observations: baseline.predict(observations, record.file("model", path), None, device).trajectory
+    return lambda observations: (baseline.predict(observations, record.file("model", path), None, device).trajectory, 0)
 
 
-def _twin_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Callable[[Observations], Trajectory]:
+def _twin_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Predictor:
     """How a twin predicts another recording."""
     twin = Twin.load(record.file("twin", path))
     keep_lengths = bool(record.settings.get("fit", {}).get("rest_length_bound"))
     keep_frame_time = record.settings["released_quirks"]["frame_time_667"]
 
-    def predict(observations: Observations) -> Trajectory:
+    def predict(observations: Observations) -> tuple[Trajectory, int]:
         safety = settings.simulation.safety
         moved = rebase(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
         velocity = initial_velocity(observations, moved.simulation.initial_velocity)
-        return roll_out(moved, observations.controller_points, device, velocity=velocity)
+        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity)
+        return trajectory, moved.counts["springs"] * moved.counts["substeps"]
 
     return predict

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
+from neuspring.core.job_records import GIGA_UPDATES, GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
 from tests.support.jobs import NAME, record, run, wait_for, wrapped
@@ -29,6 +29,25 @@ def test_a_job_leaves_its_output_in_the_log_and_a_record(results):
     assert last.seconds >= 0.4
     assert last.peak_memory_mb > 50
     assert all(len(row) == 5 for row in last.samples)
+
+
+def counted(results, facts, *, status=0):
+    """The record of a job of the rule `search` whose stage wrote a record with these facts."""
+    stage = results / "search.json"
+    stage.unlink(missing_ok=True)
+    values = json.dumps({"format": 1, "stage": "search", "status": "ok", "facts": facts})
+    code = f"import sys; open(sys.argv[2], 'w').write({values!r}); sys.exit({status})"
+    command = [*wrapped(results, "--work", "88"), sys.executable, "-c", code, "--output", str(stage)]
+    subprocess.run(command, check=False, capture_output=True)
+    job_record = record(results)
+    return job_record.work, job_record.unit
+
+
+def test_the_work_of_a_job_that_simulates_is_the_spring_updates_that_its_stage_counted(results):
+    assert counted(results, {"spring_updates": 25_000_000}) == (0.025, GIGA_UPDATES)
+    # Of a search that failed, of an older stage, of a job that ended badly, nothing is known but what was planned.
+    for facts, status in (({}, 0), ({"spring_updates": 0}, 0), ({"spring_updates": 25_000_000}, 1)):
+        assert counted(results, facts, status=status) == (88, "")
 
 
 def test_a_permanent_failure_is_not_tried_again_but_the_next_run_tries(results):

@@ -1,5 +1,6 @@
 """Expected cost of a run, from recorded times; what a cluster is asked for."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import pytest
@@ -9,8 +10,8 @@ from neuspring import config
 from neuspring.config.gpus import Gpus
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import Attempt, JobRecord
-from neuspring.experiments import needs, plan
+from neuspring.core.job_records import GIGA_UPDATES, SIMULATING, Attempt, JobRecord
+from neuspring.experiments import needs, plan, size
 from neuspring.experiments.benchmark import Benchmark, check_storage
 from tests.support.project import ROOT, config_with
 
@@ -19,7 +20,8 @@ def record(rule, scenario, seconds, work=1.0, outcome="ok", devices=(), memory=0
     attempt = Attempt(
         started="2026-01-01T00:00:00+00:00", seconds=seconds, outcome=outcome, devices=list(devices), peak_memory_mb=memory
     )
-    return JobRecord(rule=rule, name=f"{rule}/{scenario}", log="", attempts=[attempt], scenario=scenario, work=work)
+    unit = GIGA_UPDATES if rule in SIMULATING else ""
+    return JobRecord(rule=rule, name=f"{rule}/{scenario}", log="", attempts=[attempt], scenario=scenario, work=work, unit=unit)
 
 
 def job(rule, scenario="rope", kind="cpu", work=1.0):
@@ -48,6 +50,43 @@ def test_what_is_not_recorded_comes_from_the_shipped_times_and_says_so():
     assert plan.rate(job("unheard_of"), plan.History(), shipped) is None
 
 
+def test_a_small_scene_predicts_a_large_one(benchmark):
+    history = plan.History.of_records([record("search", "small", 20, 0.5)])
+    large = plan.Planned(rule="search", scenario="large", work=2000.0)
+    found = plan.rate(large, history, {})
+    assert found is not None and found.seconds * large.work == pytest.approx(20 * 2000 / 0.5)
+
+
+def test_a_record_whose_spring_updates_nobody_counted_is_not_used_and_the_plan_says_so():
+    older = dataclasses.replace(record("fit", "rope", 3600, 880.0), unit="")
+    jobs = [job("fit", work=5.0)]
+    alone, both = (plan.History.of_records(records) for records in ([older], [older, record("fit", "rope", 50, 5.0)]))
+    assert alone.rates == {} and both.rates["fit", "cpu", "rope"] == 10.0
+    note = "times of earlier jobs without a count of spring updates are not used: fit"
+    assert note in plan.report(jobs, alone, {}) and note in plan.report(jobs, both, {})
+    assert note not in plan.report(jobs, plan.History.of_records([record("fit", "rope", 50, 5.0)]), {})
+    # Frames of other rules are what they were.
+    assert plan.History.of_records([record("score", "rope", 5, 10.0)]).rates["score", "cpu", ""] == 0.5
+
+
+def test_the_plan_says_what_springs_and_substeps_rest_on():
+    sizes = [
+        size.Size(springs=100, substeps=10, springs_from=size.RECORD, substeps_from=size.RECORD),
+        size.Size(springs=100, substeps=10, springs_from=size.SETTINGS, substeps_from=size.OTHERS),
+        size.Size(springs=100, substeps=10, springs_from=size.SETTINGS, substeps_from=size.OTHERS),
+    ]
+    jobs = [dataclasses.replace(job("fit", name), size=each) for name, each in zip("abc", sizes, strict=True)]
+    text = plan.report([*jobs, jobs[0]], plan.History.of_records([record("fit", "a", 1.0)]), {})
+    assert "springs from the search's record: a\n  springs from the settings: 2 scenarios" in text
+    assert "substeps from searches of other scenarios: 2 scenarios" in text
+
+
+def test_a_transfer_of_a_baseline_has_no_springs_and_is_not_counted(benchmark):
+    history = plan.History.of_records([record("transfer", "rope", 1.0)])
+    text = plan.report([dataclasses.replace(job("transfer"), work=None)], history, {})
+    assert "not counted: transfer" in text and "no time on record." in text
+
+
 def test_the_plan_counts_hours_slots_and_what_is_unknown():
     history = plan.History.of_records([record("fit", "rope", 36, 10, devices=["0"]), record("observe", "rope", 36)])
     jobs = [job("fit", kind="gpu", work=1000.0)] * 80 + [job("observe")] * 10 + [job("unheard_of")]
@@ -62,7 +101,9 @@ def test_the_plan_counts_hours_slots_and_what_is_unknown():
 def test_every_rule_that_takes_long_has_a_shipped_time():
     rates = plan.shipped_rates()
     assert {"capture", "segment", "track", "lift", "observe", "search", "fit", "rollout", "score"} <= {rule for rule, _ in rates}
-    assert {("search", "gpu"), ("fit", "gpu")} <= set(rates)
+    assert {(rule, kind) for rule in SIMULATING for kind in ("cpu", "gpu")} <= set(rates)
+    # Nanoseconds per spring, substep and twin: a core needs tens of them, a GPU about one.
+    assert all(rates[rule, "cpu"].seconds > 5 > rates[rule, "gpu"].seconds for rule in SIMULATING)
     assert all(rate.seconds > 0 and rate.source for rate in rates.values())
 
 
@@ -72,11 +113,11 @@ def benchmark(tmp_path):
     return Benchmark.of(config_with(changes), ROOT)
 
 
-def test_work_is_rollouts_or_epochs_times_training_frames(benchmark):
+def test_frames_simulated_are_rollouts_or_epochs_times_training_frames(benchmark):
     wanted = needs.Needs(benchmark, "cpu")
     names = SimpleNamespace(scenario=benchmark.config.scenarios[0], search="uniform", method="baseline")
-    # 8 frames, of which 70 % are for training.
-    assert [wanted.work(rule, names) for rule in ("search", "fit", "rollout")] == [100 * 6, 30 * 6, 8]
+    # 8 frames, of which 70 % are for training; frame 0 is given.
+    assert [wanted.work(rule, names) for rule in ("search", "fit", "rollout", "score")] == [100 * 5, 30 * 5, 7, 8]
 
 
 def test_lengths_of_released_and_synthetic_scenes_are_known(tmp_path):
@@ -89,7 +130,7 @@ def test_lengths_of_released_and_synthetic_scenes_are_known(tmp_path):
 
 
 def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(benchmark, tmp_path, monkeypatch):
-    monkeypatch.setattr(needs.Needs, "work", lambda self, rule, wildcards: 4800)
+    monkeypatch.setattr(needs.Needs, "amount", lambda self, rule, wildcards: (4800.0, None))
     wanted = needs.Needs(benchmark, "cpu")
     memory, minutes = wanted.memory("fit"), wanted.minutes("fit")
     assert [memory(None, attempt) for attempt in (1, 2)] == [8000, 16000]
@@ -211,5 +252,7 @@ def test_a_job_that_went_on_after_a_kill_took_as_long_as_all_its_attempts():
     attempts = [
         Attempt(started="2026-01-01T00:00:00+00:00", seconds=times[outcome], outcome=outcome) for outcome in ("ok", "killed", "ok")
     ]
-    history = plan.History.of_records([JobRecord(rule="fit", name="fit/a", log="", attempts=attempts, scenario="rope", work=10.0)])
-    assert plan.rate(job("fit"), history, {}) == plan.Rate(seconds=95.0, source="this results folder")
+    history = plan.History.of_records(
+        [JobRecord(rule="score", name="score/a", log="", attempts=attempts, scenario="rope", work=10.0)]
+    )
+    assert plan.rate(job("score"), history, {}) == plan.Rate(seconds=95.0, source="this results folder")

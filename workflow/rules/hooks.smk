@@ -15,9 +15,7 @@ def plan_of_run():
         "cpu": 0 if CLUSTER else workflow.cores,
         "gpu": workflow.global_resources["gpu"].value if POOL else 0,
     }
-    jobs = needs.planned(
-        workflow.dag.needrun_jobs(exclude_finished=False), Path(RESULTS)
-    )
+    jobs = needs.planned(workflow.dag.needrun_jobs(exclude_finished=False), NEEDS)
     print(messages.plan(jobs, NEEDS.history, slots), flush=True)
     if GPU and not CLUSTER and not POOL:
         print(
