@@ -34,6 +34,8 @@ from neuspring.scores.studies import Study, read_studies
 
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
+LEAST_TOGETHER = 4
+"""Fewer fits of a scenario gain less from shared launches than from jobs of their own, which run at the same time."""
 REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
@@ -240,6 +242,13 @@ class Benchmark:
         if not low <= wanted_low < wanted_high <= high:
             rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+
+    def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
+        """The fits (method, seed) of a scenario that share launches; none where they are few, or `twins_per_launch` is 1."""
+        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
+            return ()
+        members = tuple((name, seed) for name in self.fits if self.applies(name, scenario) for seed in self.config.seeds)
+        return members if len(members) >= LEAST_TOGETHER else ()
 
     @property
     def tuned(self) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
 """Fits that run at the same time and share launches: each in a thread of its own, their frames in the lanes of one solver.
 
-A fit asks its seat for a frame, or for a frame's adjoint, and waits. When every fit of the company waits, one launch serves all who ask
-for the same. So fits in step (equal horizons) always share, and others still finish. Each fit's numbers are those it has alone, bit for
-bit on a CPU, as long as no list of collision partners is full.
+A fit asks its seat for a frame, or for a frame's adjoint, and waits. When every fit of the company waits, one launch serves all who
+ask for the same. So fits in step (equal horizons) always share, and others still finish. Each fit's numbers are those it has alone,
+bit for bit on a CPU, as long as no list of collision partners is full.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from neuspring.physics.population import packed, stacked, union
+from neuspring.physics.population import stacked, union
 from neuspring.physics.solver import FrameSolver, Parameters
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ class Seat:
     """A fit's place in a company; to `simulate_frame` it is a solver."""
 
     def __init__(self, company: Company, twin: Twin) -> None:
-        self._company = company
+        self.company = company
         self.twin = twin
         self.frame_token = 0
         """Changes with every frame that the shared solver simulates: tells whether it still holds a given one."""
@@ -38,16 +38,16 @@ class Seat:
 
     def sit(self, twin: Twin) -> Seat:
         """Simulate `twin` from now on."""
-        self._company.seat(self, twin)
+        self.company.seat(self, twin)
         return self
 
     def run(self, *inputs: torch.Tensor) -> Results:
         """As `FrameSolver.run`."""
-        return self._company.ask(self, "run", inputs)
+        return self.company.ask(self, "run", inputs)
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> Results:
         """As `FrameSolver.backward`."""
-        return self._company.ask(self, "backward", (adj_x, adj_v))
+        return self.company.ask(self, "backward", (adj_x, adj_v))
 
 
 class Company:

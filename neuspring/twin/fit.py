@@ -76,6 +76,8 @@ class FitResult:
     earlier_seconds: float
     """Wall time of the attempts that this one continued, up to their last checkpoint."""
     collision_overflow: int
+    epochs_together: int
+    """Epochs that ran together with those of other fits."""
 
 
 @dataclass
@@ -291,7 +293,8 @@ def fit(
     `seat` the simulation shares launches with other fits (company.py). Raises NumericalFailure if no epoch could be completed.
     """
     label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
-    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key)
+    share = 1 / len(seat.company.seats) if seat else 1.0
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
     run = TwinFit(problem, seat)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
@@ -320,6 +323,7 @@ def fit(
         loop.attempts,
         loop.earlier_seconds,
         state.overflow,
+        loop.epochs_together,
     )
 
 
