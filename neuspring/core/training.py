@@ -36,7 +36,7 @@ class TrainingLoop:
         self.history: list[dict[str, Any]] = []
         """A row per epoch."""
         self.attempts = 1
-        """1, plus one for every time that the training continued from a checkpoint."""
+        """1, plus one for every time that the training continued from a checkpoint of a killed one."""
         self.earlier_seconds = 0.0
         """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
         self.epochs_together = 0
@@ -45,8 +45,9 @@ class TrainingLoop:
         """The checkpoint to continue from."""
         if self.restored:
             run = self.restored.values.pop("run")
-            self.history, self.attempts, self.earlier_seconds = run["history"], run["attempts"] + 1, run["seconds"]
-            self.epochs_together = run["epochs_together"]
+            self.history, self.earlier_seconds, self.epochs_together = run["history"], run["seconds"], run["epochs_together"]
+            # To go on alone after what was planned to run together is no second attempt.
+            self.attempts = run["attempts"] + (self.epochs_together < len(self.history) or not self._alone)
             print(f"continuing {what} after epoch {len(self.history) - 1}")
 
     def __iter__(self) -> Iterator[int]:
