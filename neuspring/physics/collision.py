@@ -98,7 +98,7 @@ def kernels(real: Any, width: int) -> Kernels:
             reach = model.distance[g][q]
             here = column(state.x[0, i, g], q)
             query = wp.hash_grid_query(grid, here, reach, g * width + q)
-            candidate = 0
+            candidate = wp.int32(0)
             while wp.hash_grid_query_next(query, candidate):
                 j = candidate - (g * width + q) * model.nodes
                 if j != i and wp.length(column(state.x[0, j, g], q) - here) < reach:
