@@ -8,10 +8,10 @@ LOAD = """
 import logging, sys
 import warp as wp
 from neuspring.core import device as kernels
-from neuspring.physics import springs, velocity
+from neuspring.physics import collision, frame
 wp.config.log_level = logging.INFO
 sys.stdin.readline()
-for kernel in (*springs.kernels(wp.float32), velocity.kernels(wp.float32).velocity):
+for kernel in (*collision.kernels(wp.float32, 1), frame.kernels(wp.float32, 1).begin):
     kernels.load(kernel, "cpu")
 """
 
