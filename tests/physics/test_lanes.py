@@ -318,6 +318,19 @@ def test_overflow_is_counted_for_each_twin(count: int) -> None:
     assert overflow == [8 * 3, 6 * 1, 0, 0][:count]
 
 
+@pytest.mark.parametrize("capacity", [1, 2, 5])
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int) -> None:
+    """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
+    clouds = crowds(17 if dtype == SINGLE else 4)
+    clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
+    lists, overflow = partners(clouds, dtype, capacity, DISTANCE)
+    wanted = [expected(x, dtype, DISTANCE) for x in clouds]
+    assert lists == [[row[:capacity] for row in rows] for rows in wanted]
+    assert overflow == [sum(max(len(row) - capacity, 0) for row in rows) for rows in wanted]
+    assert overflow[2] > 100
+
+
 def test_contact_distances_are_those_of_each_twin() -> None:
     """The grid's cells are as wide as the largest; a twin with a smaller one lists no more than its own."""
     x = cloud("around the origin")
