@@ -13,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.reference import Scene
@@ -51,7 +52,7 @@ def member(number: int, variant: str) -> Member:
         ground=tuple(rng.uniform(0.1, 0.9, 2)),
         contact=tuple(rng.uniform(0.1, 0.9, 2)),
         contact_distance=rng.uniform(0.02, 0.045),
-        simulation=replace(body.simulation, substeps=SUBSTEPS[number % len(SUBSTEPS)]),
+        simulation=replace(body.simulation, substeps=SUBSTEPS[number % len(SUBSTEPS)], frame_time=rng.uniform(0.018, 0.022)),
     )
     shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
     return Member(body, x + shift[0], v + shift[1], hands + shift[2])
@@ -194,6 +195,17 @@ def test_a_broken_twin_breaks_no_other(how: str, variant: str, broken: int) -> N
     assert not np.isfinite(sick).all() or np.abs(sick).max() > 1e6
     for number in set(range(4)) - {broken}:
         assert_same(of(got, number), member_alone(number, variant, SINGLE), number)
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("gravity", 1.6), ("up", "-z"), ("ground", False), ("self_collision", True), ("collision_capacity", 7),
+    ("controller_velocity", True),
+])  # fmt: skip
+def test_twins_share_their_physics(name: str, value: Any) -> None:
+    """What the solver takes from the first would be wrong for the others."""
+    body, *_ = member(0, "ground")
+    with pytest.raises(InputError, match=rf"simulation\.{name}.*same for all twins"):
+        solver_for([body, replace(body, simulation=replace(body.simulation, **{name: value}))], 2)
 
 
 # The list of springs --------------------------------------------------------------------------------------------------
