@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
+from neuspring.core.device import load
 from neuspring.physics import contact
 from neuspring.physics.arrays import Buffers, structs
 from neuspring.physics.lanes import lanes
@@ -70,9 +71,9 @@ def find_candidates(b: Buffers, reach: float) -> None:
     """List the partners of every node at the start of the frame; `reach` is the largest contact distance, m."""
     made, views, size = kernels(b.real, b.width), b.views, (b.nodes, b.groups)
     model, state, _ = b.arguments()
-    b.launch(made.place, size, model, state, views["grid_points"])
+    b.launch(load(made.place, b.device), size, model, state, views["grid_points"])
     views["grid"].build(views["grid_points"], reach, groups=views["grid_groups"])
-    b.launch(made.find, size, model, state, views["grid"].id, views["overflow"])
+    b.launch(load(made.find, b.device), size, model, state, views["grid"].id, views["overflow"])
 
 
 @functools.cache
