@@ -174,12 +174,9 @@ class Needs:
         if rule == "fits":
             return int(sum(self._epochs(method) for method, _ in together) * (body.train_end - 1))
         if rule == "fit":
-            # What runs together is the work of `fits`.
-            return (
-                1
-                if (wildcards.method, int(wildcards.seed)) in together
-                else int(self._epochs(wildcards.method) * (body.train_end - 1))
-            )
+            if (wildcards.method, int(wildcards.seed)) in together:
+                return 1  # what runs together is the work of `fits`
+            return int(self._epochs(wildcards.method) * (body.train_end - 1))
         if rule == "transfer":
             return sum(self.sizes.body(name).frames - 1 for name in benchmark.transfers[wildcards.scenario])
         method = benchmark.methods[wildcards.method]

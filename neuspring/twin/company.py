@@ -2,7 +2,7 @@
 
 A fit asks its seat for a frame, or for a frame's adjoint, and waits. When every fit of the company waits, one launch serves all who
 ask for the same. So fits in step (equal horizons) always share, and others still finish. Each fit's numbers are those it has alone,
-bit for bit on a CPU, as long as no list of collision partners is full.
+bit for bit on a CPU.
 """
 
 from __future__ import annotations

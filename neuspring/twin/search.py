@@ -173,12 +173,7 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
     """What becomes of candidates that are rolled out together over the training frames."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
     start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    results = outcomes(twins, hands, start, loss, problem.device)
-    # Where lists of collision partners were full, a candidate is judged by what it finds alone.
-    return [
-        outcomes([twin], hands, start, loss, problem.device)[0] if one.collision_overflow and len(twins) > 1 else one
-        for twin, one in zip(twins, results, strict=True)
-    ]
+    return outcomes(twins, hands, start, loss, problem.device)
 
 
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:

@@ -99,7 +99,7 @@ def test_modules_that_are_imported_by_name_count(copy):
 
 def test_transitive_imports_count(copy):
     before = digest("neuspring.stages.search")
-    edit(copy / "physics" / "springs.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
+    edit(copy / "physics" / "lanes.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
     assert digest("neuspring.stages.search") != before
     assert "neuspring.physics.springs" in provenance.used_modules("neuspring.stages.fit")
 

@@ -115,7 +115,7 @@ def benchmark(tmp_path):
 
 def test_frames_simulated_are_rollouts_or_epochs_times_training_frames(benchmark):
     wanted = needs.Needs(benchmark, "cpu")
-    names = SimpleNamespace(scenario=benchmark.config.scenarios[0], search="uniform", method="baseline")
+    names = SimpleNamespace(seed=0, scenario=benchmark.config.scenarios[0], search="uniform", method="baseline")
     # 8 frames, of which 70 % are for training; frame 0 is given.
     assert [wanted.work(rule, names) for rule in ("search", "fit", "rollout", "score")] == [100 * 5, 30 * 5, 7, 8]
 
@@ -138,7 +138,7 @@ def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_at
     record("fit", "rope", 125, 1000, memory=2000.0).save(tmp_path)
     wanted = needs.Needs(benchmark, "cpu")
     memory, minutes = wanted.memory("fit"), wanted.minutes("fit")
-    rope, cloth = SimpleNamespace(scenario="rope"), SimpleNamespace(scenario="cloth")
+    rope, cloth = SimpleNamespace(seed=0, scenario="rope"), SimpleNamespace(scenario="cloth")
     # 0.125 s per unit: 600 s, times three. A second attempt is not held to what may have been too little.
     assert [memory(rope, attempt) for attempt in (1, 2, 3)] == [3000, 16000, 24000]
     assert [minutes(rope, attempt) for attempt in (1, 2)] == [30, 960]

@@ -10,7 +10,7 @@ from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity, recent_velocity, spread
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.search import candidate, cost
+from neuspring.twin.search import candidate, judge
 from tests.support import small
 
 # The interpolation is smoothed by 1e-6 m; float32 positions of about 1 m carry 6e-8 m, times 30 frames per second, times 4.
@@ -103,7 +103,7 @@ def test_search_and_fit_start_with_the_observed_velocity(kind):
     problem = small.search_problem(seen, simulation=simulation)
     twin = candidate(problem, small.start_values() | {"drag": 0.0})
     loss = FrameLoss.of(seen, config.Losses(acceleration=0.0), "cpu")
-    loss_of_truth, _ = cost(replace(problem, losses=config.Losses(acceleration=0.0)), twin, loss)
+    (truth,) = judge(replace(problem, losses=config.Losses(acceleration=0.0)), [twin], loss)
     fitted = fit(small.fit_problem(seen, twin=twin, simulation=simulation, fit=config.Fit(epochs=1)))
     # Millimeters squared: dashpots of controllers, which the released simulator holds at rest, leave a little.
-    assert (loss_of_truth < 1e-6) == (fitted.best_loss < 1e-6) == (kind == "observed"), (loss_of_truth, fitted.best_loss)
+    assert (truth.cost < 1e-6) == (fitted.best_loss < 1e-6) == (kind == "observed"), (truth.cost, fitted.best_loss)
