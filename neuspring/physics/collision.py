@@ -110,7 +110,12 @@ def kernels(real: Any, width: int) -> Kernels:
                         model.near_lanes[i, p - 1, g] = model.near_lanes[i, p - 1, g] | (1 << q)
                     else:
                         if count == room:
-                            overflow[i, g, q] = overflow[i, g, q] + 1
+                            # The last of the list makes room, for every twin that has it.
+                            lost = 1 << q
+                            if p < room:
+                                lost = model.near_lanes[i, room - 1, g]
+                            for other in range(width):
+                                overflow[i, g, other] = overflow[i, g, other] + ((lost >> other) & 1)
                         else:
                             count = count + 1
                         if p < room:
