@@ -16,7 +16,7 @@ from neuspring.config.perception import Perception
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses, Search
-from neuspring.config.types import Name, Section
+from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
 
@@ -100,6 +100,9 @@ class Config(Section):
     """The study table; its path is relative to the Snakefile."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
+    twins_per_launch: Count | Literal["auto"] = "auto"
+    """Candidates of a search that are simulated in one launch, at most. auto: on CUDA a whole generation, on a CPU as many as save
+    time. Results do not depend on it, bit for bit on a CPU."""
     gpus: Gpus = field(default_factory=Gpus)
     simulation: Simulation = field(default_factory=Simulation)
     losses: Losses = field(default_factory=Losses)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,6 +55,22 @@ def add_device(parser: ArgumentParser) -> None:
     """--device and --threads."""
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N")
     parser.add_argument("--threads", type=int, default=1)
+
+
+def add_twins_per_launch(parser: ArgumentParser) -> None:
+    """--twins-per-launch; see `read_twins_per_launch`."""
+    about = "candidates simulated in one launch, at most: auto, or a number; results do not depend on it"
+    parser.add_argument("--twins-per-launch", default="auto", help=about)
+
+
+def read_twins_per_launch(a: Namespace) -> int:
+    """The value of --twins-per-launch; 0 for auto. Raises InputError."""
+    word = str(a.twins_per_launch)
+    if word == "auto":
+        return 0
+    if not re.fullmatch(r"0*[1-9][0-9]{0,8}", word):
+        raise InputError("--twins-per-launch", "must be auto or an integer of at least 1", repr(word))
+    return int(word)
 
 
 def add_output(parser: ArgumentParser, help: str = "file to write") -> None:

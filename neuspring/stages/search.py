@@ -10,7 +10,7 @@ from neuspring.config.select import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.checkpoint import checkpoint_key
 from neuspring.core.device import resolve_device
-from neuspring.core.errors import NumericalFailure
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_history
 from neuspring.core.records import Recorder
 from neuspring.stages import STAGES
@@ -25,19 +25,33 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
     shared.add_seed(parser)
     shared.add_device(parser)
+    shared.add_twins_per_launch(parser)
     shared.add_output(parser)
 
 
 def command(a: Namespace) -> None:
     """`neuspring search`."""
-    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output)
+    together = shared.read_twins_per_launch(a)
+    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output, together, a.threads)
 
 
-def run(observations_path: Path, settings: Config, clusters: int, seed: int, device: str, output: Path) -> None:
+def run(
+    observations_path: Path,
+    settings: Config,
+    clusters: int,
+    seed: int,
+    device: str,
+    output: Path,
+    together: int = 0,
+    threads: int = 1,
+) -> None:
     """Write twin.npz, trace.parquet (every candidate with its cost and variables), history.parquet, and the record `output`.
 
     A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
+    At most `together` candidates share a launch (0: as many as save time), and `threads` of a CPU simulate: neither is a setting.
     """
+    if threads < 1:
+        raise InputError("--threads", "must be at least 1", threads)
     device = resolve_device(device)
     values = select(settings, STAGES["search"].reads)
     record = Recorder(
@@ -55,6 +69,8 @@ def run(observations_path: Path, settings: Config, clusters: int, seed: int, dev
         settings.released_quirks,
         device,
         clusters,
+        together,
+        threads,
     )
     # The budget is not part of the key: a search with a larger one begins with the same candidates.
     without_budget = {name: value for name, value in values["search"].items() if name != "rollouts"}

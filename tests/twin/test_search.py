@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -501,6 +503,27 @@ def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, thr
     with pytest.raises(MemoryError, match=f"no room in {where}"):
         search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
     assert len(pd.read_parquet(record)) == 11
+
+
+def test_threads_of_a_search_have_none_of_torch(monkeypatch):
+    """`threads` cores are busy, not its square; afterwards torch has what it had."""
+    before, seen = torch.get_num_threads(), set()
+    function = module.judge
+
+    def watched(*arguments):
+        seen.add((threading.get_ident(), torch.get_num_threads()))
+        return function(*arguments)
+
+    monkeypatch.setattr(module, "judge", watched)
+    torch.set_num_threads(3)
+    try:
+        search(small.search_problem(threads=2, together=1), seed=0)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert {count for _, count in seen} == {1}
+    assert len(seen) == 2
+    assert not any(thread.ident in dict(seen) for thread in threading.enumerate())
 
 
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
