@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _threads(words: Sequence[str]) -> str:
-    """Threads of numerical libraries: the value of --threads, before any parser knows it, as they read it when they are imported."""
+    """Threads of numerical libraries: those of --threads, before any parser knows it, as they read it when they are imported."""
     if words[:1] and words[0] in OWN_THREADS:
         return "1"
     known = argparse.ArgumentParser(add_help=False, exit_on_error=False)
