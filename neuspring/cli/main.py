@@ -18,6 +18,8 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.stages import STAGES
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+OWN_THREADS = ("search",)
+"""Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,7 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _threads(words: Sequence[str]) -> str:
-    """The value of --threads, before any parser knows it: numerical libraries read it when they are imported."""
+    """Threads of numerical libraries: those of --threads, before any parser knows it, as they read it when they are imported."""
+    if words[:1] and words[0] in OWN_THREADS:
+        return "1"
     known = argparse.ArgumentParser(add_help=False, exit_on_error=False)
     known.add_argument("--threads", default="1")
     try:

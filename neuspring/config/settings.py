@@ -16,7 +16,7 @@ from neuspring.config.perception import Perception
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses, Search
-from neuspring.config.types import Name, Section
+from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
 
@@ -100,7 +100,7 @@ class Config(Section):
     """The study table; its path is relative to the Snakefile."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
-    twins_per_launch: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    twins_per_launch: Count | Literal["auto"] = "auto"
     """How many candidates of a search, or fits of a scenario, are simulated together at most; auto: as many as pay. 1: one by one.
     It changes no number on a CPU."""
     gpus: Gpus = field(default_factory=Gpus)

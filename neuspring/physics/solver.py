@@ -1,4 +1,4 @@
-"""One frame of simulation, forward and backward, of one twin or of several at once, each a captured graph on the CPU and on CUDA.
+"""One frame of simulation, forward and backward, of one twin or of several at once: a launch on a CPU, a captured graph on CUDA.
 
 Memory is substeps x nodes x twins and does not grow with the number of frames: longer gradients run each frame again from its
 stored start (see `autograd.py`).
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Simulation
+from neuspring.core.device import load
 from neuspring.core.errors import InputError
 from neuspring.physics import collision, contact, frame, position, springs, velocity
 from neuspring.physics.arrays import Buffers, Graphs
@@ -176,7 +177,13 @@ class FrameSolver:
         return values if self.together else values[0]
 
     def _run(self, name: str, launch: Callable[[], None]) -> None:
-        self._graphs.run(name, self._needed(name), launch)
+        if self.buffers.threads:
+            self._graphs.run(name, self._needed(name), launch)
+            return
+        # One launch needs no graph. Warp would record it with whatever other threads of the process launch meanwhile.
+        for kernel in self._needed(name):
+            load(kernel, self.device)
+        launch()
 
     def _needed(self, name: str) -> Iterator[Any]:
         """The kernels of a frame forward or backward."""

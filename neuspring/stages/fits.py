@@ -55,7 +55,7 @@ def options(parser: ArgumentParser) -> None:
 
 def command(a: Namespace) -> None:
     """`neuspring fits`."""
-    run(a.observations, read_rows(a.rows), a.device, a.output, shared.twins_per_launch(a))
+    run(a.observations, read_rows(a.rows), a.device, a.output, shared.read_twins_per_launch(a))
 
 
 def read_rows(text: str) -> list[Row]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,20 +58,19 @@ def add_device(parser: ArgumentParser) -> None:
 
 
 def add_twins_per_launch(parser: ArgumentParser) -> None:
-    """--twins-per-launch; see `twins_per_launch`."""
-    parser.add_argument(
-        "--twins-per-launch", default="auto", help="how many twins are simulated together at most; auto: as many as pay"
-    )
+    """--twins-per-launch; see `read_twins_per_launch`."""
+    about = "twins simulated in one launch, at most: auto, or a number; results do not depend on it"
+    parser.add_argument("--twins-per-launch", default="auto", help=about)
 
 
-def twins_per_launch(a: Namespace) -> int:
-    """How many twins share a launch at most; 0 for `auto`. Raises InputError."""
-    text = str(a.twins_per_launch)
-    if text == "auto":
+def read_twins_per_launch(a: Namespace) -> int:
+    """The value of --twins-per-launch; 0 for auto. Raises InputError."""
+    word = str(a.twins_per_launch)
+    if word == "auto":
         return 0
-    if not text.isdecimal() or int(text) < 1:
-        raise InputError("--twins-per-launch", "must be auto or an integer of at least 1", text)
-    return int(text)
+    if not re.fullmatch(r"0*[1-9][0-9]{0,8}", word):
+        raise InputError("--twins-per-launch", "must be auto or an integer of at least 1", repr(word))
+    return int(word)
 
 
 def add_output(parser: ArgumentParser, help: str = "file to write") -> None:

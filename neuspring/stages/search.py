@@ -10,7 +10,7 @@ from neuspring.config.select import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.checkpoint import checkpoint_key
 from neuspring.core.device import resolve_device
-from neuspring.core.errors import NumericalFailure
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_history
 from neuspring.core.records import Recorder
 from neuspring.stages import STAGES
@@ -31,8 +31,8 @@ def options(parser: ArgumentParser) -> None:
 
 def command(a: Namespace) -> None:
     """`neuspring search`."""
-    settings, together = shared.read_settings(a.settings), shared.twins_per_launch(a)
-    run(a.observations, settings, a.clusters, a.seed, a.device, a.output, together, a.threads)
+    together = shared.read_twins_per_launch(a)
+    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output, together, a.threads)
 
 
 def run(
@@ -50,6 +50,8 @@ def run(
     At most `together` candidates share a launch (0: as many as pay), and `threads` launches run at the same time on a CPU; neither
     changes a number there. A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
     """
+    if threads < 1:
+        raise InputError("--threads", "must be at least 1", threads)
     device = resolve_device(device)
     values = select(settings, STAGES["search"].reads)
     record = Recorder(

@@ -10,8 +10,9 @@ finished one with a larger budget: CMA-ES is replayed with the recorded costs.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -241,24 +242,24 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     budget = problem.search.rollouts
     progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
     start = 0
-    pool = ThreadPoolExecutor(problem.threads)
-    # The last generation may be cut short, so that searches of any population size use exactly the same budget.
-    while start < budget:
-        population = proposals.ask()[: budget - start]
-        stop = start + len(population)
-        if not _replays(trace[start:stop], population, problem.variables):
-            print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
-            trace, saved = trace[:start], start
-            if not start:
-                attempts, earlier = 1, 0.0
-        fresh = population[max(len(trace) - start, 0) :]
-        if fresh:
-            trace += _evaluate(problem, fresh, loss, len(trace), proposals.generation, pool)
-        progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
-        proposals.tell([row["cost"] for row in trace[start:stop]])
-        start = stop
-        if record is not None and len(trace) > saved:
-            _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
+    with _threads(problem.threads) as pool:
+        # The last generation may be cut short, so that searches of any population size use exactly the same budget.
+        while start < budget:
+            population = proposals.ask()[: budget - start]
+            stop = start + len(population)
+            if not _replays(trace[start:stop], population, problem.variables):
+                print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
+                trace, saved = trace[:start], start
+                if not start:
+                    attempts, earlier = 1, 0.0
+            fresh = population[max(len(trace) - start, 0) :]
+            if fresh:
+                trace += _evaluate(problem, fresh, loss, len(trace), proposals.generation, pool)
+            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
+            proposals.tell([row["cost"] for row in trace[start:stop]])
+            start = stop
+            if record is not None and len(trace) > saved:
+                _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
     table = pd.DataFrame(trace[:budget])
     best = table.iloc[int(table["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
@@ -270,6 +271,18 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[Executor]:
+    """Threads that make and simulate candidates. Torch has no others in them, so that `count` cores are busy and no more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(count) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Proposals:
@@ -344,7 +357,9 @@ def _evaluate(
             else:
                 rows[k]["cost"] = min(result.cost, PENALTY)
 
-    list(pool.map(simulate, groups(problem, twins) if twins else []))
+    # Threads would meet in the one stream of a GPU.
+    each = pool.map if problem.device == "cpu" else map
+    list(each(simulate, groups(problem, twins) if twins else []))
     return [row for row, _ in made]
 
 

@@ -7,6 +7,7 @@ on its company, bit for bit on a CPU.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,7 @@ class Outcome:
     """What became of a candidate's rollout."""
 
     cost: float
-    """Mean training loss over frames 1 .. train_end - 1, m^2, acceleration included; not finite if it left the scene."""
+    """Mean training loss over frames 1 .. train_end - 1, m^2, acceleration included; infinite if it left the scene."""
     left: int
     """The frame in which a node left the scene; 0 if none did."""
     collision_overflow: int
@@ -50,7 +51,7 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
         if frame % LOOK_EVERY[device.partition(":")[0]] == 0 and not sums.present:
             break
     return [
-        Outcome(cost, left, overflow)
+        Outcome(math.inf if left else cost, left, overflow)
         for cost, left, overflow in zip(sums.costs(len(hands) - 1), sums.left, solver.overflows, strict=True)
     ]
 

@@ -1,8 +1,8 @@
 """Time and memory of one simulated frame: `python -m tests.benchmarks.bench_frame [--device cuda:0] [--repeats 15]`.
 
 One CPU thread, float32, points drawn in a box with springs from `uniform_topology`. Columns: min and median over repeats, and
-the median per spring and substep. `captured` is what FrameSolver runs (a recorded graph); `launched` issues every kernel again
-from Python. Finishes within two minutes.
+the median per spring and substep. `captured` is what FrameSolver runs (a recorded graph on CUDA, a launch on a CPU);
+`launched` issues every kernel again from Python. Finishes within two minutes.
 """
 
 from __future__ import annotations

@@ -5,10 +5,10 @@ import json
 import pytest
 
 from neuspring import config
-from neuspring.cli.main import main
+from neuspring.cli.main import _threads, main
 from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
 from tests.support.phystwin_case import write_case
@@ -112,3 +112,38 @@ def test_sync_reports_a_damaged_record(tmp_path, capsys):
 def test_a_device_that_is_not_there_is_an_error_not_a_fallback(device):
     with pytest.raises(InputError, match="device"):
         resolve_device(device)
+
+
+@pytest.mark.parametrize(
+    ("options", "together", "threads"),
+    [([], 0, 1), (["--twins-per-launch", "auto"], 0, 1), (["--twins-per-launch", "12", "--threads", "3"], 12, 3)],
+)
+def test_a_search_knows_how_many_candidates_and_threads_it_may_take(tmp_path, monkeypatch, options, together, threads):
+    asked = []
+
+    def stop(problem, *_, **__):
+        asked.append((problem.together, problem.threads))
+        raise NumericalFailure("stopped")
+
+    monkeypatch.setattr("neuspring.stages.search.search", stop)
+    arguments = ["--observations", str(observed(tmp_path)), "--device", "cpu", "--output", str(tmp_path / "search.json")]
+    assert main(["search", *arguments, *options]) == 0
+    assert asked == [(together, threads)]
+
+
+@pytest.mark.parametrize("word", ["0", "-1", "many", "1.5", "", "1e3", "Auto"])
+def test_a_number_of_twins_per_launch_that_cannot_be_is_bad_input(word, tmp_path, capsys):
+    assert main(["search", "--observations", "x.npz", f"--twins-per-launch={word}", "--output", str(tmp_path / "y.json")]) == 2
+    assert f"--twins-per-launch: must be auto or an integer of at least 1; received {word!r}" in capsys.readouterr().err
+
+
+def test_a_search_without_threads_is_bad_input(tmp_path, capsys):
+    assert main(["search", "--observations", "x.npz", "--threads", "0", "--output", str(tmp_path / "y.json")]) == 2
+    assert "--threads: must be at least 1; received 0" in capsys.readouterr().err
+
+
+def test_libraries_take_the_threads_that_a_command_does_not_take_itself():
+    """Else every thread of a search would start as many again."""
+    assert _threads(["fit", "--threads", "4"]) == "4"
+    assert _threads(["search", "--threads", "4"]) == "1"
+    assert _threads(["fit"]) == _threads([]) == "1"

@@ -126,6 +126,8 @@ MISTAKES = {
         "***@host",
     ),
     "device": ("device: gpu", "device", "received 'gpu'"),
+    "no twins in a launch": ("twins_per_launch: 0", "twins_per_launch", "received 0"),
+    "a word for twins in a launch": ("twins_per_launch: all", "twins_per_launch", "'auto'", "received 'all'"),
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
     "negative seed": ("seeds: [-1]", "seeds.0", "received -1"),
     "a mapping for a list": ("seeds: {a: 1}", "seeds"),

@@ -29,3 +29,11 @@ def test_a_profile_plans_every_job(project, profile):
 def test_jobs_of_a_cluster_ask_for_gpus_that_this_machine_may_lack(project, profile):
     # search, fit and two of rollout.
     assert dry_run(project, profile, "cuda").count("gpu=1") == 4
+
+
+def test_a_search_is_told_how_many_candidates_and_threads_it_may_take(project):
+    """As config/README.md and workflow/README.md say."""
+    changes = {"twins_per_launch": 3}
+    output = run(project, changes, "--dry-run", "--printshellcmds", "--set-threads", "search=2", "--until", "search")
+    [command] = [line for line in output.splitlines() if "-m neuspring search" in line]
+    assert " --twins-per-launch 3 " in command and " --threads 2 " in command

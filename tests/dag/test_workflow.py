@@ -58,6 +58,8 @@ def test_the_search_is_shared_and_nothing_reruns_without_a_change(tiny_run):
     project, output = tiny_run
     assert jobs_in(output)["search"] == 1
     assert plan(project) == {}
+    # How candidates are simulated changes no result; the report states it, as the whole configuration.
+    assert plan(project, {"twins_per_launch": 3}, "--set-threads", "search=2") == {"report": 1, "all": 1}
 
 
 def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):

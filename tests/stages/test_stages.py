@@ -158,6 +158,23 @@ def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     assert StageRecord.load(tmp_path / "search.json").attempts == 1
 
 
+def test_how_candidates_are_simulated_is_no_setting(finished, tmp_path):
+    """Neither the record nor the key of what is continued knows it."""
+    seen = finished[0] / "small" / "observations.npz"
+    records, traces = [], []
+    for name, how in (("one", {"together": 1}), ("many", {"together": 0, "threads": 2})):
+        search.run(seen, SETTINGS, 1, 0, "cpu", tmp_path / name / "search.json", **how)
+        records.append(StageRecord.load(tmp_path / name / "search.json"))
+        traces.append(pd.read_parquet(tmp_path / name / "trace.parquet"))
+    assert records[0].settings == records[1].settings
+    assert records[0].facts == records[1].facts
+    assert records[0].files["twin"] == records[1].files["twin"]
+    assert traces[0].attrs["key"] == traces[1].attrs["key"]
+    larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
+    search.run(seen, larger, 1, 0, "cpu", tmp_path / "one" / "search.json", together=5)
+    assert StageRecord.load(tmp_path / "one" / "search.json").attempts == 2
+
+
 def test_the_same_results_have_the_same_key(finished, tmp_path):
     _, run, _ = finished
     again = run_all(tmp_path)

@@ -1,20 +1,27 @@
 """The zero-order stage: coding of variables, budget, failure handling, and exact continuation."""
 
+import itertools
 import re
+import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.physics import stability
+from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import search as module
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.search import PENALTY, SearchProblem, candidate, judge, search
+from neuspring.twin.search import PENALTY, SearchProblem, candidate, groups, judge, search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import small
@@ -413,3 +420,198 @@ def test_an_unstable_candidate_is_penalised_not_fatal():
     penalised = result.trace[result.trace["cost"] == PENALTY]
     assert 0 < len(penalised) < len(result.trace)
     assert penalised["reason"].str.startswith("unstable").all()
+
+
+# Company --------------------------------------------------------------------------------------------------------------
+
+
+def crowded(**changes: object) -> SearchProblem:
+    """The small search with self-collision."""
+    seen = small.observations()
+    return small.search_problem(replace(seen, scenario=replace(seen.scenario, self_collision=True)), **changes)
+
+
+@pytest.mark.parametrize("make", [small.search_problem, crowded], ids=["free", "self-collision"])
+@pytest.mark.parametrize("clusters", [1, 3])
+def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(make, clusters):
+    """The slow path, one candidate after the other, is the specification."""
+    slow = search(make(clusters=clusters, together=1), seed=3)
+    assert slow.trace["substeps"].nunique() > 10
+    for how in ({}, {"together": 4}, {"together": 16}, {"threads": 2}, {"together": 1, "threads": 3}):
+        fast = search(make(clusters=clusters, **how), seed=3)
+        assert_same_trace(fast.trace, slow.trace)
+        assert (fast.values, fast.cost) == (slow.values, slow.cost)
+        np.testing.assert_array_equal(fast.twin.topology.springs, slow.twin.topology.springs)
+
+
+def test_the_search_is_the_same_where_lists_of_partners_are_full():
+    """Then a candidate is judged by what it finds alone."""
+    settings = config.Simulation(collision_capacity=6)
+    slow, fast = (search(crowded(simulation=settings, together=together), seed=3).trace for together in (1, 16))
+    assert_same_trace(fast, slow)
+    assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
+
+
+def test_threads_that_simulate_at_the_same_time_do_not_meet():
+    """Many short simulations by more threads than there are cores, again and again."""
+    slow = search(crowded(together=1), seed=0).trace
+    for _ in range(5):
+        assert_same_trace(search(crowded(together=1, threads=6), seed=0).trace, slow)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [({"together": 1}, {"together": 16}), ({"threads": 2}, {"together": 1}), ({}, {"together": 4, "threads": 2})],
+)
+@pytest.mark.parametrize("where", ["_made", "judge"])
+def test_a_killed_search_continues_with_other_company(tmp_path, monkeypatch, first, second, where):
+    """Killed in the second generation, while its candidates are made or simulated."""
+    record = tmp_path / "trace.parquet"
+    function, calls = getattr(module, where), 0
+
+    def dying(*arguments):
+        nonlocal calls
+        calls += 1
+        if len(pd.read_parquet(record)) if record.exists() else 0:
+            raise KeyboardInterrupt
+        return function(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, where, dying)
+        with pytest.raises(KeyboardInterrupt):
+            search(small.search_problem(**first), 5, record=record, key="k")
+    assert calls > 1
+    assert len(pd.read_parquet(record)) == 11
+    continued = search(small.search_problem(**second), seed=5, record=record, key="k")
+    assert continued.attempts == 2
+    assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("where", ["_made", "judge"])
+def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, threads):
+    """And the record has whole generations alone."""
+    record = tmp_path / "trace.parquet"
+    function = getattr(module, where)
+
+    def broken(*arguments):
+        if record.exists():
+            raise MemoryError(f"no room in {where}")
+        return function(*arguments)
+
+    monkeypatch.setattr(module, where, broken)
+    with pytest.raises(MemoryError, match=f"no room in {where}"):
+        search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
+    assert len(pd.read_parquet(record)) == 11
+
+
+def test_threads_of_a_search_have_none_of_torch(monkeypatch):
+    """`threads` cores are busy, not its square; afterwards torch has what it had."""
+    before, seen = torch.get_num_threads(), set()
+    function = module.judge
+
+    def watched(*arguments):
+        seen.add((threading.get_ident(), torch.get_num_threads()))
+        return function(*arguments)
+
+    monkeypatch.setattr(module, "judge", watched)
+    torch.set_num_threads(3)
+    try:
+        search(small.search_problem(threads=2, together=1), seed=0)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert {count for _, count in seen} == {1}
+    assert len(seen) == 2
+    assert not any(thread.ident in dict(seen) for thread in threading.enumerate())
+
+
+def test_candidates_of_every_fate_in_one_generation(monkeypatch):
+    """Some diverge, some are unstable, some have isolated nodes, and the others are judged as if they were alone."""
+    # About the spacing of the nodes.
+    start = config.SearchStart(object_radius=0.0145, stiffness=3e4)
+    settings = config.Search(rollouts=22, isolated_nodes="penalise", start=start)
+    chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
+    check = stability.check
+
+    def lenient(twin):
+        # Nothing that passes the check diverges here, so candidates with little drag are let through.
+        if twin.material.drag > 3.0:
+            check(twin)
+
+    monkeypatch.setattr(stability, "check", lenient)
+    slow = search(replace(chosen, together=1), seed=2).trace
+    assert_same_trace(search(chosen, seed=2).trace, slow)
+    assert_same_trace(search(replace(chosen, threads=2), seed=2).trace, slow)
+    kinds = {"left": "left the scene in frame", "unstable": "unstable: ", "isolated": "have no spring", "fine": "^$"}
+    for kind, pattern in kinds.items():
+        rows = slow[slow["reason"].str.contains(pattern)]
+        assert 0 in set(rows["generation"]), kind
+        assert ((rows["cost"] == PENALTY) == (kind != "fine")).all()
+        assert ((rows["substeps"] == 60) == (kind in ("left", "fine"))).all()
+
+
+def stand_in(substeps: int, springs: int) -> Any:
+    """What `groups` asks of a twin."""
+    return SimpleNamespace(simulation=SimpleNamespace(substeps=substeps), topology=SimpleNamespace(springs=range(springs)))
+
+
+def time_of(members: list[int], sizes: list[tuple[int, int]]) -> float:
+    """Expected time of a group: lanes wait for the most substeps, and work on at least the most springs."""
+    substeps, springs = zip(*(sizes[k] for k in members), strict=True)
+    return COST[width_for(len(members))] * max(substeps) * max(springs)
+
+
+SIZES = st.lists(st.tuples(st.integers(1, 2000), st.integers(1, 40_000)), min_size=1, max_size=24)
+"""Substeps and springs of candidates."""
+
+
+@given(SIZES, st.integers(0, 20), st.integers(1, 5))
+def test_groups_are_a_partition_that_never_takes_longer_than_one_by_one(sizes, together, threads):
+    problem = small.search_problem(together=together, threads=threads)
+    twins = [stand_in(*size) for size in sizes]
+    made = groups(problem, twins)
+    assert sorted(k for members in made for k in members) == list(range(len(twins)))
+    assert all(1 <= len(members) <= min(together or WIDTHS[-1], WIDTHS[-1]) for members in made)
+    assert made == groups(problem, twins)
+    # Those with the most substeps begin.
+    slowest = [max(sizes[k][0] for k in members) for members in made]
+    assert slowest == sorted(slowest, reverse=True)
+
+    def expected(parts: list[list[int]]) -> float:
+        times = [time_of(members, sizes) for members in parts]
+        return max(sum(times) / threads, *times)
+
+    assert expected(made) <= expected([[k] for k in range(len(twins))]) * (1 + CODING)
+
+
+@given(SIZES.filter(lambda sizes: len(sizes) <= 7), st.integers(0, 5))
+def test_no_other_split_takes_one_thread_less_time(sizes, together):
+    """All splits of the candidates in the order of their substeps."""
+    made = groups(small.search_problem(together=together), [stand_in(*size) for size in sizes])
+    order, most = [k for members in made for k in members], together or len(sizes)
+    splits = []
+    for cuts in itertools.product([False, True], repeat=len(sizes) - 1):
+        ends = [0, *(place for place, cut in enumerate(cuts, start=1) if cut), len(sizes)]
+        splits.append([order[first:last] for first, last in itertools.pairwise(ends)])
+    times = [sum(time_of(part, sizes) for part in parts) for parts in splits if max(map(len, parts)) <= most]
+    assert sum(time_of(members, sizes) for members in made) == pytest.approx(min(times), rel=CODING)
+
+
+def test_alike_candidates_share_lanes_and_others_do_not():
+    """Sixteen of one kind fill the lanes; one with a hundred times the substeps is simulated by itself."""
+    many = [(20, 1000)] * 8 + [(2000, 1000)] + [(20, 1000)] * 8
+    problem = small.search_problem()
+    assert groups(problem, [stand_in(*size) for size in many])[0] == [8]
+    assert all(len(members) > 1 for members in groups(problem, [stand_in(*size) for size in many])[1:])
+    # Two threads share the work.
+    alike = groups(replace(problem, threads=2), [stand_in(20, 1000)] * 16)
+    assert sorted(map(len, alike)) == [8, 8]
+
+
+@pytest.mark.parametrize(("together", "sizes"), [(0, [11]), (4, [4, 4, 3]), (1, [1] * 11), (20, [11])])
+def test_cuda_takes_as_many_as_it_is_told(together, sizes):
+    problem = small.search_problem(device="cuda:0", together=together)
+    made = groups(problem, [stand_in(20 + k, 1000) for k in range(11)])
+    assert [len(members) for members in made] == sizes
+    assert [k for members in made for k in members] == list(range(11))

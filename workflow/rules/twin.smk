@@ -21,7 +21,8 @@ rule search:
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
-            f" --clusters {{params.clusters}} --seed {{wildcards.seed}} --twins-per-launch {CONFIG.twins_per_launch} --output {{output:q}}"
+            " --clusters {params.clusters} --seed {wildcards.seed}"
+            f" --twins-per-launch {CONFIG.twins_per_launch} --output {{output:q}}"
         )
 
 

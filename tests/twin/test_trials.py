@@ -1,0 +1,304 @@
+"""Candidates that are simulated together: each as if it were alone, and judged by the torch losses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Topology, Twin
+from neuspring.physics import population
+from neuspring.physics.autograd import solver_for
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.rollout import FAR, Diverged, frames
+from neuspring.twin.search import SearchProblem, candidate, judge
+from neuspring.twin.trials import LossSums, Outcome
+from tests.support import small
+
+FLOAT32_SUMS = 1e-5
+"""Relative: float32 sums of up to 372 terms, in another order."""
+CANDIDATES = (
+    {"object_radius": 0.03, "stiffness": 2e3, "ground_friction": 0.1},
+    {"object_radius": 0.045, "stiffness": 1.2e4, "drag": 6.0, "contact_distance": 0.03},
+    {
+        "object_radius": 0.04,
+        "object_neighbours": 16.0,
+        "stiffness": 3e4,
+        "dashpot": 60.0,
+        "ground_elasticity": 0.9,
+        "contact_elasticity": 0.2,
+    },
+    {"object_neighbours": 10.0, "controller_neighbours": 12.0, "controller_radius": 0.03, "contact_distance": 0.012},
+    {"object_radius": 0.02, "stiffness": 9e4, "contact_distance": 0.0135, "contact_elasticity": 0.1},
+    {"stiffness": 6e2, "drag": 15.0, "object_neighbours": 14.0},
+)
+
+
+def colliding(seen: Observations, **simulation: object) -> SearchProblem:
+    """The problem with self-collision."""
+    crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
+    return small.search_problem(crowded, simulation=config.Simulation(**simulation))  # type: ignore[arg-type]
+
+
+def candidates(problem: SearchProblem, count: int = len(CANDIDATES)) -> list[Twin]:
+    """Twins that differ in their springs, substeps and materials."""
+    return [candidate(problem, small.start_values() | CANDIDATES[k % len(CANDIDATES)]) for k in range(count)]
+
+
+def unsteady(twin: Twin, part: float = 0.25) -> Twin:
+    """The twin with too few substeps."""
+    return replace(twin, simulation=replace(twin.simulation, substeps=max(int(twin.simulation.substeps * part), 1)))
+
+
+def loss_of(problem: SearchProblem, **changes: object) -> FrameLoss:
+    return replace(FrameLoss.of(problem.observations, problem.losses, "cpu"), **changes)  # type: ignore[arg-type]
+
+
+def hands_of(problem: SearchProblem) -> torch.Tensor:
+    return torch.tensor(problem.observations.controller_points)[: problem.observations.scenario.train_end]
+
+
+def alone(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
+    """What becomes of each candidate in a launch of its own."""
+    return [judge(problem, [twin], loss)[0] for twin in twins]
+
+
+def by_torch(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> float:
+    """The cost by the losses of the fit, over the rollout of a solver of the twin's own."""
+    states = frames(twin, solver_for(twin, differentiable=False), hands_of(problem), problem.velocity)
+    return loss.of_rollout(states, torch.tensor(problem.velocity, dtype=torch.float32))
+
+
+# Company --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("crowded", [False, True], ids=["free", "self-collision"])
+@pytest.mark.parametrize("count", [2, 6, 11])
+def test_candidates_fare_together_as_alone(count, crowded):
+    """In 4, 8 and 16 lanes, with lanes to spare."""
+    problem = colliding(small.observations()) if crowded else small.search_problem()
+    twins, loss = candidates(problem, count), loss_of(problem)
+    assert len({t.topology.springs.tobytes() for t in twins}) == len({t.simulation.substeps for t in twins}) == min(count, 6)
+    together = judge(problem, twins, loss)
+    assert together == alone(problem, twins, loss)
+    assert len({outcome.cost for outcome in together}) == min(count, 6)
+
+
+def test_the_crowded_candidates_do_collide():
+    """Else the test above would say nothing of self-collision."""
+    free, crowded = small.search_problem(), colliding(small.observations())
+    costs = [[outcome.cost for outcome in judge(p, candidates(p), loss_of(p))] for p in (free, crowded)]
+    assert all(without != with_it for without, with_it in zip(*costs, strict=True))
+
+
+@pytest.mark.parametrize("crowded", [False, True], ids=["free", "self-collision"])
+def test_candidates_that_diverge_do_not_touch_the_others(crowded):
+    problem = colliding(small.observations()) if crowded else small.search_problem()
+    steady, loss = candidates(problem), loss_of(problem)
+    twins = [unsteady(steady[0]), steady[1], unsteady(steady[2], 0.1), *steady[3:], unsteady(steady[4], 0.05)]
+    together = judge(problem, twins, loss)
+    assert together == alone(problem, twins, loss)
+    assert [bool(outcome.left) for outcome in together] == [True, False, True, False, False, False, True]
+    assert all(np.isfinite(outcome.cost) == (not outcome.left) for outcome in together)
+
+
+@pytest.mark.parametrize("capacity", [1, 4, 7])
+def test_overflow_is_that_of_a_candidate_alone(capacity):
+    """Full lists: of every candidate, of some, of few nodes."""
+    problem = colliding(small.observations(), collision_capacity=capacity)
+    twins, loss = candidates(problem), loss_of(problem)
+    together = judge(problem, twins, loss)
+    assert together == alone(problem, twins, loss)
+    assert any(outcome.collision_overflow for outcome in together)
+
+
+def fan(partners: Sequence[int], nodes: int, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places [N, 3] and velocities: node 0 in the middle, `partners` near it and coming, all others far from each other."""
+    places = np.arange(1, nodes + 1)[:, None] * [0.0, 10 * distance, 0.0]
+    places[0] = 0.0
+    angles = np.linspace(0, 2 * np.pi, len(partners), endpoint=False)
+    places[list(partners)] = 0.8 * distance * np.stack([np.cos(angles), 0.3 * np.ones_like(angles), np.sin(angles)], axis=1)
+    velocities = np.zeros_like(places)
+    velocities[list(partners)] = -places[list(partners)]
+    return places, velocities
+
+
+def test_a_shared_list_that_is_full_says_so_of_every_twin_that_lost_a_partner():
+    """Two twins fill the list of node 0, a third has partners before theirs; alone each has room."""
+    capacity, distance = 2, 0.02
+    problem = colliding(small.observations(), collision_capacity=capacity)
+    twin = candidate(problem, small.start_values() | {"contact_distance": distance})
+    twin = replace(twin, simulation=replace(twin.simulation, substeps=1, frame_time=1e-6, gravity=0.0))
+    nodes = len(twin.topology.nodes)
+    each = [fan(partners, nodes, distance) for partners in ([7, 8], [9, 10], [3, 4])]
+    places, velocities = (torch.tensor(np.stack(values), dtype=torch.float32) for values in zip(*each, strict=True))
+    hands = torch.tensor(twin.topology.controllers)
+
+    def after(members: list[int]) -> tuple[np.ndarray, list[int]]:
+        """Velocities of node 0 after a frame, and overflows."""
+        twins = [replace(twin, material=replace(twin.material, stiffness=0 * twin.material.stiffness, drag=0.0)) for _ in members]
+        twins = [replace(one, material=replace(one.material, dashpot=0 * one.material.dashpot)) for one in twins]
+        solver = population.solver_of(twins, differentiable=False)
+        still = hands.expand(len(members), -1, -1)
+        _, v = solver.forward(places[members], velocities[members], still, still)
+        return v[:, 0].numpy(), solver.overflows
+
+    speeds, overflows = after([0, 1, 2])
+    for k, (speed, overflow) in enumerate(zip(speeds, overflows, strict=True)):
+        own, own_overflow = after([k])
+        assert own_overflow == [0] and own[0].any()
+        assert overflow or np.array_equal(speed, own[0])
+    assert sum(overflows) > 0
+
+
+# Losses ---------------------------------------------------------------------------------------------------------------
+
+
+def hidden() -> Observations:
+    """Points that come and go, and motion that is valid for some of them."""
+    seen, rng = small.observations(), np.random.default_rng(3)
+    shape = seen.object_visibility.shape
+    visible = rng.random(shape) < 0.6
+    visible[0] = True
+    return replace(seen, object_visibility=visible, object_motion_valid=rng.random(shape) < 0.3)
+
+
+def dark() -> Observations:
+    """Nothing seen in frame 2, and no motion valid from 1 to 2 and from 3 to 4."""
+    seen = hidden()
+    visible, valid = seen.object_visibility.copy(), seen.object_motion_valid.copy()
+    visible[2] = valid[1] = valid[3] = False
+    return replace(seen, object_visibility=visible, object_motion_valid=valid)
+
+
+def astray() -> Observations:
+    """Tracks more than a meter off, where the track loss is linear."""
+    seen = small.observations()
+    points = seen.object_points.copy()
+    points[2:, ::3] += np.float32(2.5)
+    return replace(seen, object_points=points)
+
+
+SCENES = {"plain": small.observations, "hidden": hidden, "dark": dark, "astray": astray}
+
+
+@pytest.mark.parametrize("frozen", [False, True], ids=["own counts", "frozen counts"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_cost_is_that_of_the_torch_losses(scene, frozen):
+    problem = small.search_problem(SCENES[scene](), losses=config.Losses(chamfer=1.3, track=0.7, acceleration=0.2))
+    twins, loss = candidates(problem, 3), loss_of(problem, frozen_counts=frozen)
+    costs = [outcome.cost for outcome in judge(problem, twins, loss)]
+    assert costs == pytest.approx([by_torch(problem, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
+
+
+@pytest.mark.parametrize("term", ["chamfer", "track", "acceleration"])
+def test_each_term_is_that_of_the_torch_losses(term):
+    """A term that is small beside the others is compared by itself."""
+    problem = small.search_problem(hidden(), losses=config.Losses(**{"chamfer": 0.0, "track": 0.0, "acceleration": 0.0, term: 1.0}))
+    twins, loss = candidates(problem, 3), loss_of(problem)
+    costs = [outcome.cost for outcome in judge(problem, twins, loss)]
+    assert min(costs) > 0
+    assert costs == pytest.approx([by_torch(problem, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
+
+
+def test_the_velocity_at_the_start_counts():
+    """It moves the nodes, and the first change of velocity begins with it."""
+    rest = small.search_problem()
+    thrown = small.search_problem()
+    object.__setattr__(thrown, "velocity", np.random.default_rng(0).normal(0, 2.0, rest.velocity.shape).astype(np.float32))
+    twins, loss = candidates(rest, 3), loss_of(rest)
+    costs = [outcome.cost for outcome in judge(thrown, twins, loss)]
+    assert costs == pytest.approx([by_torch(thrown, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
+    assert costs != pytest.approx([by_torch(rest, twin, loss) for twin in twins], rel=0.01)
+
+
+@pytest.mark.parametrize("part", [0.5, 0.25, 0.1])
+def test_divergence_names_the_frame_that_the_rollout_names(part):
+    problem = small.search_problem()
+    twins, loss = [unsteady(twin, part) for twin in candidates(problem)], loss_of(problem)
+    named = []
+    for twin in twins:
+        try:
+            by_torch(problem, twin, loss)
+            named.append(0)
+        except Diverged as end:
+            named.append(end.frame)
+    assert [outcome.left for outcome in judge(problem, twins, loss)] == named
+    assert any(named)
+
+
+def test_a_node_that_comes_back_has_left():
+    """The first frame stays noted, of each twin its own."""
+    problem = small.search_problem()
+    twins = candidates(problem, 3)
+    solver = population.solver_of(twins, differentiable=False)
+    sums = LossSums(solver, loss_of(problem), torch.tensor(problem.velocity))
+    near = torch.tensor(twins[0].topology.nodes).expand(len(twins), -1, -1)
+    for frame, gone in enumerate([(), (1,), (0, 1), ()], start=1):
+        places = near.clone()
+        for twin in gone:
+            places[twin, 5 + twin, twin] = -2 * FAR
+        solver.start(places, 0 * places)
+        sums.add(frame)
+    assert sums.left == [3, 2, 0]
+    assert sums.present
+
+
+# Solvers of several twins ---------------------------------------------------------------------------------------------
+
+
+@st.composite
+def graphs(draw: st.DrawFn) -> list[np.ndarray]:
+    """Springs of one to four topologies of five nodes and two controllers; each pair once, ends in any order."""
+    pairs = [(i, j) for i in range(7) for j in range(i + 1, 7) if i < 5]
+    topologies = []
+    for _ in range(draw(st.integers(1, 4))):
+        own = draw(st.lists(st.sampled_from(pairs), min_size=1, unique=True))
+        own.sort(key=lambda pair: pair[1] >= 5)  # springs of the object come first
+        turned = draw(st.lists(st.booleans(), min_size=len(own), max_size=len(own)))
+        topologies.append(np.array([pair[::-1] if turn else pair for pair, turn in zip(own, turned, strict=True)], np.int32))
+    return topologies
+
+
+def topology(springs: np.ndarray) -> Topology:
+    """Five nodes and two controllers on a line."""
+    points = np.arange(7)[:, None] * np.float32([0.01, 0, 0])
+    rest = np.full(len(springs), 0.01)
+    return Topology(nodes=points[:5], controllers=points[5:], springs=springs, rest_lengths=rest, labels=np.zeros(5, np.int32))
+
+
+@given(graphs(), st.randoms(use_true_random=False))
+def test_the_union_has_every_spring_once_and_knows_where(each, random):
+    pairs, places = population.union([topology(springs) for springs in each])
+    ends = {frozenset(pair) for pair in pairs.tolist()}
+    assert len(ends) == len(pairs)
+    assert ends == {frozenset(pair) for springs in each for pair in springs.tolist()}
+    for springs, place in zip(each, places, strict=True):
+        np.testing.assert_array_equal(np.sort(pairs[place], axis=1), np.sort(springs, axis=1))
+    # Neither the order of springs, nor their direction, nor that of the topologies decides the union.
+    others = []
+    for springs in random.sample(each, len(each)):
+        turned = [pair[::-1] if random.random() < 0.5 else pair for pair in random.sample(springs.tolist(), len(springs))]
+        others.append(topology(np.array(sorted(turned, key=lambda pair: max(pair) >= 5), np.int32)))
+    again, _ = population.union(others)
+    np.testing.assert_array_equal(again, pairs)
+
+
+@given(graphs())
+def test_springs_that_a_twin_lacks_have_no_strength_in_it(each):
+    """Its own stand where the union says."""
+    rng = np.random.default_rng(0)
+    pairs, places = population.union([topology(springs) for springs in each])
+    problem = small.search_problem()
+    packed = population.packed(candidate(problem, small.start_values()))
+    own = [packed._replace(springs=torch.tensor(rng.uniform(1.0, 2.0, (len(springs), 3)))) for springs in each]
+    stacked = population.stacked(own, places, len(pairs)).springs
+    for parameters, springs, got in zip(own, each, stacked, strict=True):
+        values = {frozenset(pair): row for pair, row in zip(springs.tolist(), parameters.springs.tolist(), strict=True)}
+        assert got.tolist() == [values.get(frozenset(pair), [0.0, 0.0, 0.0]) for pair in pairs.tolist()]
