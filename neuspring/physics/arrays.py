@@ -58,9 +58,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         contact_e: of_twin
         contact_mu: of_twin
         distance: of_twin
-        stiffness: numbers
-        inverse_length: numbers
-        dashpot: numbers
+        springs: vectors
         near: lists
         near_lanes: lists
         near_count: table
@@ -82,9 +80,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         moving: vectors
         after: vectors
         force: slots
-        stiffness: numbers
-        inverse_length: numbers
-        dashpot: numbers
+        springs: vectors
         decay: numbers
         ground_e: numbers
         ground_mu: numbers
@@ -171,10 +167,10 @@ class Buffers:
         lanes_last = padded.reshape(self.groups, self.width, values.shape[1], 3).permute(2, 0, 3, 1)
         target[: values.shape[1]].copy_(lanes_last)
 
-    def get_vectors(self, name: str, slot: int | None = None) -> torch.Tensor:
-        """The nodes of an array as [B, N, 3]."""
-        source = (self.tensors[name] if slot is None else self.tensors[name][slot])[: self.nodes]
-        twins = source.permute(1, 3, 0, 2).reshape(self.groups * self.width, self.nodes, 3)
+    def get_vectors(self, name: str, slot: int | None = None, count: int | None = None) -> torch.Tensor:
+        """The first `count` Vectors of an array (None: all), of one slot where it has slots, as [B, P, 3]."""
+        source = (self.tensors[name] if slot is None else self.tensors[name][slot])[:count]
+        twins = source.permute(1, 3, 0, 2).reshape(self.groups * self.width, len(source), 3)
         return twins[: self.twins].clone()
 
     def set_numbers(self, name: str, values: torch.Tensor) -> None:

@@ -107,7 +107,9 @@ class FrameSolver:
         """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move linearly from begin to end [C, 3]."""
         self.start(x, v)
         self.advance(begin, end)
-        return self._one(self.buffers.get_vectors("x", self.last)), self._one(self.buffers.get_vectors("v", self.last))
+        return self._one(self.buffers.get_vectors("x", self.last, self.nodes)), self._one(
+            self.buffers.get_vectors("v", self.last, self.nodes)
+        )
 
     def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
         """Put the state at the start of a frame into the buffers."""
@@ -149,7 +151,7 @@ class FrameSolver:
         b.set_vectors("adj_x", self._stacked(adj_x))
         b.set_vectors("adj_v", self._stacked(adj_v))
         self._run("backward", self.launch_backward)
-        state = (b.get_vectors("adj_x"), b.get_vectors("adj_v"))
+        state = (b.get_vectors("adj_x", count=self.nodes), b.get_vectors("adj_v", count=self.nodes))
         own = (springs.gradient(b), velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
         return *map(self._one, (*state, *own)), None
 

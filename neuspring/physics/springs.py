@@ -26,9 +26,9 @@ class Functions(NamedTuple):
     """Functions of this file for one scalar type and width."""
 
     force: Any
-    """(offset, relative velocity, Y, 1 / l0, gamma) -> the force on the first end."""
+    """(offset, relative velocity, parameters) -> the force on the first end. Rows of the parameters: Y, 1 / l0, gamma."""
     force_adjoint: Any
-    """(the same, c) -> adjoints of c . f: of offset, of relative velocity, of Y, (1/Y) of 1 / l0, of gamma."""
+    """(the same, c) -> adjoints of c . f: of offset, of relative velocity, of the parameters (second row over Y)."""
     add_row: Any
     add_row_adjoint: Any
     gathered: Any
@@ -81,24 +81,21 @@ def allocate(b: Buffers, pairs: np.ndarray) -> None:
     """Springs between `pairs` [S, 2] of points."""
     graph = Graph.of(pairs, b.nodes)
     b.add_integers(**{name: getattr(graph, name) for name in Graph._fields})
-    b.add_numbers(stiffness=len(pairs), inverse_length=len(pairs), dashpot=len(pairs))
-    b.add_numbers(adj_stiffness=len(pairs), adj_inverse_length=len(pairs), adj_dashpot=len(pairs))
+    b.add_vectors(springs=(len(pairs),), adj_springs=(len(pairs),))
 
 
 def fill(b: Buffers, packed: torch.Tensor) -> None:
     """Take parameters [B, S, 3]."""
-    ordered = packed[:, b.indices["order"]]
-    for column, name in enumerate(("stiffness", "inverse_length", "dashpot")):
-        b.set_numbers(name, ordered[..., column])
+    b.set_vectors("springs", packed[:, b.indices["order"]])
 
 
 def gradient(b: Buffers) -> torch.Tensor:
     """dL/d(packed parameters) [B, S, 3]."""
-    columns = [b.get_numbers(f"adj_{name}") for name in ("stiffness", "inverse_length", "dashpot")]
+    ordered, own = b.get_vectors("adj_springs"), b.get_vectors("springs")
     # The kernels leave the factor Y of dL/d(1 / l0) to the end.
-    columns[1] = columns[1] * b.get_numbers("stiffness")
-    result = torch.empty((*columns[0].shape, 3), dtype=b.dtype, device=b.device)
-    result[:, b.indices["order"]] = torch.stack(columns, dim=-1)
+    ordered[..., 1] *= own[..., 0]
+    result = torch.empty_like(ordered)
+    result[:, b.indices["order"]] = ordered
     return result
 
 
@@ -112,28 +109,32 @@ def functions(real: Any, width: int) -> Functions:
     one = wp.constant(Number(*[real(1.0)] * width))
 
     @wp.func
-    def force(offset: Vector, relative: Vector, stiffness: Number, inverse_length: Number, dashpot: Number) -> Vector:
-        length = root(dot(offset, offset))
-        d = divided(offset, floored(length))
-        strain = wp.cw_mul(length, inverse_length) - one
-        return scaled(d, wp.cw_mul(stiffness, strain) + wp.cw_mul(dashpot, dot(relative, d)))
+    def place(index: int) -> int:
+        """An index that is plainly not negative: Warp looks at the sign of every other one, a sixth of a spring's time."""
+        return index & 0x7FFFFFFF
 
     @wp.func
-    def force_adjoint(offset: Vector, relative: Vector, stiffness: Number, inverse_length: Number, dashpot: Number, c: Vector):
+    def force(offset: Vector, relative: Vector, p: Vector) -> Vector:
+        length = root(dot(offset, offset))
+        d = divided(offset, floored(length))
+        strain = wp.cw_mul(length, p[1]) - one
+        return scaled(d, wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], dot(relative, d)))
+
+    @wp.func
+    def force_adjoint(offset: Vector, relative: Vector, p: Vector, c: Vector):
+        # With d = offset / l written out, so that d itself is never formed.
         length = root(dot(offset, offset))
         inverse = wp.cw_div(one, floored(length))
-        d = scaled(offset, inverse)
-        cd = dot(c, d)
-        wd = dot(relative, d)
-        strain = wp.cw_mul(length, inverse_length) - one
+        cd = wp.cw_mul(dot(c, offset), inverse)
+        wd = wp.cw_mul(dot(relative, offset), inverse)
+        strain = wp.cw_mul(length, p[1]) - one
         # d(f.c)/d(offset): the direction turns (c and the relative velocity, without their parts along d), the length
         # stretches the spring (along d).
-        turn = wp.cw_mul(wp.cw_mul(stiffness, strain) + wp.cw_mul(dashpot, wd), inverse)
-        damped = wp.cw_mul(cd, dashpot)
-        drift = wp.cw_mul(damped, inverse)
-        along = wp.cw_mul(cd, wp.cw_mul(stiffness, inverse_length) - turn) - wp.cw_mul(wd, drift)
-        adj_offset = scaled(c, turn) + scaled(relative, drift) + scaled(d, along)
-        return adj_offset, scaled(d, damped), wp.cw_mul(cd, strain), wp.cw_mul(cd, length), wp.cw_mul(cd, wd)
+        turn = wp.cw_mul(wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], wd), inverse)
+        drift = wp.cw_mul(wp.cw_mul(cd, p[2]), inverse)
+        along = wp.cw_mul(cd, wp.cw_mul(p[0], p[1]) - turn) - wp.cw_mul(wd, drift)
+        adj_offset = scaled(c, turn) + scaled(relative, drift) + scaled(offset, wp.cw_mul(along, inverse))
+        return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
 
     @wp.func
     def add_row(model: Model, state: State, slot: int, i: int, g: int):
@@ -141,14 +142,13 @@ def functions(real: Any, width: int) -> Functions:
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         total = state.force[i, g]
-        for e in range(model.rows[i], model.rows[i + 1]):
-            j = model.partners[e]
+        for each in range(model.rows[i], model.rows[i + 1]):
+            e = place(each)
+            j = place(model.partners[e])
             f = force(
                 state.x[slot, j, g] - x,
                 state.v[slot, j, g] - v,
-                model.stiffness[e, g],
-                model.inverse_length[e, g],
-                model.dashpot[e, g],
+                model.springs[e, g],
             )
             total = total + f
             state.force[j, g] = state.force[j, g] - f
@@ -162,23 +162,20 @@ def functions(real: Any, width: int) -> Functions:
         adj_force = adjoint.force[turn, i, g]
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
-        for e in range(model.rows[i], model.rows[i + 1]):
-            j = model.partners[e]
-            offset, relative, stiffness, inverse_length, dashpot = force_adjoint(
+        for each in range(model.rows[i], model.rows[i + 1]):
+            e = place(each)
+            j = place(model.partners[e])
+            offset, relative, parameters = force_adjoint(
                 state.x[slot, j, g] - x,
                 state.v[slot, j, g] - v,
-                model.stiffness[e, g],
-                model.inverse_length[e, g],
-                model.dashpot[e, g],
+                model.springs[e, g],
                 adj_force - adjoint.force[turn, j, g],
             )
             adj_x = adj_x - offset
             adj_v = adj_v - relative
             adjoint.x[j, g] = adjoint.x[j, g] + offset
             adjoint.v[j, g] = adjoint.v[j, g] + relative
-            adjoint.stiffness[e, g] = adjoint.stiffness[e, g] + stiffness
-            adjoint.inverse_length[e, g] = adjoint.inverse_length[e, g] + inverse_length
-            adjoint.dashpot[e, g] = adjoint.dashpot[e, g] + dashpot
+            adjoint.springs[e, g] = adjoint.springs[e, g] + parameters
         adjoint.x[i, g] = adj_x
         adjoint.v[i, g] = adj_v
 
@@ -188,15 +185,14 @@ def functions(real: Any, width: int) -> Functions:
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         total = Vector()
-        for k in range(model.links[i], model.links[i + 1]):
-            j = model.link_partners[k]
-            e = model.link_springs[k]
+        for each in range(model.links[i], model.links[i + 1]):
+            k = place(each)
+            j = place(model.link_partners[k])
+            e = place(model.link_springs[k])
             total = total + force(
                 state.x[slot, j, g] - x,
                 state.v[slot, j, g] - v,
-                model.stiffness[e, g],
-                model.inverse_length[e, g],
-                model.dashpot[e, g],
+                model.springs[e, g],
             )
         return total
 
@@ -208,23 +204,20 @@ def functions(real: Any, width: int) -> Functions:
         adj_force = adjoint.force[turn, i, g]
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
-        for k in range(model.links[i], model.links[i + 1]):
-            j = model.link_partners[k]
-            e = model.link_springs[k]
-            offset, relative, stiffness, inverse_length, dashpot = force_adjoint(
+        for each in range(model.links[i], model.links[i + 1]):
+            k = place(each)
+            j = place(model.link_partners[k])
+            e = place(model.link_springs[k])
+            offset, relative, parameters = force_adjoint(
                 state.x[slot, j, g] - x,
                 state.v[slot, j, g] - v,
-                model.stiffness[e, g],
-                model.inverse_length[e, g],
-                model.dashpot[e, g],
+                model.springs[e, g],
                 adj_force - adjoint.force[turn, j, g],
             )
             adj_x = adj_x - offset
             adj_v = adj_v - relative
             if i < j:
-                adjoint.stiffness[e, g] = adjoint.stiffness[e, g] + stiffness
-                adjoint.inverse_length[e, g] = adjoint.inverse_length[e, g] + inverse_length
-                adjoint.dashpot[e, g] = adjoint.dashpot[e, g] + dashpot
+                adjoint.springs[e, g] = adjoint.springs[e, g] + parameters
         adjoint.x[i, g] = adj_x
         adjoint.v[i, g] = adj_v
 
