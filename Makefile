@@ -46,6 +46,7 @@ format: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench
+	$(BIN)/python -m tests.benchmarks.bench_adjoint
 	$(BIN)/python -m tests.benchmarks.bench_splats
 	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
 	$(BIN)/python -m tests.benchmarks.bench_workflow

@@ -100,6 +100,9 @@ class Config(Section):
     """The study table; its path is relative to the Snakefile."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
+    twins_per_launch: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    """How many candidates of a search, or fits of a scenario, are simulated together at most; auto: as many as pay. 1: one by one.
+    It changes no number on a CPU."""
     gpus: Gpus = field(default_factory=Gpus)
     simulation: Simulation = field(default_factory=Simulation)
     losses: Losses = field(default_factory=Losses)

@@ -25,7 +25,7 @@ RUN = ".run"
 """File in FOLDER that names the current run of the workflow, or the last one."""
 GPU_NOTES = ".gpus"
 """File in FOLDER in which the jobs of that run note which GPUs failed."""
-SIMULATING = ("search", "fit", "rollout", "transfer")
+SIMULATING = ("search", "fits", "fit", "rollout", "transfer")
 """Rules whose work is spring updates (`neuspring.experiments.size`)."""
 SPRING_UPDATES = "spring_updates"
 """The fact of their stages' records that counts them."""

@@ -23,23 +23,31 @@ class TrainingLoop:
     equals an uninterrupted one if its checkpoints hold all that an epoch depends on.
     """
 
-    def __init__(self, what: str, label: str, epochs: int, every: int, partial: Path | None, key: str) -> None:
+    def __init__(
+        self, what: str, label: str, epochs: int, every: int, partial: Path | None, key: str, *, share: float = 1.0
+    ) -> None:
         """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
-        `every` epochs; one that lies there is continued from if it has the same `key`."""
+        `every` epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the part of
+        the time that counts for this training, where several run together."""
+        self._share, self._alone = share, share == 1.0
         self._begun = time.monotonic()
         self._epochs, self._every, self._partial, self._key = epochs, every, partial, key
         self._progress = Progress(label, epochs)
         self.history: list[dict[str, Any]] = []
         """A row per epoch."""
         self.attempts = 1
-        """1, plus one for every time that the training continued from a checkpoint."""
+        """1, plus one for every time that the training continued from a checkpoint of a killed one."""
         self.earlier_seconds = 0.0
-        """Wall time of earlier attempts, up to their last checkpoint."""
+        """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
+        self.epochs_together = 0
+        """How many epochs ran together with those of other trainings."""
         self.restored = Checkpoint.load(partial, key, what)
         """The checkpoint to continue from."""
         if self.restored:
             run = self.restored.values.pop("run")
-            self.history, self.attempts, self.earlier_seconds = run["history"], run["attempts"] + 1, run["seconds"]
+            self.history, self.earlier_seconds, self.epochs_together = run["history"], run["seconds"], run["epochs_together"]
+            # To go on alone after what was planned to run together is no second attempt.
+            self.attempts = run["attempts"] + (self.epochs_together < len(self.history) or not self._alone)
             print(f"continuing {what} after epoch {len(self.history) - 1}")
 
     def __iter__(self) -> Iterator[int]:
@@ -50,15 +58,17 @@ class TrainingLoop:
     def record(self, row: dict[str, Any], note: str) -> None:
         """Add the row of a finished epoch to the history, and show progress."""
         self.history.append(row)
+        self.epochs_together += not self._alone
         self._progress.update(len(self.history), note)
 
     def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
         """Save the training's own state, with the history, if a checkpoint is due."""
-        if self._partial is None or len(self.history) % self._every:
+        done = len(self.history)
+        if self._partial is None or (done % self._every and done < self._epochs):
             return
         state = checkpoint()
-        seconds = self.earlier_seconds + time.monotonic() - self._begun
-        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds}
+        seconds = self.earlier_seconds + self._share * (time.monotonic() - self._begun)
+        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds, "epochs_together": self.epochs_together}
         Checkpoint(state.arrays, {**state.values, "run": run}).save(self._partial, self._key)
 
 

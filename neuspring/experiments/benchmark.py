@@ -7,8 +7,10 @@ import difflib
 import fnmatch
 import shlex
 import tempfile
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,8 @@ from neuspring.scores.studies import Study, read_studies
 
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
+LEAST_TOGETHER = 3
+"""Fewer fits gain less from shared launches than from jobs of their own, which run at the same time."""
 REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
@@ -240,6 +244,22 @@ class Benchmark:
         if not low <= wanted_low < wanted_high <= high:
             rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+
+    def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
+        """The fits (method, seed) of a scenario that share launches: those of equal horizon, where they are not too few.
+
+        None where `twins_per_launch` is 1.
+        """
+        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
+            return ()
+        rows, seeds = [name for name in self.fits if self.applies(name, scenario)], self.config.seeds
+        alike = Counter(self._horizons[name] for name in rows)
+        return tuple((name, seed) for name in rows if alike[self._horizons[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
+
+    @cached_property
+    def _horizons(self) -> dict[str, int]:
+        """Frames per step of each fit."""
+        return {name: fit_of(self.config, method, name).horizon for name, method in self.fits.items()}
 
     @property
     def tuned(self) -> tuple[str, ...]:

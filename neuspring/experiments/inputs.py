@@ -185,6 +185,33 @@ class Inputs:
         """The search's record; a baseline's model has none."""
         return [] if self.benchmark.methods[job.method].model else [self.search_of_fit(job)]
 
+    def searches_of_fits(self, job: Any) -> list[str]:
+        """The searches that the fits of a scenario start from, where these share launches."""
+        return list(dict.fromkeys(self.search_of_fit(member) for member in self._members(job.scenario)))
+
+    def rows_of_fits(self, job: Any) -> str:
+        """The fits of a scenario that share launches, by row of the method table, as JSON."""
+        source = self.benchmark.scenarios[job.scenario].source
+        rows: dict[str, dict[str, Any]] = {}
+        for member in self._members(job.scenario):
+            name = member.method
+            row: dict[str, Any] = {
+                "kind": self.benchmark.fits[name].fit,
+                "settings": self._settings("fit", source, name),
+                "fits": {},
+            }
+            rows.setdefault(name, row)["fits"][self._record(member, name, "fit")] = self.search_of_fit(member)
+        return _json(list(rows.values()))
+
+    def shared_launches(self, job: Any) -> list[str]:
+        """The record of the launches that a fit shared with others, if it is one of several."""
+        together = (job.method, int(job.seed)) in self.benchmark.fits_together(job.scenario)
+        return [f"{self.results}/{job.scenario}/fits.json"] if together else []
+
+    def _members(self, scenario: str) -> list[Any]:
+        pairs = self.benchmark.fits_together(scenario)
+        return [SimpleNamespace(scenario=scenario, method=method, seed=seed) for method, seed in pairs]
+
     def fit(self, job: Any) -> list[str]:
         """The fit's record, if the method has that stage. Methods with the same fit share it."""
         owner = self.benchmark.fit_of_method.get(job.method)

@@ -170,8 +170,16 @@ class Needs:
         benchmark, body = self._benchmark, self.sizes.body(wildcards.scenario)
         if rule == "search":
             return int(self._rollouts(wildcards.search) * (body.train_end - 1))
+        together = benchmark.fits_together(wildcards.scenario) if rule in ("fits", "fit") else ()
+        if rule == "fits":
+            return int(sum(self._epochs(method) for method, _ in together) * (body.train_end - 1))
         if rule == "fit":
-            return int(self._epochs(wildcards.method) * (body.train_end - 1))
+            # What runs together is the work of `fits`.
+            return (
+                1
+                if (wildcards.method, int(wildcards.seed)) in together
+                else int(self._epochs(wildcards.method) * (body.train_end - 1))
+            )
         if rule == "transfer":
             return sum(self.sizes.body(name).frames - 1 for name in benchmark.transfers[wildcards.scenario])
         method = benchmark.methods[wildcards.method]
@@ -188,6 +196,9 @@ class Needs:
             return work, None
         if rule == "search":
             search = wildcards.search
+        elif rule == "fits":
+            together = self._benchmark.fits_together(wildcards.scenario)
+            search = self._benchmark.fits[together[0][0]].search if together else None
         else:
             rows = self._benchmark.fits if rule == "fit" else self._benchmark.methods
             search = rows[wildcards.method].search

@@ -77,6 +77,8 @@ class History:
             if record.rule in SIMULATING and record.unit != GIGA_UPDATES:
                 uncounted.add(record.rule)
                 continue
+            if not record.work:
+                continue  # a fit whose epochs all ran together with those of others
             kind = _kind(record.attempts[ends[-1]])
             took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
             for scenario in {"", record.scenario}:

@@ -44,7 +44,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         capacity: int
         up: real
         gravity: lane.Vector
-        inverse_time: real
         rows: integers
         partners: integers
         links: integers
@@ -52,6 +51,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         link_springs: integers
         counts: of_twin
         substep: of_twin
+        inverse_time: of_twin
         decay: of_twin
         ground_e: of_twin
         ground_mu: of_twin
@@ -135,9 +135,11 @@ class Buffers:
         self.add_vectors(x=(self.slots, total), v=(self.slots, total), after=(self.history, nodes))
         self.add_vectors(begin=(controllers,), end=(controllers,), adj_x=(total,), adj_v=(total,), adj_after=(nodes,))
         self.add_vectors(adj_force=(2, total), **({} if threads else {"force": (total,)}))
-        self.add_numbers(counts=None, substep=None)
+        self.add_numbers(counts=None, substep=None, inverse_time=None)
         self.set_numbers("counts", torch.tensor(self.counts, dtype=dtype, device=device))
         self.set_numbers("substep", torch.tensor([s.substep for s in simulations], dtype=dtype, device=device))
+        inverse_times = [1.0 / s.frame_time if s.controller_velocity else 0.0 for s in simulations]
+        self.set_numbers("inverse_time", torch.tensor(inverse_times, dtype=dtype, device=device))
         # Without self-collision nothing changes velocities between the forces and the motion.
         self.views |= {"moving": self.views["after"]} | ({"adj_moving": self.views["adj_after"]} if differentiable else {})
 
@@ -212,7 +214,6 @@ class Buffers:
             "capacity": sim.collision_capacity,
             "up": sim.up_sign if sim.ground else 0.0,
             "gravity": self.lanes.Vector(*[0.0] * (2 * self.width), *[-sim.gravity * sim.up_sign] * self.width),
-            "inverse_time": 1.0 / sim.frame_time if sim.controller_velocity else 0.0,
         }
         made = []
         for kind, prefix in zip(kinds, ("", "", "adj_"), strict=True):

@@ -41,9 +41,9 @@ class Frame(torch.autograd.Function):
 
 
 def simulate_frame(
-    solver: FrameSolver, parameters: Parameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+    solver: Any, parameters: Parameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`."""
+    """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`, solvers as in `Frame`."""
     state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, begin, end, x, v, *parameters)  # type: ignore[no-untyped-call]
     return state
 

@@ -2,8 +2,8 @@
 
 Node i takes the mean impulse over its listed partners that are closer than the contact distance and approach, by the response of
 contact.py. Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost
-grows with the nodes. A list is in node order; those with the lowest indices stay where they are more than it holds. The twins of
-a group share a list: a bit per lane says whose partner a node is.
+grows with the nodes. A list is in node order; where a twin has more than `collision_capacity`, those with the lowest indices stay.
+The twins of a group share a list: a bit per lane says whose partner a node is.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -13,14 +13,13 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
+from neuspring.core.device import load
 from neuspring.physics import contact
 from neuspring.physics.arrays import Buffers, structs
 from neuspring.physics.lanes import lanes
 
 CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
-SHARED_ROOM = 2
-"""A list of several twins holds this many times the partners that one twin may have."""
 
 
 class Kernels(NamedTuple):
@@ -44,7 +43,8 @@ def allocate(b: Buffers) -> None:
     if not b.simulation.self_collision:
         return
     capacity, twins = b.simulation.collision_capacity, b.groups * b.width
-    room = min(capacity if b.width == 1 else SHARED_ROOM * capacity, b.nodes)
+    # Room for the partners of all lanes, so that no twin takes another's. On a CPU, memory that no list reaches costs nothing.
+    room = min(b.width * capacity, b.nodes)
     device: dict[str, Any] = {"dtype": torch.int32, "device": b.device}
     tables = {name: torch.zeros((b.nodes, room, b.groups), **device) for name in ("near", "near_lanes")}
     tables |= {"near_count": torch.zeros((b.nodes, b.groups), **device)}
@@ -71,9 +71,9 @@ def find_candidates(b: Buffers, reach: float) -> None:
     """List the partners of every node at the start of the frame; `reach` is the largest contact distance, m."""
     made, views, size = kernels(b.real, b.width), b.views, (b.nodes, b.groups)
     model, state, _ = b.arguments()
-    b.launch(made.place, size, model, state, views["grid_points"])
+    b.launch(load(made.place, b.device), size, model, state, views["grid_points"])
     views["grid"].build(views["grid_points"], reach, groups=views["grid_groups"])
-    b.launch(made.find, size, model, state, views["grid"].id, views["overflow"])
+    b.launch(load(made.find, b.device), size, model, state, views["grid"].id, views["overflow"])
 
 
 @functools.cache
@@ -85,6 +85,35 @@ def kernels(real: Any, width: int) -> Kernels:
     points: Any = wp.array(dtype=wp.types.vector(3, real))
     counts: Any = wp.array3d(dtype=int)
 
+    @wp.func
+    def inserted(model: Model, i: int, g: int, j: int, q: int, count: int) -> int:
+        """Make j a partner of node i in lane q; the new length of the sorted list."""
+        p = count
+        while p > 0 and model.near[i, p - 1, g] > j:
+            p = p - 1
+        if p > 0 and model.near[i, p - 1, g] == j:
+            model.near_lanes[i, p - 1, g] = model.near_lanes[i, p - 1, g] | (1 << q)
+            return count
+        k = count
+        while k > p:
+            model.near[i, k, g] = model.near[i, k - 1, g]
+            model.near_lanes[i, k, g] = model.near_lanes[i, k - 1, g]
+            k = k - 1
+        model.near[i, p, g] = j
+        model.near_lanes[i, p, g] = 1 << q
+        return count + 1
+
+    @wp.func
+    def dropped(model: Model, i: int, g: int, k: int, q: int, count: int) -> int:
+        """Take entry k from lane q, and out of the list where no other lane has it; the new length."""
+        model.near_lanes[i, k, g] = model.near_lanes[i, k, g] & ~(1 << q)
+        if model.near_lanes[i, k, g] != 0:
+            return count
+        for later in range(k + 1, count):
+            model.near[i, later - 1, g] = model.near[i, later, g]
+            model.near_lanes[i, later - 1, g] = model.near_lanes[i, later, g]
+        return count - 1
+
     def place(model: Model, state: State, grid_points: points):
         i, g = wp.tid()
         for q in range(width):
@@ -92,44 +121,30 @@ def kernels(real: Any, width: int) -> Kernels:
 
     def find(model: Model, state: State, grid: wp.uint64, overflow: counts):
         i, g = wp.tid()
-        room = model.near.shape[1]
         count = wp.int32(0)
         for q in range(width):
             reach = model.distance[g][q]
             here = column(state.x[0, i, g], q)
+            own = wp.int32(0)
             query = wp.hash_grid_query(grid, here, reach, g * width + q)
             candidate = wp.int32(0)
             while wp.hash_grid_query_next(query, candidate):
                 j = candidate - (g * width + q) * model.nodes
                 if j != i and wp.length(column(state.x[0, j, g], q) - here) < reach:
-                    # Where j belongs in the sorted list.
-                    p = count
-                    while p > 0 and model.near[i, p - 1, g] > j:
-                        p = p - 1
-                    if p > 0 and model.near[i, p - 1, g] == j:
-                        model.near_lanes[i, p - 1, g] = model.near_lanes[i, p - 1, g] | (1 << q)
-                    else:
-                        if count == room:
-                            overflow[i, g, q] = overflow[i, g, q] + 1
-                        else:
-                            count = count + 1
-                        if p < room:
-                            k = count - 1
-                            while k > p:
-                                model.near[i, k, g] = model.near[i, k - 1, g]
-                                model.near_lanes[i, k, g] = model.near_lanes[i, k - 1, g]
-                                k = k - 1
-                            model.near[i, p, g] = j
-                            model.near_lanes[i, p, g] = 1 << q
-        # Each twin keeps as many as it would keep alone.
-        for q in range(width):
-            own = wp.int32(0)
-            for k in range(count):
-                if (model.near_lanes[i, k, g] >> q) & 1 == 1:
-                    own = own + 1
-                    if own > model.capacity:
-                        model.near_lanes[i, k, g] = model.near_lanes[i, k, g] & ~(1 << q)
+                    keep = True
+                    if own == model.capacity:
+                        # The twin's last partner makes room for one that comes before it.
                         overflow[i, g, q] = overflow[i, g, q] + 1
+                        last = count - 1
+                        while (model.near_lanes[i, last, g] >> q) & 1 == 0:
+                            last = last - 1
+                        keep = j < model.near[i, last, g]
+                        if keep:
+                            count = dropped(model, i, g, last, q, count)
+                    else:
+                        own = own + 1
+                    if keep:
+                        count = inserted(model, i, g, j, q, count)
         model.near_count[i, g] = count
 
     unique = wp.kernel(module="unique", enable_backward=False)

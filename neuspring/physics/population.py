@@ -1,7 +1,7 @@
 """Several twins of the same nodes and controllers in one solver: their topologies as one graph.
 
-A twin's spring that another one lacks is there for both, and has no stiffness and no dashpot in the other: it adds nothing. The springs
-of a node are summed in the order of its partners, so that a twin moves, bit for bit, as in a solver of its own.
+A twin's spring that another one lacks is there for both, and has no stiffness and no dashpot in the other: it adds nothing. The
+springs of a node are summed in the order of its partners, so that a twin moves, bit for bit, as in a solver of its own.
 """
 
 from __future__ import annotations

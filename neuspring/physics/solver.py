@@ -7,17 +7,19 @@ stored start (see `autograd.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Simulation
+from neuspring.core.errors import InputError
 from neuspring.physics import collision, contact, frame, position, springs, velocity
 from neuspring.physics.arrays import Buffers, Graphs
 
-PER_TWIN = ("frame_time", "substeps")
-"""What may differ between the simulations of one solver."""
+PER_TWIN = ("frame_time", "substeps", "initial_velocity")
+"""What may differ between the simulations of one solver; it does not read the last."""
 
 
 class Parameters(NamedTuple):
@@ -38,14 +40,24 @@ class Parameters(NamedTuple):
     """[1]: contact distance, m. No gradient: it only selects pairs."""
 
 
+def _check(simulations: Sequence[Simulation]) -> None:
+    """One physics for all twins of a solver."""
+    for field in fields(Simulation):
+        values = {getattr(simulation, field.name) for simulation in simulations}
+        if field.name not in PER_TWIN and len(values) != 1:
+            rule = "must be the same for all twins of a solver, of which there is at least one"
+            raise InputError(f"simulation.{field.name}", rule, sorted(values), "Make a solver for each.")
+
+
 class FrameSolver:
     """Simulates frames of one spring graph.
 
     spring_pairs [S, 2] index nodes; i >= nodes means controller i - nodes. All tensors that go in and out have `dtype` and
     live on `device`. Float32 is the working precision, float64 serves verification.
 
-    A sequence of simulations makes a solver of as many twins, which may differ in their substeps and in everything that is not the
-    graph; then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and in company.
+    A sequence of simulations makes a solver of as many twins, which may differ in parameters and state, and in `PER_TWIN` of their
+    simulations (else InputError); then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and
+    in company.
 
     `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU.
     """
@@ -64,6 +76,7 @@ class FrameSolver:
     ) -> None:
         self.together = not isinstance(simulation, Simulation)
         simulations = [simulation] if isinstance(simulation, Simulation) else list(simulation)
+        _check(simulations)
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
         threads = device != "cpu" if threads is None else threads
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)

@@ -56,7 +56,7 @@ def functions(real: Any, width: int) -> Functions:
         for q in range(width):
             fraction[q] = wp.min(real(step + 1) / model.counts[g][q], one)
         state.x[slot, model.nodes + c, g] = state.begin[c, g] + scaled(travel, fraction)
-        state.v[slot, model.nodes + c, g] = travel * model.inverse_time
+        state.v[slot, model.nodes + c, g] = scaled(travel, model.inverse_time[g])
 
     @wp.func
     def updated(v: Vector, force: Vector, gravity: Vector, dt: Number, decay: Number) -> Vector:

@@ -54,6 +54,13 @@ STAGES = {
         memory_mb=8000,
         minutes=240,
     ),
+    "fits": Stage(
+        about="coarse twins of a scenario -> checkpoints of their fits, several in one launch",
+        reads=("fit", *COMMON),
+        gpu="always",
+        memory_mb=16000,
+        minutes=960,
+    ),
     "fit": Stage(
         about="coarse twin -> fitted twin, by gradients",
         reads=("fit", *COMMON),

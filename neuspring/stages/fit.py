@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 
 from neuspring.config import Config, Kind
@@ -34,24 +35,31 @@ def command(a: Namespace) -> None:
     run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output)
 
 
-def run(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> None:
-    """Write twin.npz, history.parquet (losses per epoch), and the record `output`.
+@dataclass(frozen=True)
+class Prepared:
+    """A fit before it runs."""
 
-    `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
-    A checkpoint that a killed fit left is continued.
-    """
-    before, device = StageRecord.load(search_record), resolve_device(device)
-    seed = before.settings["seed"]
-    record = Recorder(
+    problem: FitProblem
+    partial: Path
+    """Where its checkpoints lie."""
+    key: str
+    """What a checkpoint must match."""
+
+
+def recorder(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> Recorder:
+    """The recorder of a fit, which digests its inputs."""
+    return Recorder(
         "fit",
         output,
         inputs={"observations": observations_path, "search": search_record},
-        settings=select(settings, STAGES["fit"].reads) | {"kind": kind, "seed": seed},
+        settings=select(settings, STAGES["fit"].reads) | {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]},
         device=device,
     )
-    if before.status == "failed":
-        record.save(failure=f"search: {before.reason}")
-        return
+
+
+def prepared(record: Recorder, observations_path: Path, search_record: Path, settings: Config) -> Prepared:
+    """What a fit starts from; the search must not have failed."""
+    before = StageRecord.load(search_record)
     problem = FitProblem(
         Observations.load(observations_path),
         Twin.load(before.file("twin", search_record)),
@@ -59,15 +67,30 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
         settings.simulation,
         settings.losses,
         settings.released_quirks,
-        device,
-        kind,
-        int(seed),
+        record.device,
+        record.settings["kind"],
+        int(record.settings["seed"]),
     )
     inputs = {"observations": record.inputs["observations"], "twin": before.files["twin"][1]}
-    key = checkpoint_key(inputs, record.settings, device, "neuspring.twin.fit")
-    partial = output.with_name("fit.partial.npz")
+    key = checkpoint_key(inputs, record.settings, record.device, "neuspring.twin.fit")
+    return Prepared(problem, record.output.with_name("fit.partial.npz"), key)
+
+
+def run(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> None:
+    """Write twin.npz, history.parquet (losses per epoch), and the record `output`.
+
+    `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
+    A checkpoint that a killed fit left, or one that ran together with others (`fits`), is continued.
+    """
+    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output)
+    before = StageRecord.load(search_record)
+    if before.status == "failed":
+        record.save(failure=f"search: {before.reason}")
+        return
+    ready = prepared(record, observations_path, search_record, settings)
+    problem, partial = ready.problem, ready.partial
     try:
-        result = fit(problem, partial=partial, key=key)
+        result = fit(problem, partial=partial, key=ready.key)
     except NumericalFailure as failure:
         record.save(failure=str(failure))
         return
@@ -76,11 +99,13 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     columns = {name: result.history[name] for name in ("loss", "tail_loss", "gradient_norm", "learning_rate")}
     write_history(result.history["epoch"], columns, files["history"])
     counts = result.twin.counts
-    frames = len(result.history) * (problem.observations.scenario.train_end - 1)
+    # Those that ran together count in the record of `fits`.
+    frames = (len(result.history) - result.epochs_together) * (problem.observations.scenario.train_end - 1)
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
         "epochs": len(result.history),
+        "epochs_together": result.epochs_together,
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
         "spring_updates": frames * counts["springs"] * counts["substeps"],

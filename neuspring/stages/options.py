@@ -56,6 +56,23 @@ def add_device(parser: ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1)
 
 
+def add_twins_per_launch(parser: ArgumentParser) -> None:
+    """--twins-per-launch; see `twins_per_launch`."""
+    parser.add_argument(
+        "--twins-per-launch", default="auto", help="how many twins are simulated together at most; auto: as many as pay"
+    )
+
+
+def twins_per_launch(a: Namespace) -> int:
+    """How many twins share a launch at most; 0 for `auto`. Raises InputError."""
+    text = str(a.twins_per_launch)
+    if text == "auto":
+        return 0
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError("--twins-per-launch", "must be auto or an integer of at least 1", text)
+    return int(text)
+
+
 def add_output(parser: ArgumentParser, help: str = "file to write") -> None:
     """--output."""
     parser.add_argument("--output", type=Path, required=True, help=help)

@@ -25,18 +25,30 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
     shared.add_seed(parser)
     shared.add_device(parser)
+    shared.add_twins_per_launch(parser)
     shared.add_output(parser)
 
 
 def command(a: Namespace) -> None:
     """`neuspring search`."""
-    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output)
+    settings, together = shared.read_settings(a.settings), shared.twins_per_launch(a)
+    run(a.observations, settings, a.clusters, a.seed, a.device, a.output, together, a.threads)
 
 
-def run(observations_path: Path, settings: Config, clusters: int, seed: int, device: str, output: Path) -> None:
+def run(
+    observations_path: Path,
+    settings: Config,
+    clusters: int,
+    seed: int,
+    device: str,
+    output: Path,
+    together: int = 0,
+    threads: int = 1,
+) -> None:
     """Write twin.npz, trace.parquet (every candidate with its cost and variables), history.parquet, and the record `output`.
 
-    A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
+    At most `together` candidates share a launch (0: as many as pay), and `threads` launches run at the same time on a CPU; neither
+    changes a number there. A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
     """
     device = resolve_device(device)
     values = select(settings, STAGES["search"].reads)
@@ -55,6 +67,8 @@ def run(observations_path: Path, settings: Config, clusters: int, seed: int, dev
         settings.released_quirks,
         device,
         clusters,
+        together,
+        threads,
     )
     # The budget is not part of the key: a search with a larger one begins with the same candidates.
     without_budget = {name: value for name, value in values["search"].items() if name != "rollouts"}

@@ -29,6 +29,7 @@ from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame, solver_for
 from neuspring.physics.solver import FrameSolver, Parameters
+from neuspring.twin.company import Seat
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.parameters import TwinParameters
@@ -75,6 +76,8 @@ class FitResult:
     earlier_seconds: float
     """Wall time of the attempts that this one continued, up to their last checkpoint."""
     collision_overflow: int
+    epochs_together: int
+    """Epochs that ran together with those of other fits."""
 
 
 @dataclass
@@ -114,8 +117,8 @@ def tail_start(train_end: int, tail_fraction: float) -> int:
 class TwinFit:
     """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
 
-    def __init__(self, problem: FitProblem) -> None:
-        self.problem = problem
+    def __init__(self, problem: FitProblem, seat: Seat | None = None) -> None:
+        self.problem, self._seat = problem, seat
         observations, settings = problem.observations, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
@@ -132,7 +135,7 @@ class TwinFit:
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
         self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas)
         self.twin = problem.twin
-        self._solver: FrameSolver | None = None
+        self._solver: FrameSolver | Seat | None = None
         self._overflow = 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
@@ -142,15 +145,17 @@ class TwinFit:
         """Whether an epoch is a single optimiser step, so that its losses belong to the values before it."""
         return self.horizon >= self.head_end - 1
 
-    def solver(self) -> FrameSolver:
-        """The solver for the current number of substeps."""
+    def solver(self) -> FrameSolver | Seat:
+        """The solver for the current number of substeps, or the seat in a shared one."""
         if self._solver is None:
-            self._solver = solver_for(self.twin, self.problem.device)
+            self._solver = self._seat.sit(self.twin) if self._seat else solver_for(self.twin, self.problem.device)
         return self._solver
 
     @property
     def collision_overflow(self) -> int:
         """Collision candidates that did not fit the list, summed over all solvers so far."""
+        if self._seat:
+            return self._seat.collision_overflow
         return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
 
     def use_substeps(self, count: int) -> None:
@@ -280,15 +285,17 @@ def fit(
     partial: Path | None = None,
     key: str = "",
     on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
+    seat: Seat | None = None,
 ) -> FitResult:
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
-    `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. Raises
-    NumericalFailure if no epoch could be completed.
+    `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
+    `seat` the simulation shares launches with other fits (company.py). Raises NumericalFailure if no epoch could be completed.
     """
     label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
-    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key)
-    run = TwinFit(problem)
+    share = 1 / len(seat.company.seats) if seat else 1.0
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
+    run = TwinFit(problem, seat)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)
@@ -316,6 +323,7 @@ def fit(
         loop.attempts,
         loop.earlier_seconds,
         state.overflow,
+        loop.epochs_together,
     )
 
 

@@ -184,8 +184,8 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
     """Which candidates are simulated together, the slowest group first.
 
-    On CUDA all. On a CPU lanes wait for their group's largest number of substeps, and work on all springs of their group: alike ones are
-    put together, such that the expected time of `threads` is least.
+    On CUDA all. On a CPU lanes wait for their group's largest number of substeps, and work on all springs of their group: alike
+    ones are put together, such that the expected time of `threads` is least.
     """
     if problem.device != "cpu":
         size = problem.together or len(twins)
@@ -202,7 +202,7 @@ def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
     times = {(part[0], len(part)): time_of(part) for part in parts}
 
     def split(limit: float) -> tuple[float, float, list[list[int]]]:
-        """(expected time of all threads, sum, groups) of the split with the least sum, in which no group of several takes longer."""
+        """(time of all threads, sum, groups) of the split with the least sum, in which no group of several takes longer."""
         best: list[tuple[float, float, list[list[int]]]] = [(0.0, 0.0, [])]
         for first in reversed(range(len(order))):
             choices = []

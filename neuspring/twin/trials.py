@@ -1,8 +1,8 @@
 """Rollouts of several candidates at once, and their training losses (losses.py) without gradients.
 
-Everything stays in the solver's buffers, in lanes: after each frame kernels add the frame's loss to each twin's sum, and note the frame
-in which a twin leaves the scene. Sums go through points and nodes in order, in float64, so that a twin's cost does not depend on its
-company, bit for bit on a CPU.
+Everything stays in the solver's buffers, in lanes: after each frame kernels add the frame's loss to each twin's sum, and note the
+frame in which a twin leaves the scene. Sums go through points and nodes in order, in float64, so that a twin's cost does not depend
+on its company, bit for bit on a CPU.
 """
 
 from __future__ import annotations

@@ -100,3 +100,26 @@ def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(project):
     (row,) = pd.read_csv(project / "results" / "tables" / "runs.csv").to_dict("records")
     assert row["status"] == "failed"
     assert "none of 11 candidates could be simulated" in row["reason"]
+
+
+@pytest.mark.slow
+def test_fits_that_share_launches_end_as_they_would_one_by_one(project):
+    """With `twins_per_launch: 1` there is no such job, and every twin is the same, bit for bit."""
+    changes = {"methods": ["baseline"], "seeds": [0, 1, 2], "fit": {"epochs": 2, "checkpoint_every": 5}}
+    targets = [f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (0, 1, 2)]
+    run(project, changes, "--", *targets)
+    results = project / "results" / SCENE
+    record = json.loads((results / "fits.json").read_text())
+    assert record["facts"]["companies"] == [targets]
+    assert record["facts"]["errors"] == {}
+    twins = {seed: (results / "baseline" / seed / "twin.npz").read_bytes() for seed in "012"}
+    assert all(json.loads((project / path).read_text())["facts"]["epochs_together"] == 2 for path in targets)
+    # Another seed trains what is missing, and nothing again.
+    before = {path: (project / path).stat().st_mtime_ns for path in targets}
+    run(project, changes | {"seeds": [0, 1, 2, 3]}, "--", *targets, f"results/{SCENE}/baseline/3/fit.json")
+    assert {path: (project / path).stat().st_mtime_ns for path in targets} == before
+    for path in targets:
+        (project / path).unlink()
+    output = run(project, changes | {"twins_per_launch": 1}, "--", *targets)
+    assert "fits" not in {line.split()[0] for line in output.splitlines() if line.strip()}
+    assert {seed: (results / "baseline" / seed / "twin.npz").read_bytes() for seed in "012"} == twins

@@ -433,3 +433,16 @@ def test_every_method_that_is_shipped_is_valid():
         "neuspring_plus_carry_over": "neuspring_plus",
         "neuspring_plus_average": "neuspring_plus",
     }
+
+
+def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
+    def pairs(**changes):
+        return Benchmark.of(shipped("toy") | changes, ROOT).fits_together("toy_rope_lift_smooth")
+
+    # `baseline` takes a frame per step, `neuspring` ten: with two seeds each has one other in step.
+    assert pairs(seeds=[0, 1]) == ()
+    assert pairs(seeds=[0, 1, 2]) == (*(("baseline", k) for k in range(3)), *(("neuspring", k) for k in range(3)))
+    assert pairs(seeds=[0, 1, 2], twins_per_launch=1) == ()
+    assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
+    three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
+    assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))

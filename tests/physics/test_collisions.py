@@ -35,15 +35,19 @@ def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") ->
     body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
     solver = solver_for(body, 0, device)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
-    solver.buffers.partners.fill_(-1)
+    tables = solver.buffers.indices
+    tables["near"].fill_(-1)
     for _ in range(frames):
         after, _ = solver.forward(state, 0 * state, nobody, nobody)
         np.testing.assert_array_equal(after.cpu().numpy(), x)
-    partners, count = solver.buffers.partners.numpy(), solver.buffers.count.numpy()
-    assert partners.shape == (len(x), capacity)
+    # One twin: one group, whose only lane every partner is listed for.
+    partners, lanes, count = (tables[name][..., 0].cpu().numpy() for name in ("near", "near_lanes", "near_count"))
+    assert partners.shape == (len(x), min(capacity, len(x)))
     assert (count <= capacity).all()
     # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
-    assert (partners[np.arange(capacity) >= count[:, None]] == -1).all()
+    beyond = np.arange(partners.shape[1]) >= count[:, None]
+    assert (partners[beyond] == -1).all()
+    assert (lanes[~beyond] == 1).all()
     return [row[:n].tolist() for row, n in zip(partners, count, strict=True)], solver.collision_overflow
 
 

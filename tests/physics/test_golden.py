@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_te
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.losses import acceleration
+from tests.support import scenes
 from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
 from tests.support.scenes import DEVICES
 
@@ -54,14 +55,20 @@ class Frame(NamedTuple):
 
 
 @cache
-def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool) -> FrameSolver:
-    return solver_for(clip(name).twin, device, dtype, differentiable=differentiable)
+def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool, threads: bool) -> FrameSolver:
+    twin = clip(name).twin
+    if threads == (device != "cpu"):
+        return solver_for(twin, device, dtype, differentiable=differentiable)
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
+    return scenes.solver_for(Scene.of(twin), len(twin.topology.controllers), **options)
 
 
 @cache
-def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, restart: bool) -> tuple[np.ndarray, np.ndarray]:
-    """States x, v [F, N, 3] at frame ends; `restart` starts every frame from the record."""
-    c, solver = clip(name), solver_of(name, device, dtype, differentiable)
+def rollout(
+    name: str, device: str, dtype: torch.dtype, differentiable: bool, restart: bool, threads: bool | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """States x, v [F, N, 3] at frame ends; `restart` starts every frame from the record, `threads` is None for the device's way."""
+    c, solver = clip(name), solver_of(name, device, dtype, differentiable, device != "cpu" if threads is None else threads)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -75,9 +82,10 @@ def rollout(name: str, device: str, dtype: torch.dtype, differentiable: bool, re
 
 
 @cache
-def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool) -> list[Frame]:
+def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool, threads: bool | None = None) -> list[Frame]:
     """Every frame as in the released first-order stage: state detached between frames, gradient of the frame's loss."""
-    c, solver, frames = clip(name), solver_of(name, device, dtype, True), []
+    c, solver = clip(name), solver_of(name, device, dtype, True, device != "cpu" if threads is None else threads)
+    frames = []
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -138,13 +146,27 @@ def test_cloth_follows_the_record_frame_by_frame(dtype: torch.dtype, device: str
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", NAMES)
 def test_forward_only_equals_differentiable(name: str, device: str) -> None:
-    """Two substep slots or all of them: the same numbers, bit for bit (on CUDA up to the order of atomic sums)."""
+    """Few substep slots or all of them: the same numbers, bit for bit."""
     differentiable, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
     for a, b in zip(differentiable, free, strict=True):
-        if device == "cpu":
-            np.testing.assert_array_equal(a, b)
-        elif name in DRAWN:
-            np.testing.assert_allclose(a, b, atol=POSITION)
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_thread_per_node_gives_what_one_thread_gives(name: str) -> None:
+    """The kernels of a GPU, run on the CPU, follow the record as far as the others do: positions bit for bit, and gradients."""
+    positions = (rollout(name, "cpu", torch.float32, True, name not in DRAWN, threads) for threads in (None, True))
+    for a, b in zip(*positions, strict=True):
+        np.testing.assert_array_equal(a, b)
+    frames = (optimised_frames(name, "cpu", torch.float32, True, threads) for threads in (None, True))
+    for one, many in zip(*frames, strict=True):
+        np.testing.assert_array_equal(one.losses, many.losses)
+        if name in DRAWN:
+            np.testing.assert_array_equal(one.grad_log_stiffness, many.grad_log_stiffness)
+            np.testing.assert_array_equal(one.grad_collide, many.grad_collide)
+    if name not in DRAWN:
+        # Impulses add to both nodes of a pair, in any order.
+        check_frames(clip(name), optimised_frames(name, "cpu", torch.float32, True, True), range(QUIET_FRAME, QUIET_FRAME + 1))
 
 
 @pytest.mark.parametrize("device", DEVICES)

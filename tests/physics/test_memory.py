@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.solver import FrameSolver
@@ -43,37 +46,42 @@ def test_a_further_frame_keeps_its_start_only(substeps: int) -> None:
     assert saved_bytes(substeps, 9) - saved_bytes(substeps, 1) == 8 * 2 * 10 * VECTOR
 
 
-def buffer_bytes(solver: FrameSolver) -> int:
-    sizes = {view.ptr: view.capacity for view in solver.buffers.views.values()}
-    return sum((sizes | {t.data_ptr(): t.untyped_storage().nbytes() for t in solver.buffers.tensors.values()}).values())
+def storages(solver: FrameSolver) -> dict[int, int]:
+    """Bytes by address of everything that the solver keeps; the hash grid's cells are Warp's."""
+    b = solver.buffers
+    sizes = {view.ptr: view.capacity for view in b.views.values() if isinstance(view, wp.array)}
+    return sizes | {t.data_ptr(): t.untyped_storage().nbytes() for t in (*b.tensors.values(), *b.indices.values())}
 
 
-def test_buffers_do_not_grow_with_frames() -> None:
+@pytest.mark.parametrize("differentiable", [True, False])
+@pytest.mark.parametrize("threads", [False, True])
+def test_buffers_do_not_grow_with_frames(threads: bool, differentiable: bool) -> None:
     body, x, v, hands = random_scene(32, frames=12, self_collision=True)
-    for differentiable in (True, False):
-        solver = solver_for(body, hands.shape[1], differentiable=differentiable)
-        before, addresses = buffer_bytes(solver), {name: b.data_ptr() for name, b in solver.buffers.tensors.items()}
-        state = torch.tensor(x), torch.tensor(v)
-        for k in range(12):
-            state = solver.forward(*state, torch.tensor(hands[k]), torch.tensor(hands[k + 1]))
-            if differentiable:
-                solver.backward(*state)
-        assert buffer_bytes(solver) == before
-        assert {name: b.data_ptr() for name, b in solver.buffers.tensors.items()} == addresses
+    options: dict[str, Any] = {"dtype": torch.float32, "differentiable": differentiable, "threads": threads}
+    solver, motion = solver_for(body, hands.shape[1], **options), torch.tensor(hands, dtype=torch.float32)
+    before, grid = storages(solver), solver.buffers.views["grid"].id
+    state = torch.tensor(x, dtype=torch.float32), torch.tensor(v, dtype=torch.float32)
+    for k in range(12):
+        state = solver.forward(*state, motion[k], motion[k + 1])
+        if differentiable:
+            solver.backward(*state)
+    assert storages(solver) == before
+    assert solver.buffers.views["grid"].id == grid
 
 
-def test_forward_only_keeps_two_substeps() -> None:
-    """Differentiable: every substep of one frame. Forward only: independent of the number of substeps."""
+@pytest.mark.parametrize("twins", [1, 4])
+@pytest.mark.parametrize("threads", [False, True])
+def test_only_gradients_keep_all_substeps(threads: bool, twins: int) -> None:
+    """Differentiable: every substep of one frame, of each twin. Forward only: independent of the number of substeps."""
     sizes = {}
     for substeps in (10, 40):
         body, *_, hands = random_scene(33, substeps=substeps)
         for differentiable in (True, False):
-            sizes[substeps, differentiable] = buffer_bytes(
-                solver_for(body, hands.shape[1], dtype=torch.float32, differentiable=differentiable)
-            )
+            options: dict[str, Any] = {"dtype": torch.float32, "differentiable": differentiable, "threads": threads}
+            sizes[substeps, differentiable] = sum(storages(solver_for([body] * twins, hands.shape[1], **options)).values())
     assert sizes[40, False] == sizes[10, False]
     nodes, total = body.nodes, body.nodes + hands.shape[1]
-    assert sizes[40, True] - sizes[10, True] == 30 * (2 * total + nodes) * VECTOR
+    assert sizes[40, True] - sizes[10, True] == twins * 30 * (2 * total + nodes) * VECTOR
 
 
 def test_results_do_not_alias_the_buffers() -> None:

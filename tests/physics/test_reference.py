@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neuspring.physics import reference
-from tests.support.scenes import DEVICES, no_hands, random_scene, scene, warp
+from tests.support.scenes import WAYS, no_hands, random_scene, scene, warp
 
 # Two float64 programs of the same equations differ by rounding (1e-16 of 0.1 m and 1 m/s), amplified along 60 substeps of
 # stiff springs and bounces by less than 1e5; a decision that flips would show as 1e-6 or more.
@@ -29,14 +29,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("device", "threads"), WAYS)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_solver_equals_reference(variant: str, seed: int, device: str) -> None:
+def test_solver_equals_reference(variant: str, seed: int, device: str, threads: bool) -> None:
     body = random_scene(seed, **VARIANTS[variant])
     expected = reference.rollout(*body)
     for differentiable in (False, True):
-        for got, wanted in zip(warp(*body, device, differentiable=differentiable), expected, strict=True):
+        for got, wanted in zip(warp(*body, device, differentiable=differentiable, threads=threads), expected, strict=True):
             np.testing.assert_allclose(got, wanted, atol=SAME, rtol=0)
 
 

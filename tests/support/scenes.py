@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -16,8 +16,22 @@ from neuspring.physics import reference
 from neuspring.physics.autograd import pack
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver, Parameters
+from tests.support.devices import CUDA
 from tests.support.devices import DEVICES as DEVICES
 
+WAYS = [
+    pytest.param("cpu", False, id="cpu"),
+    pytest.param("cpu", True, id="cpu-threads"),
+    pytest.param("cuda:0", True, id="cuda:0", marks=CUDA),
+]
+"""(device, threads): the CPU also runs the kernels of a GPU, so that every machine tests them."""
+VARIANTS: dict[str, dict[str, Any]] = {
+    "free": {"on_ground": False},
+    "ground": {},
+    "self-collision": {"self_collision": True},
+    "all": {"self_collision": True, "up": "-z", "controller_velocity": True},
+}
+"""Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
 Engine = Callable[[Scene, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -84,12 +98,22 @@ def packed(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64
 
 
 def solver_for(
-    scene: Scene, controllers: int, device: str = "cpu", dtype: torch.dtype = torch.float64, *, differentiable: bool = True
+    scene: Scene | Sequence[Scene],
+    controllers: int,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float64,
+    *,
+    differentiable: bool = True,
+    threads: bool | None = None,
 ) -> FrameSolver:
-    """A FrameSolver with the scene's parameters set."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
-    solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
-    solver.set_parameters(packed(scene, device, dtype))
+    """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
+    if isinstance(scene, Scene):
+        solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
+        solver.set_parameters(packed(scene, device, dtype))
+        return solver
+    solver = FrameSolver(scene[0].springs, scene[0].nodes, controllers, [body.simulation for body in scene], **options)
+    solver.set_parameters(Parameters(*map(torch.stack, zip(*(packed(body, device, dtype) for body in scene), strict=True))))
     return solver
 
 
@@ -102,9 +126,10 @@ def warp(
     dtype: torch.dtype = torch.float64,
     *,
     differentiable: bool = False,
+    threads: bool | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`reference.rollout` with the Warp solver."""
-    solver = solver_for(scene, controllers.shape[1], device, dtype, differentiable=differentiable)
+    solver = solver_for(scene, controllers.shape[1], device, dtype, differentiable=differentiable, threads=threads)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(np.asarray(values), dtype=dtype, device=device)

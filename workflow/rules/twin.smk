@@ -21,7 +21,34 @@ rule search:
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
-            " --clusters {params.clusters} --seed {wildcards.seed} --output {output:q}"
+            f" --clusters {{params.clusters}} --seed {{wildcards.seed}} --twins-per-launch {CONFIG.twins_per_launch} --output {{output:q}}"
+        )
+
+
+# An accelerator alone: its checkpoints, which `fit` continues from, are those that the fits would have left one by one.
+rule fits:
+    input:
+        observations=rules.observe.output,
+        searches=INPUTS.searches_of_fits,
+    output:
+        f"{RESULTS}/{{scenario}}/fits.json",
+    log:
+        log_of("fits", "{scenario}"),
+    priority: GPU_FIRST
+    conda:
+        ENVIRONMENT
+    resources:
+        work=work("fits"),
+        gpu=gpu("fits"),
+        mem_mb=NEEDS.memory("fits"),
+        runtime=NEEDS.minutes("fits"),
+    params:
+        rows=INPUTS.rows_of_fits,
+        code=code_of("fits"),
+    shell:
+        gpu_job(
+            "fits --observations {input.observations:q} --rows {params.rows:q}"
+            f" --twins-per-launch {CONFIG.twins_per_launch} --output {{output:q}}"
         )
 
 
@@ -29,6 +56,9 @@ rule fit:
     input:
         observations=rules.observe.output,
         search=INPUTS.search_of_fit,
+        shared=lambda wildcards: [
+            ancient(path) for path in INPUTS.shared_launches(wildcards)
+        ],
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/fit.json",
     log:

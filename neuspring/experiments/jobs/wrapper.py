@@ -202,7 +202,7 @@ def _measured(record: JobRecord, command: Sequence[str]) -> JobRecord:
         updates = float(read_json(output, RECORD_FORMAT)["facts"][SPRING_UPDATES])
     except (InputError, KeyError, TypeError, ValueError):
         return record
-    return replace(record, work=updates / 1e9, unit=GIGA_UPDATES) if updates > 0 else record
+    return replace(record, work=updates / 1e9, unit=GIGA_UPDATES)
 
 
 def _lease(job: Job, notes: Path | None) -> gpus.Lease | None:

@@ -1,0 +1,382 @@
+"""Twins simulated together: each gets, bit for bit, what it gets alone, whatever its company, and however a frame is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuspring.core.errors import InputError
+from neuspring.physics import reference
+from neuspring.physics.autograd import pack, simulate_frame
+from neuspring.physics.reference import Scene
+from neuspring.physics.solver import FrameSolver
+from tests.support.scenes import VARIANTS, WAYS, random_scene, scene, solver_for, tensors
+
+SINGLE, DOUBLE = torch.float32, torch.float64
+ROUNDING = 1e-5
+"""Float32 sums of the same terms in another order, relative to the largest entry: each term is rounded to 6e-8,
+then carried through tens of substeps."""
+SUBSTEPS = (10, 13, 11, 15, 10, 12, 7)
+"""Of the first twins; then again."""
+SIZES = [(SINGLE, count) for count in (1, 3, 4, 8, 16, 17)] + [(DOUBLE, count) for count in (1, 3, 4)]
+"""Less than, as many as, and more than a width of lanes."""
+
+
+class Member(NamedTuple):
+    """A twin of a population: its scene, start and hands."""
+
+    body: Scene
+    x: np.ndarray
+    v: np.ndarray
+    hands: np.ndarray
+
+
+def member(number: int, variant: str) -> Member:
+    """Twins on the same graph, near each other, and different in everything else."""
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, **VARIANTS[variant])
+    rng, springs = np.random.default_rng(number), len(body.springs)
+    body = replace(
+        body,
+        stiffness=body.stiffness * rng.uniform(0.5, 2.0, springs),
+        rest_lengths=body.rest_lengths * rng.uniform(0.9, 1.1, springs),
+        dashpot=body.dashpot * rng.uniform(0.5, 2.0, springs),
+        drag=body.drag * rng.uniform(0.5, 2.0),
+        ground=tuple(rng.uniform(0.1, 0.9, 2)),
+        contact=tuple(rng.uniform(0.1, 0.9, 2)),
+        contact_distance=rng.uniform(0.02, 0.045),
+        simulation=replace(body.simulation, substeps=SUBSTEPS[number % len(SUBSTEPS)], frame_time=rng.uniform(0.018, 0.022)),
+    )
+    shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
+    return Member(body, x + shift[0], v + shift[1], hands + shift[2])
+
+
+Results = dict[str, np.ndarray]
+
+
+def results(solver: FrameSolver, x: Any, v: Any, hands: Any) -> Results:
+    """Two frames, and the adjoints of the second for a fixed loss. Arrays as the solver takes them, hands [.., F, C, 3]."""
+    x, v, hands = (torch.tensor(np.asarray(values), dtype=solver.dtype, device=solver.device) for values in (x, v, hands))
+    first = solver.forward(x, v, hands[..., 0, :, :], hands[..., 1, :, :])
+    second = solver.forward(*first, hands[..., 1, :, :], hands[..., 2, :, :])
+    weight = torch.tensor(np.random.default_rng(7).standard_normal((2, *x.shape[-2:]))).to(x)
+    adjoints = solver.backward(*(values.expand_as(x) for values in weight))
+    names = ("x", "v", "springs", "decay", "ground", "contact")
+    states = {"first x": first[0], "first v": first[1], "second x": second[0], "second v": second[1]}
+    named = states | {f"adjoint {name}": values for name, values in zip(names, adjoints, strict=False) if values is not None}
+    return {name: values.cpu().numpy() for name, values in named.items()}
+
+
+def together(members: Sequence[Member], dtype: torch.dtype, **options: Any) -> Results:
+    """Results [B, ...] of twins in one solver."""
+    solver = solver_for([one.body for one in members], members[0].hands.shape[1], dtype=dtype, **options)
+    return results(solver, *(np.stack(values) for values in list(zip(*members, strict=True))[1:]))
+
+
+def alone(one: Member, dtype: torch.dtype, **options: Any) -> Results:
+    return results(solver_for(one.body, one.hands.shape[1], dtype=dtype, **options), *one[1:])
+
+
+@cache
+def member_alone(number: int, variant: str, dtype: torch.dtype) -> Results:
+    return alone(member(number, variant), dtype)
+
+
+def assert_same(got: Results, wanted: Results, label: Any = "") -> None:
+    assert got.keys() == wanted.keys()
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(got[name], values, err_msg=f"{label} {name}")
+
+
+def of(population: Results, number: int) -> Results:
+    return {name: values[number] for name, values in population.items()}
+
+
+# Alone and in company -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("dtype", "count"), SIZES)
+def test_a_twin_gets_what_it_gets_alone(dtype: torch.dtype, count: int, variant: str) -> None:
+    got = together([member(number, variant) for number in range(count)], dtype)
+    for number in range(count):
+        assert_same(of(got, number), member_alone(number, variant, dtype), number)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_twins_differ_and_are_lively(variant: str) -> None:
+    """Otherwise equality would say little: each reaches its contacts, and none is another's copy."""
+    members = [member(number, variant) for number in range(17)]
+    simulation = members[0].body.simulation
+    for name, on in (("ground", simulation.ground), ("contact", simulation.self_collision)):
+        touched = [bool(member_alone(number, variant, SINGLE)[f"adjoint {name}"].any()) for number in range(17)]
+        assert sum(touched) >= 12 if on else not any(touched), name
+    ends = np.stack([member_alone(number, variant, SINGLE)["second x"] for number in range(17)])
+    gaps = np.abs(ends[:, None] - ends[None]).max(axis=(2, 3))
+    assert (gaps[np.triu_indices(17, 1)] > 1e-3).all()
+
+
+def test_a_twin_agrees_with_the_reference_in_company() -> None:
+    """Each twin's own parameters, substeps and hands, against a program without lanes."""
+    members = [member(number, "all") for number in range(3)]
+    got = together(members, DOUBLE)
+    for number, (body, x, v, hands) in enumerate(members):
+        xs, vs = reference.rollout(body, x, v, hands[:3])
+        # As in test_reference: rounding, amplified along the substeps.
+        np.testing.assert_allclose(of(got, number)["second x"], xs[2], atol=1e-9, rtol=0)
+        np.testing.assert_allclose(of(got, number)["second v"], vs[2], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+def test_twins_have_graphs_of_their_own(dtype: torch.dtype, variant: str) -> None:
+    """The solver holds the union of their springs; absent ones have neither stiffness nor dashpot, and change nothing."""
+    members, rng = [member(number, variant) for number in range(3)], np.random.default_rng(1)
+    present = rng.random((3, len(members[0].body.springs))) < 0.6
+    assert len({row.tobytes() for row in present}) == 3
+    union = [
+        one._replace(body=replace(one.body, stiffness=one.body.stiffness * own, dashpot=one.body.dashpot * own))
+        for one, own in zip(members, present, strict=True)
+    ]
+    got = together(union, dtype)
+    for number, (one, own) in enumerate(zip(members, present, strict=True)):
+        names = ("springs", "stiffness", "rest_lengths", "dashpot")
+        body = replace(one.body, **{name: getattr(one.body, name)[own] for name in names})
+        in_union = of(got, number)
+        in_union["adjoint springs"] = in_union["adjoint springs"][own]
+        assert_same(in_union, alone(one._replace(body=body), dtype), number)
+
+
+def assert_same_by_threads(got: Results, wanted: Results, variant: str) -> None:
+    """Bit for bit; but adjoints of impulses add to both nodes of a pair in any order."""
+    for name, values in wanted.items():
+        if VARIANTS[variant].get("self_collision") and name.startswith("adjoint"):
+            np.testing.assert_allclose(got[name], values, atol=ROUNDING * np.abs(values).max(), rtol=0, err_msg=name)
+        else:
+            np.testing.assert_array_equal(got[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_thread_per_node_gives_what_one_thread_gives(variant: str) -> None:
+    members = [member(number, variant) for number in range(3)]
+    assert_same_by_threads(together(members, SINGLE, threads=True), together(members, SINGLE), variant)
+
+
+@pytest.mark.parametrize(("device", "threads"), WAYS)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_twin_gets_what_it_gets_alone_each_way(variant: str, device: str, threads: bool) -> None:
+    members, options = [member(number, variant) for number in range(3)], {"device": device, "threads": threads}
+    got = together(members, SINGLE, **options)
+    for number, one in enumerate(members):
+        assert_same_by_threads(of(got, number), alone(one, SINGLE, **options), variant)
+
+
+@pytest.mark.parametrize("broken", range(4))
+@pytest.mark.parametrize("variant", ["ground", "all"])
+@pytest.mark.parametrize("how", ["nan", "infinite speed", "far away", "divergence"])
+def test_a_broken_twin_breaks_no_other(how: str, variant: str, broken: int) -> None:
+    members = [member(number, variant) for number in range(4)]
+    one = members[broken]
+    members[broken] = {
+        "nan": one._replace(x=np.where(np.arange(6)[:, None] == 2, np.nan, one.x)),
+        "infinite speed": one._replace(v=one.v * np.inf),
+        "far away": one._replace(x=one.x * 1e30),
+        "divergence": one._replace(body=replace(one.body, stiffness=one.body.stiffness * 1e30)),
+    }[how]
+    got = together(members, SINGLE)
+    sick = of(got, broken)["second x"]
+    assert not np.isfinite(sick).all() or np.abs(sick).max() > 1e6
+    for number in set(range(4)) - {broken}:
+        assert_same(of(got, number), member_alone(number, variant, SINGLE), number)
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("gravity", 1.6), ("up", "-z"), ("ground", False), ("self_collision", True), ("collision_capacity", 7),
+    ("controller_velocity", True),
+])  # fmt: skip
+def test_twins_share_their_physics(name: str, value: Any) -> None:
+    """What the solver takes from the first would be wrong for the others."""
+    body, *_ = member(0, "ground")
+    with pytest.raises(InputError, match=rf"simulation\.{name}.*same for all twins"):
+        solver_for([body, replace(body, simulation=replace(body.simulation, **{name: value}))], 2)
+
+
+# The list of springs --------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.data())
+def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject) -> None:
+    one = member(data.draw(st.integers(0, 5)), data.draw(st.sampled_from(sorted(VARIANTS))))
+    count = len(one.body.springs)
+    order = np.array(data.draw(st.permutations(range(count))))
+    turned = np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+    springs = one.body.springs[order]
+    springs = np.where(turned[:, None], springs[:, ::-1], springs)
+    other = replace(one.body, springs=springs, **{n: getattr(one.body, n)[order] for n in ("stiffness", "rest_lengths", "dashpot")})
+    wanted, got = alone(one, SINGLE), alone(one._replace(body=other), SINGLE)
+    wanted["adjoint springs"] = wanted["adjoint springs"][order]
+    assert_same(got, wanted)
+
+
+# Lists of collision partners ------------------------------------------------------------------------------------------
+
+DISTANCE = 0.02
+
+
+def partners(clouds: Sequence[np.ndarray], dtype: torch.dtype, capacity: int, distance: float) -> tuple[list[Any], list[int]]:
+    """Lists of partners at the start of a frame, of each twin and node, and what did not fit, of each twin."""
+    options: dict[str, Any] = {"self_collision": True, "contact_distance": distance, "collision_capacity": capacity}
+    solver = solver_for([scene(len(cloud), **options) for cloud in clouds], 0, dtype=dtype)
+    x, nobody = torch.tensor(np.stack(clouds), dtype=dtype), torch.zeros(len(clouds), 0, 3, dtype=dtype)
+    solver.forward(x, 0 * x, nobody, nobody)
+    b = solver.buffers
+    near, lanes, counts = (b.indices[name].numpy() for name in ("near", "near_lanes", "near_count"))
+    lists = []
+    for twin in range(len(clouds)):
+        group, lane = divmod(twin, b.width)
+        rows = zip(near[..., group], lanes[..., group] >> lane & 1, counts[:, group], strict=True)
+        lists.append([row[:count][bits[:count] == 1].tolist() for row, bits, count in rows])
+    return lists, solver.overflows
+
+
+def expected(cloud: np.ndarray, dtype: torch.dtype, distance: float) -> list[list[int]]:
+    """The same from the specification, in the engine's precision."""
+    kind = np.float32 if dtype == SINGLE else np.float64
+    pairs = reference.candidates(cloud.astype(kind), kind(distance))
+    return [pairs[pairs[:, 0] == i, 1].tolist() for i in range(len(cloud))]
+
+
+def cloud(kind: str) -> np.ndarray:
+    """[N, 3] around the origin, far from it, on the borders of the grid's cells, or wider than the grid."""
+    rng, steps = np.random.default_rng(3), np.arange(-3, 4) * DISTANCE / 2
+    lattice = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    return {
+        "around the origin": rng.uniform(-0.04, 0.04, (150, 3)),
+        "far away": rng.uniform(-0.04, 0.04, (150, 3)) + np.array([900.0, -700.0, 500.0]),
+        "cell borders": lattice,
+        "far cell borders": lattice + np.array([5000, -3000, 7000]) * DISTANCE,
+        "just off cell borders": lattice + rng.choice([-1e-7, 0.0, 1e-7], lattice.shape),
+        # Points 64 cells apart share a cell.
+        "wider than the grid": rng.uniform(-0.03, 0.03, (150, 3)) + rng.integers(0, 2, (150, 3)) * 64 * DISTANCE,
+        "in one place": np.repeat(rng.uniform(-0.04, 0.04, (5, 3)), 6, axis=0),
+    }[kind]
+
+
+CLOUDS = ("around the origin", "far away", "cell borders", "far cell borders", "just off cell borders", "wider than the grid",
+          "in one place")  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype) -> None:
+    x = cloud(kind)
+    wanted = expected(x, dtype, DISTANCE)
+    assert sum(map(len, wanted)) > len(x)
+    lists, overflow = partners([x], dtype, 500, DISTANCE)
+    assert lists == [wanted]
+    assert overflow == [0]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.005, 0.1), st.floats(-3.0, 3.0), st.sampled_from([SINGLE, DOUBLE]))
+def test_the_grid_finds_all_pairs_of_any_cloud(seed: int, distance: float, decades: float, dtype: torch.dtype) -> None:
+    """Random clouds of random extent, at random distances of up to a kilometer from the origin."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-2, 2, (30, 3)) * distance + rng.uniform(-1, 1, 3) * 10.0**decades
+    assert partners([x], dtype, 500, distance)[0] == [expected(x, dtype, distance)]
+
+
+def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
+    """Twins in which different nodes, 3 to 8 of them, are all near each other; the others are lonely."""
+    clouds = []
+    for twin in range(count):
+        rng = np.random.default_rng(twin)
+        x, crowd = np.arange(1, nodes + 1)[:, None] * [0.0, 1.0, 0.0], rng.permutation(nodes)[: 3 + twin % 6]
+        x[crowd] = rng.uniform(-0.004, 0.004, (len(crowd), 3))
+        clouds.append(x)
+    return clouds
+
+
+@pytest.mark.parametrize("count", [1, 3, 17])
+@pytest.mark.parametrize("capacity", [50, 12])
+def test_twins_share_lists_but_not_partners(capacity: int, count: int) -> None:
+    """Each has its own pairs; none overflows."""
+    clouds = crowds(count)
+    lists, overflow = partners(clouds, SINGLE, capacity, DISTANCE)
+    assert lists == [expected(x, SINGLE, DISTANCE) for x in clouds]
+    assert overflow == [0] * count
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_overflow_is_counted_for_each_twin(count: int) -> None:
+    """A full list keeps the partners that come first, of each twin those it keeps alone, and says whose did not fit."""
+    crowd = np.random.default_rng(5).permutation(24)[:8]
+    clouds = []
+    for twin in range(count):
+        x = np.arange(1, 25)[:, None] * [0.0, 1.0, 0.0]
+        x[crowd[2 * twin % 8 :]] = np.random.default_rng(twin).uniform(-0.004, 0.004, (8 - 2 * twin % 8, 3))
+        clouds.append(x)
+    lists, overflow = partners(clouds, SINGLE, 4, DISTANCE)
+    wanted = [expected(x, SINGLE, DISTANCE) for x in clouds]
+    assert lists == [[row[:4] for row in rows] for rows in wanted]
+    assert overflow == [8 * 3, 6 * 1, 0, 0][:count]
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 5])
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int) -> None:
+    """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
+    clouds = crowds(17 if dtype == SINGLE else 4)
+    clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
+    lists, overflow = partners(clouds, dtype, capacity, DISTANCE)
+    wanted = [expected(x, dtype, DISTANCE) for x in clouds]
+    assert lists == [[row[:capacity] for row in rows] for rows in wanted]
+    assert overflow == [sum(max(len(row) - capacity, 0) for row in rows) for rows in wanted]
+    assert overflow[2] > 100
+
+
+def test_contact_distances_are_those_of_each_twin() -> None:
+    """The grid's cells are as wide as the largest; a twin with a smaller one lists no more than its own."""
+    x = cloud("around the origin")
+    scenes = [scene(len(x), self_collision=True, contact_distance=distance) for distance in (0.005, 0.02, 0.011)]
+    solver, nobody = solver_for(scenes, 0), torch.zeros(3, 0, 3, dtype=DOUBLE)
+    stacked = torch.tensor(np.stack([x] * 3))
+    solver.forward(stacked, 0 * stacked, nobody, nobody)
+    found = solver.buffers.indices["near_lanes"][..., 0]
+    listed = torch.arange(found.shape[1]) < solver.buffers.indices["near_count"]
+    counts = [int(((found >> lane & 1) * listed).sum()) for lane in range(3)]
+    assert counts == [len(reference.candidates(x, distance)) for distance in (0.005, 0.02, 0.011)]
+
+
+# Gradients ------------------------------------------------------------------------------------------------------------
+
+LEARNED = ("stiffness", "rest_lengths", "dashpot", "drag", "ground_elasticity", "contact_friction")
+
+
+def test_gradcheck_of_two_twins() -> None:
+    """torch.autograd.gradcheck over pack and simulate_frame of a batch; a twin's results depend on no other's inputs."""
+    members = [member(number, "all") for number in (0, 1)]
+    solver = solver_for([one.body for one in members], members[0].hands.shape[1])
+    values = [tensors(one.body) for one in members]
+    begin, end = (torch.tensor(np.stack([one.hands[k] for one in members])) for k in (0, 1))
+
+    def run(x: torch.Tensor, v: torch.Tensor, *learned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        packs = []
+        for k, one in enumerate(members):
+            own = {name: batch[k] for name, batch in zip(LEARNED, learned, strict=True)}
+            packs.append(pack(**(values[k] | own), substep=one.body.simulation.substep))
+        return simulate_frame(solver, type(packs[0])(*map(torch.stack, zip(*packs, strict=True))), x, v, begin, end)
+
+    inputs = [torch.tensor(np.stack([getattr(one, name) for one in members])) for name in ("x", "v")]
+    inputs += [torch.stack([own[name] for own in values]) for name in LEARNED]
+    inputs = [value.clone().requires_grad_() for value in inputs]
+    # As for one twin in test_gradients.
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)

@@ -1,0 +1,148 @@
+"""Fits that share launches leave what each would leave alone; what goes wrong with one is its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.stages import fit, fits, observe, options, search
+from tests.support import small
+
+SETTINGS = config.Config(
+    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    fit=config.Fit(epochs=3, checkpoint_every=2, field=config.SpringField(channels=4, hidden=16, bands=2)),
+    toy=config.Toy(frames=8),
+    device="cpu",
+)
+ROWS = {"springs": SETTINGS.fit, "field": SETTINGS.fit, "ten": replace(SETTINGS.fit, horizon=3)}
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Observations, and the searches of two seeds."""
+    folder = tmp_path_factory.mktemp("started")
+    observe.run(small.row(), SETTINGS, folder / "observations.npz")
+    for seed in (0, 1):
+        search.run(folder / "observations.npz", SETTINGS, 1, seed, "cpu", folder / f"search-{seed}" / "search.json")
+    return folder
+
+
+def text(name: str) -> str:
+    return json.dumps({"fit": config.plain(ROWS[name])})
+
+
+def rows_of(started: Path, folder: Path) -> list[fits.Row]:
+    """Three rows of the method table, two seeds each; the last has another horizon."""
+    return [
+        fits.Row(
+            kind="field" if name == "field" else "springs",
+            settings=text(name),
+            fits={str(folder / name / str(k) / "fit.json"): str(started / f"search-{k}" / "search.json") for k in (0, 1)},
+        )
+        for name in ROWS
+    ]
+
+
+def finish(started: Path, rows: list[fits.Row]) -> None:
+    """The jobs of the fits themselves."""
+    for row in rows:
+        for output, found in row.fits.items():
+            seen, settings = started / "observations.npz", options.read_settings(row.settings)
+            fit.run(seen, Path(found), settings, row.kind, "cpu", Path(output))
+
+
+@pytest.fixture(scope="module")
+def alone(started: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fits one by one."""
+    folder = tmp_path_factory.mktemp("alone")
+    finish(started, rows_of(started, folder))
+    return folder
+
+
+def assert_same(got: Path, wanted: Path) -> None:
+    """Equal twins and histories, bit for bit."""
+    for name in ROWS:
+        for seed in ("0", "1"):
+            one, other = (folder / name / seed for folder in (got, wanted))
+            pd.testing.assert_frame_equal(
+                pd.read_parquet(one / "history.parquet"), pd.read_parquet(other / "history.parquet"), check_exact=True
+            )
+            twins = [Twin.load(folder / "twin.npz") for folder in (one, other)]
+            assert twins[0].simulation == twins[1].simulation
+            for array in ("stiffness", "dashpot"):
+                np.testing.assert_array_equal(*(getattr(twin.material, array) for twin in twins))
+            records = [StageRecord.load(folder / "fit.json") for folder in (one, other)]
+            assert (records[0].settings, records[0].inputs) == (records[1].settings, records[1].inputs)
+
+
+@pytest.mark.parametrize("most", [0, 3])
+def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Path, tmp_path: Path, most: int) -> None:
+    rows = rows_of(started, tmp_path)
+    fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json", most)
+    record = StageRecord.load(tmp_path / "fits.json")
+    sizes = [len(company) for company in record.facts["companies"]]
+    # Four of one horizon and two of another; of three at most, one would be alone, and is left to itself.
+    assert sizes == ([4, 2] if most == 0 else [3, 2])
+    assert record.facts["errors"] == {}
+    finish(started, rows)
+    assert_same(tmp_path, alone)
+    together = {path for company in record.facts["companies"] for path in company}
+    for row in rows:
+        for output in row.fits:
+            facts, attempts = StageRecord.load(Path(output)).facts, StageRecord.load(Path(output)).attempts
+            assert (facts["epochs_together"], attempts) == ((3, 1) if output in together else (0, 1))
+            assert (facts["spring_updates"] == 0) == (output in together)
+            assert not Path(output).with_name("fit.partial.npz").exists()
+
+
+def test_finished_fits_and_failed_searches_are_left_alone(started: Path, alone: Path, tmp_path: Path) -> None:
+    rows = rows_of(started, alone)
+    broken = tmp_path / "failed.json"
+    replace(StageRecord.load(started / "search-0" / "search.json"), status="failed", reason="x").save(broken)
+    rows.append(fits.Row(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
+    before = {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()}
+    fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json")
+    assert StageRecord.load(tmp_path / "fits.json").facts["companies"] == []
+    assert {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()} == before
+
+
+def test_a_fit_with_other_settings_is_made_again(started: Path, alone: Path, tmp_path: Path) -> None:
+    rows = rows_of(started, tmp_path)
+    finish(started, rows)
+    longer = [replace(row, settings=json.dumps({"fit": {"epochs": 4}})) for row in rows[:1]]
+    fits.run(started / "observations.npz", longer, "cpu", tmp_path / "fits.json")
+    assert len(StageRecord.load(tmp_path / "fits.json").facts["companies"][0]) == 2
+
+
+def test_an_error_of_one_is_named_and_holds_nobody_up(
+    started: Path, alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, original = rows_of(started, tmp_path), fits.fit
+
+    def failing(problem: object, *, partial: Path, **more: object) -> object:
+        if partial.parent == tmp_path / "field" / "1":
+            raise MemoryError("too large")
+        return original(problem, partial=partial, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fits, "fit", failing)
+        fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json")
+    errors = StageRecord.load(tmp_path / "fits.json").facts["errors"]
+    assert errors == {str(tmp_path / "field" / "1" / "fit.json"): "MemoryError: too large"}
+    finish(started, rows)
+    assert_same(tmp_path, alone)
+
+
+@pytest.mark.parametrize(("given", "message"), [("{", "must be JSON"), ("{}", "a list of rows"), ('[{"kind": "x"}]', "entry 0")])
+def test_bad_rows(given: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        fits.read_rows(given)

@@ -1,0 +1,105 @@
+"""Fits in company: the same numbers, bit for bit, as each alone, whatever the others do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuspring import config
+from neuspring.core.errors import NumericalFailure
+from neuspring.twin import fit as module
+from neuspring.twin.company import together
+from neuspring.twin.fit import FitProblem, FitResult, fit
+from tests.support import small
+
+FIELD = config.SpringField(channels=4, hidden=16, bands=2)
+
+
+def several() -> list[FitProblem]:
+    """Springs and fields, topologies and substeps of their own, in step and out of step."""
+    values = small.start_values()
+    base = small.fit_problem()
+    coarse = small.fit_problem(values=values | {"object_neighbours": 7.0, "stiffness": 2e4})
+    return [
+        base,
+        replace(base, fit=replace(base.fit, learning_rate=2e-2)),
+        replace(coarse, kind="field", seed=3, fit=replace(base.fit, field=FIELD, learning_rate=5e-3)),
+        replace(base, fit=replace(base.fit, horizon=3, epochs=4)),
+        replace(coarse, fit=replace(base.fit, horizon=0, selection="tail", epochs=2)),
+    ]
+
+
+def in_company(problems: list[FitProblem], **more) -> list[FitResult | Exception]:
+    works = [lambda seat, problem=problem: fit(problem, seat=seat, **more) for problem in problems]
+    return together([problem.twin for problem in problems], "cpu", works)
+
+
+def assert_equal(got: FitResult | Exception, wanted: FitResult) -> None:
+    assert isinstance(got, FitResult), got
+    pd.testing.assert_frame_equal(got.history, wanted.history, check_exact=True)
+    assert (got.best_epoch, got.best_loss, got.rollbacks) == (wanted.best_epoch, wanted.best_loss, wanted.rollbacks)
+    assert got.twin.simulation == wanted.twin.simulation
+    for part in ("topology", "material"):
+        for name, value in vars(getattr(wanted.twin, part)).items():
+            np.testing.assert_array_equal(getattr(getattr(got.twin, part), name), value, err_msg=name)
+
+
+def test_fits_in_company_equal_those_alone() -> None:
+    problems = several()
+    for got, problem in zip(in_company(problems), problems, strict=True):
+        assert_equal(got, fit(problem))
+
+
+def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
+    frames = []
+    original = module.FrameSolver.forward
+    monkeypatch.setattr(module.FrameSolver, "forward", lambda self, *a: frames.append(len(a[0])) or original(self, *a))
+    fit(small.fit_problem())
+    alone = len(frames)
+    frames.clear()
+    in_company([small.fit_problem(fit=replace(small.fit_problem().fit, learning_rate=rate)) for rate in (1e-2, 2e-2, 5e-2)])
+    assert (len(frames), frames[0]) == (alone, 3)
+
+
+def test_one_that_fails_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems = several()[:3]
+    broken = replace(problems[1], twin=replace(problems[1].twin, simulation=replace(problems[1].twin.simulation, substeps=1)))
+    broken = replace(broken, simulation=replace(broken.simulation, substeps=1))
+    results = in_company([problems[0], broken, problems[2]])
+    assert isinstance(results[1], NumericalFailure)
+    for k in (0, 2):
+        assert_equal(results[k], fit(problems[k]))
+
+
+def test_growing_substeps_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that stiffens beyond its substeps takes more, and the others go on as they would."""
+    problems = several()[:2]
+    fast = replace(problems[0], fit=replace(problems[0].fit, learning_rate=1.0, epochs=3))
+    results = in_company([fast, problems[1]])
+    assert results[0].twin.simulation.substeps >= fast.twin.simulation.substeps
+    for got, problem in zip(results, (fast, problems[1]), strict=True):
+        assert_equal(got, fit(problem))
+
+
+def test_an_error_in_the_shared_launch_reaches_everyone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(module.FrameSolver, "forward", fail)
+    results = in_company(several()[:3])
+    assert [str(result) for result in results] == ["no memory"] * 3
+
+
+def test_self_collision_in_company() -> None:
+    base = small.fit_problem()
+    seen = base.observations
+    crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
+    problems = [small.fit_problem(crowded, fit=replace(base.fit, learning_rate=rate)) for rate in (1e-2, 5e-2)]
+    for got, problem in zip(in_company(problems), problems, strict=True):
+        assert_equal(got, fit(problem))
+        assert torch.is_grad_enabled()
