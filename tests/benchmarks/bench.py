@@ -5,7 +5,7 @@
 On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table and the machine's
 limits, and how every row changed since the table of the same kind of machine that was committed last. Writes
 results/bench/<kind of machine>.json, or with --save results/published/bench/<kind of machine>.json, which is to be committed. Some
-ten minutes on a CPU, less than two on a GPU.
+five minutes on a CPU; the sections of a GPU are chosen to end within two.
 """
 
 from __future__ import annotations
