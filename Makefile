@@ -45,11 +45,9 @@ format: $(INSTALLED)
 	$(BIN)/snakefmt Snakefile workflow/rules
 
 bench: $(INSTALLED)
-	$(BIN)/python -m tests.benchmarks.bench_frame
-	$(BIN)/python -m tests.benchmarks.bench_adjoint
+	$(BIN)/python -m tests.benchmarks.bench
 	$(BIN)/python -m tests.benchmarks.bench_splats
 	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
-	$(BIN)/python -m tests.benchmarks.bench_start
 	$(BIN)/python -m tests.benchmarks.bench_workflow
 
 # Needs a GPU; `make gpu GPU_OPTIONS=--again` passes options. See tests/benchmarks/GPU.md.

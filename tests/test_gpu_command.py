@@ -192,6 +192,11 @@ def test_the_benchmark_must_write_something_new(tmp_path):
     assert read_benchmark(tmp_path, begin)["rows"] == {"new.json": {"rows": [1]}}
 
 
+def test_the_benchmark_is_a_short_one_on_a_cpu(tmp_path):
+    on_cpu, on_gpu = ({part.name: part.command for part in parts(device, tmp_path)}["bench"] for device in ("cpu", "cuda:0"))
+    assert on_cpu[-3:] == ["--device", "cpu", "--quick"] and on_gpu[-2:] == ["--device", "cuda:0"]
+
+
 def test_every_test_on_a_gpu_is_selected():
     for path in (ROOT / "tests").rglob("test_*.py"):
         text = path.read_text()

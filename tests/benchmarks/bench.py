@@ -1,8 +1,11 @@
-"""The table of times of the simulator: python -m tests.benchmarks.bench [--quick] [--only SECTION] [--peer CHECKOUT] [--save]
+"""The table of times of the simulator:
 
-On the CPU, one thread, and on the first GPU where there is one. Prints one table and this machine's limits, and how every row
-changed since the table of the same kind of machine that was committed last. Writes results/bench/<kind of machine>.json, or with
---save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes; --quick less than one.
+    python -m tests.benchmarks.bench [--quick] [--only SECTION] [--device DEVICE] [--peer CHECKOUT] [--save]
+
+On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table and the machine's
+limits, and how every row changed since the table of the same kind of machine that was committed last. Writes
+results/bench/<kind of machine>.json, or with --save results/published/bench/<kind of machine>.json, which is to be committed. Some
+five minutes on a CPU; the sections of a GPU are chosen to end within two.
 """
 
 from __future__ import annotations
@@ -15,12 +18,13 @@ from pathlib import Path
 
 import torch
 
-from neuspring.core.device import start_warp
+from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
 from tests.benchmarks import limits, machine, table
 from tests.benchmarks.ours import Ours
 from tests.benchmarks.phystwin import PhysTwin
-from tests.benchmarks.sections import SECTIONS, Bench
+from tests.benchmarks.rows import Bench
+from tests.benchmarks.sections import ON_CUDA, SECTIONS
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -33,11 +37,11 @@ def main(arguments: list[str] | None = None) -> None:
     rows: list[table.Row] = []
     notes: list[str] = []
     measured: dict[str, limits.Limits] = {}
-    for device in ("cpu", *(["cuda:0"] if torch.cuda.is_available() else [])):
+    for device in devices(options.device):
         peer = PhysTwin(options.peer, device) if options.peer else None
         measured[device] = limits.measure(device)
         bench = Bench(device, measured[device], Ours(device), peer, options.quick, notes)
-        for section in options.only or SECTIONS:
+        for section in options.only or (SECTIONS if device == "cpu" else ON_CUDA):
             begin = time.perf_counter()
             rows += SECTIONS[section](bench)
             print(f"{section}, {device}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
@@ -51,16 +55,22 @@ def main(arguments: list[str] | None = None) -> None:
     print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
 
 
+def devices(chosen: str | None) -> list[str]:
+    """What to measure on: the device that was chosen, or the CPU and the first GPU where there is one."""
+    return [resolve_device(chosen)] if chosen else ["cpu", *(["cuda:0"] if torch.cuda.is_available() else [])]
+
+
 def parsed(arguments: list[str] | None) -> argparse.Namespace:
     """The options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer rows and rounds; not to be saved")
     parser.add_argument("--only", action="append", choices=list(SECTIONS), metavar="SECTION", help=", ".join(SECTIONS))
+    parser.add_argument("--device", metavar="DEVICE", help="cpu or cuda:0 alone; default: both where there is a GPU")
     parser.add_argument("--peer", type=Path, metavar="CHECKOUT", help="a checkout of PhysTwin, whose simulator is then timed too")
     parser.add_argument("--save", action="store_true", help=f"write into {table.COMMITTED}")
     options = parser.parse_args(arguments)
-    if options.save and (options.quick or options.only):
-        parser.error("--save keeps a whole table: without --quick and --only")
+    if options.save and (options.quick or options.only or options.device):
+        parser.error("--save keeps a whole table: without --quick, --only and --device")
     return options
 
 

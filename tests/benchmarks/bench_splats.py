@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import time
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,8 +19,8 @@ from neuspring.core.errors import InputError
 from neuspring.splats.rasterise import Backend, choose_backend, rasterise
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
-from tests.benchmarks.bench_frame import timed
 from tests.benchmarks.memory import peak_mib, reset_peak
+from tests.benchmarks.simulators import take_turns
 
 SIZES = ((212, 120), (424, 240), (848, 480))
 COUNTS = (2_000, 10_000, 50_000)
@@ -75,8 +76,8 @@ def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend:
         before = torch.cuda.memory_allocated() / 2**20
         both()
         grown = torch.cuda.max_memory_allocated() / 2**20 - before
-    _, first = timed(forward, repeats, device)
-    _, second = timed(both, repeats, device)
+    times = take_turns({"forward": forward, "both": both}, device, rounds=repeats, least=repeats)
+    first, second = times["forward"].median, times["both"].median
     row = f"{backend:>8}{size[0]:>6} x {size[1]:<4}{count:>8}{1e3 * first:>12.1f}{1e3 * second:>16.1f}{grown:>14.0f}"
     print(row, flush=True)
     return second
@@ -91,7 +92,8 @@ def skinning(device: str) -> None:
         turns = torch.zeros(count, 4, device=device)
         turns[:, 0] = 1
         skin = Skin(nodes, device=device)
-        _, median = timed(lambda skin=skin, nodes=nodes, m=means, q=turns: skin.step(nodes, nodes + 0.001, m, q), 5, device)
+        step = partial(skin.step, nodes, nodes + 0.001, means, turns)
+        median = take_turns({"step": step}, device, rounds=5, least=5)["step"].median
         print(f"{count:>8}{len(nodes):>8}{1e3 * median:>12.2f}{1e9 * median / count:>12.0f}")
 
 

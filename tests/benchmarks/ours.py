@@ -9,7 +9,9 @@ import torch
 from torch.nn.functional import smooth_l1_loss
 
 from neuspring.core.artifacts import Twin
-from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
+from neuspring.physics import reference
+from neuspring.physics.autograd import simulate_frame, solver_for
+from neuspring.physics.population import packed, solver_of, stacked, union
 from neuspring.physics.solver import Parameters
 from tests.benchmarks.simulators import Frame
 
@@ -37,42 +39,60 @@ class Ours:
         """One frame of one twin and the gradient of its loss."""
         solver = solver_for(twin, self.device, differentiable=True)
         x, v, begin, end = self._start(twin, hands)
-        packed = self._packed(twin)
+        parameters = self._packed(twin)
         last: list[torch.Tensor] = []
 
         def run() -> None:
-            packed.springs.grad = None
-            last[:] = simulate_frame(solver, packed, x, v, begin, end)
+            parameters.springs.grad = None
+            last[:] = simulate_frame(solver, parameters, x, v, begin, end)
             smooth_l1_loss(last[0], torch.zeros_like(last[0])).backward()
 
         def gradient() -> np.ndarray:
-            assert packed.springs.grad is not None
-            # Column 0 is dL/dY; Y dL/dY = dL/d(log Y).
-            along: np.ndarray = (packed.springs.grad[:, 0] * packed.springs.detach()[:, 0]).cpu().numpy()
-            return along
+            assert parameters.springs.grad is not None
+            return of_log_stiffness(parameters.springs.grad, parameters.springs)
 
         return Frame(run, lambda: last[0].detach().cpu().numpy(), gradient)
 
     def together(self, twins: Sequence[Twin], hands: np.ndarray, *, gradient: bool) -> Frame:
-        """One frame of several twins of one topology in one call, with or without the gradient of the sum of their losses.
+        """One frame of several twins of the same nodes in one call, with or without the gradient of the sum of their losses.
 
-        Positions [N, 3] and gradient [S] of the frame are those of the first twin. Raises NotImplementedError: this engine
-        simulates one twin at a time.
+        Their topologies may differ. Positions [N, 3] and gradient [S] of the frame are those of the first twin.
         """
-        raise NotImplementedError("several twins together, since the engine simulates one at a time")
+        solver = solver_of(twins, self.device, differentiable=gradient)
+        pairs, places = union([twin.topology for twin in twins])
+        parameters = stacked([packed(twin, self.device) for twin in twins], places, len(pairs))
+        x, v, begin, end = (values.expand(len(twins), -1, -1).contiguous() for values in self._start(twins[0], hands))
+        last: list[torch.Tensor] = []
+
+        def run() -> None:
+            last[:] = solver.forward(x, v, begin, end)
+
+        def learn() -> None:
+            parameters.springs.grad = None
+            last[:] = simulate_frame(solver, parameters, x, v, begin, end)
+            # The loss is a mean over the coordinates of a twin.
+            loss = smooth_l1_loss(last[0], torch.zeros_like(last[0]), reduction="sum") / last[0][0].numel()
+            loss.backward()
+
+        def along() -> np.ndarray:
+            assert parameters.springs.grad is not None
+            return of_log_stiffness(parameters.springs.grad[0], parameters.springs[0])[places[0]]
+
+        parameters.springs.requires_grad_(gradient)
+        return Frame(learn if gradient else run, lambda: last[0][0].detach().cpu().numpy(), along if gradient else None)
 
     def chain(self, twin: Twin, path: np.ndarray) -> Callable[[], object]:
         """The gradient of the loss after all frames of a path of the hands [F + 1, C, 3]."""
         solver = solver_for(twin, self.device, differentiable=True)
         steps = torch.tensor(path, dtype=torch.float32, device=self.device)
         start, rest, *_ = self._start(twin, path[:2])
-        packed = self._packed(twin)
+        parameters = self._packed(twin)
 
         def run() -> None:
-            packed.springs.grad = None
+            parameters.springs.grad = None
             x, v = start, rest
             for k in range(len(steps) - 1):
-                x, v = simulate_frame(solver, packed, x, v, steps[k], steps[k + 1])
+                x, v = simulate_frame(solver, parameters, x, v, steps[k], steps[k + 1])
             smooth_l1_loss(x, torch.zeros_like(x)).backward()
 
         return run
@@ -84,6 +104,23 @@ class Ours:
         return x, torch.zeros_like(x), begin, end
 
     def _packed(self, twin: Twin) -> Parameters:
-        packed = pack(**twin_tensors(twin, self.device), substep=twin.simulation.substep)
-        packed.springs.requires_grad_()
-        return packed
+        parameters = packed(twin, self.device)
+        parameters.springs.requires_grad_()
+        return parameters
+
+
+def of_log_stiffness(gradient: torch.Tensor, springs: torch.Tensor) -> np.ndarray:
+    """dL/d(log Y) [S] from the gradient of packed springs [S, 3] and their values: column 0 is dL/dY, and Y dL/dY = dL/d(log Y)."""
+    along: np.ndarray = (gradient[:, 0] * springs.detach()[:, 0]).cpu().numpy()
+    return along
+
+
+def reference_frame(twin: Twin, hands: np.ndarray) -> Frame:
+    """One frame by the specification in NumPy, float64."""
+    scene, nodes = reference.Scene.of(twin), twin.topology.nodes.astype(np.float64)
+    last: list[np.ndarray] = []
+
+    def run() -> None:
+        last[:] = reference.frame(scene, nodes, np.zeros_like(nodes), *hands)[:2]
+
+    return Frame(run, lambda: last[0])

@@ -12,7 +12,7 @@ from neuspring.twin.topology import uniform_topology
 
 HANDS = 8
 FRAME_TIME = 1 / 30
-CASES = {"a": (400, 67, 22), "b": (2000, 667, 31)}
+CASES = {"a": (400, 67, 22), "b": (2000, 667, 31), "c": (2500, 667, 22)}
 """Nodes, substeps, neighbours asked for (self included). The radius of the topology is never the limit."""
 SPACING, GAP = 0.005, 0.006
 """Between the nodes of a sheet and between its layers, m."""

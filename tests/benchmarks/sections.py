@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -14,131 +14,40 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks import bench_start, work
-from tests.benchmarks.limits import Limits
+from tests.benchmarks import bench_start
+from tests.benchmarks.crowds import by_batch, by_topologies, of_search, together
 from tests.benchmarks.memory import growth
-from tests.benchmarks.ours import Ours
+from tests.benchmarks.ours import Ours, reference_frame
+from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
 from tests.benchmarks.scenes import CASES, box, sheet, shortened
-from tests.benchmarks.simulators import Frame, Simulator, Times, distances, gradient_difference, take_turns
+from tests.benchmarks.simulators import Simulator, Times, distances
 from tests.benchmarks.table import Row
 
 TOGETHER = 16
 """Twins of one call in the first section: the lanes of a vector."""
 
 
-@dataclass(frozen=True)
-class Bench:
-    """What a section measures with."""
-
-    device: str
-    limits: Limits
-    ours: Ours
-    peer: Simulator | None = None
-    quick: bool = False
-    notes: list[str] = field(default_factory=list)
-    """What a reader of the table should know of this run."""
-
-    def clock(self, actions: dict[str, Callable[[], object]]) -> dict[str, Times]:
-        """Times of actions that take turns."""
-        return take_turns(actions, self.device, rounds=5 if self.quick else 9, seconds=2.0 if self.quick else 5.0)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A row to be."""
-
-    name: str
-    twin: Twin
-    frame: Frame
-    reference: str = ""
-    batch: int = 1
-
-    @property
-    def work(self) -> work.Work:
-        """Least work of a spring and substep."""
-        return work.FORWARD_BACKWARD if self.frame.gradient else work.FORWARD
-
-    @property
-    def counts(self) -> tuple[int, int, int, int]:
-        """Nodes, springs, substeps, twins."""
-        return len(self.twin.topology.nodes), len(self.twin.topology.springs), self.twin.simulation.substeps, self.batch
-
-
-def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
-    """The rows of entries that take turns. Ratios are in time per spring, substep and twin."""
-    times = bench.clock({entry.name: entry.frame.run for entry in entries})
-    named = {entry.name: entry for entry in entries}
-    rows = []
-    for entry in entries:
-        mine, (nodes, springs, substeps, batch) = times[entry.name], entry.counts
-        row = Row(
-            section=section, name=entry.name, device=bench.device, median=1e3 * mine.median, least=1e3 * mine.least,
-            nodes=nodes, springs=springs, substeps=substeps, batch=batch,
-        )  # fmt: skip
-        if not entry.twin.simulation.self_collision:
-            # What contacts cost is not in this count.
-            bandwidth, arithmetic = entry.work.shares(mine.median, *entry.counts, bench.limits)
-            row = replace(row, bandwidth=bandwidth, arithmetic=arithmetic)
-        if entry.reference:
-            other = named[entry.reference]
-            ratio, scale = mine.over(times[other.name]), np.prod(other.counts[1:]) / np.prod(entry.counts[1:])
-            median, least = float(scale * ratio.median), float(scale * ratio.least)
-            row = replace(row, ratio=median, least_ratio=least, reference=other.name)
-        rows.append(row)
-    return rows
-
-
-def population(twin: Twin, count: int) -> list[Twin]:
-    """Twins of one topology, each softer than the one before, down to half the stiffness."""
-    materials = [replace(twin.material, stiffness=twin.material.stiffness * scale) for scale in np.linspace(1, 0.5, count)]
-    return [replace(twin, material=material) for material in materials]
-
-
-def together(bench: Bench, twin: Twin, hands: np.ndarray, count: int, *, gradient: bool) -> Frame | None:
-    """`count` twins in one call; None, with a note, where the engine cannot."""
-    try:
-        return bench.ours.together(population(twin, count), hands, gradient=gradient)
-    except NotImplementedError as error:
-        bench.notes.append(f"left out on {bench.device}: {error}")
-        return None
-
-
 def frames(bench: Bench) -> list[Row]:
-    """A frame of both boxes: one twin alone, several together, the peer."""
+    """A frame of two boxes: one twin alone, several together, the peer, and on a CPU the specification of the small one."""
     rows = []
-    for case in ("a",) if bench.quick else CASES:
+    for case in ("a",) if bench.quick else ("a", "c") if bench.on_gpu else ("a", "b"):
         twin, hands = box(*CASES[case])
         entries = list(_company(bench, case, twin, hands))
+        if case == "a" and not bench.on_gpu:
+            entries.append(Entry(f"{case}: forward, NumPy in float64", twin, reference_frame(twin, hands), entries[0].name))
         rows += timed(bench, "frame", entries)
-        _agree(bench, entries)
+        agree(bench, entries)
     return rows
 
 
 def _company(bench: Bench, case: str, twin: Twin, hands: np.ndarray) -> Iterator[Entry]:
-    for kind, gradient in (("forward", False), ("forward + backward", True)):
+    for kind, gradient in KINDS:
         alone = f"{case}: {kind}"
-        yield Entry(alone, twin, _frame(bench.ours, twin, hands, gradient))
+        yield Entry(alone, twin, frame_of(bench.ours, twin, hands, gradient))
         crowd = together(bench, twin, hands, TOGETHER, gradient=gradient)
-        if crowd:
-            yield Entry(f"{alone}, {TOGETHER} together", twin, crowd, alone, TOGETHER)
+        yield Entry(f"{alone}, {TOGETHER} together", twin, crowd, alone, TOGETHER)
         if bench.peer:
-            yield Entry(f"{alone}, {bench.peer.name}", twin, _frame(bench.peer, twin, hands, gradient), alone)
-
-
-def _frame(simulator: Simulator, twin: Twin, hands: np.ndarray, gradient: bool) -> Frame:
-    return simulator.forward_backward(twin, hands) if gradient else simulator.forward(twin, hands)
-
-
-def _agree(bench: Bench, entries: Sequence[Entry]) -> None:
-    """Note how far positions and gradients of frames that ran are from those of their references."""
-    named = {entry.name: entry for entry in entries}
-    for entry in entries:
-        if entry.reference:
-            frame, other = entry.frame, named[entry.reference].frame
-            found = f"positions agree with those of the twin alone to {distances(frame, other).max():.1e} m"
-            if frame.gradient and other.gradient:
-                found += f", gradients to {gradient_difference(frame, other):.1e} of their norm"
-            bench.notes.append(f"{entry.name}, {bench.device}: {found}")
+            yield Entry(f"{alone}, {bench.peer.name}", twin, frame_of(bench.peer, twin, hands, gradient), alone)
 
 
 def by_nodes(bench: Bench) -> list[Row]:
@@ -164,43 +73,38 @@ def by_substeps(bench: Bench) -> list[Row]:
 def _scaling(bench: Bench, section: str, scenes: Sequence[tuple[str, tuple[Twin, np.ndarray]]]) -> list[Row]:
     """Forward alone and with its gradient; the first scene is the reference."""
     rows = []
-    for kind, gradient in (("forward", False), ("forward + backward", True)):
-        entries = [Entry(f"{name}, {kind}", twin, _frame(bench.ours, twin, hands, gradient)) for name, (twin, hands) in scenes]
+    for kind, gradient in KINDS:
+        entries = [Entry(f"{name}, {kind}", twin, frame_of(bench.ours, twin, hands, gradient)) for name, (twin, hands) in scenes]
         rows += timed(bench, section, [entries[0], *(replace(entry, reference=entries[0].name) for entry in entries[1:])])
     return rows
 
 
-def by_batch(bench: Bench) -> list[Row]:
-    """More twins in a call, on the small box."""
-    twin, hands = box(*CASES["a"])
-    rows = []
-    for kind, gradient in (("forward", False), ("forward + backward", True)):
-        entries: list[Entry] = []
-        for count in (1, 16) if bench.quick else (1, 4, 16, 64):
-            frame = together(bench, twin, hands, count, gradient=gradient)
-            if frame is None:
-                break
-            entries.append(Entry(f"{count} together, {kind}", twin, frame, entries[0].name if entries else "", count))
-        if entries:
-            rows += timed(bench, "batch", entries)
-    return rows
-
-
 def by_contacts(bench: Bench) -> list[Row]:
-    """A sheet folded onto itself, with self-collision."""
-    rows = []
+    """A sheet folded onto itself, with self-collision; a note says how time grows with the nodes."""
+    rows: list[Row] = []
+    grown: dict[str, list[Row]] = {}
     for size in (2_000,) if bench.quick else (2_000, 4_300, 8_600):
         twin, hands = sheet(size, 67)
-        rows += timed(bench, "collision", list(_company(bench, f"sheet of {size:,}", twin, hands)))
+        for row in timed(bench, "collision", list(_company(bench, f"sheet of {size:,}", twin, hands))):
+            rows.append(row)
+            grown.setdefault(row.name.partition(": ")[2], []).append(row)
         if bench.peer:
             _touch_alike(bench, bench.peer, twin, hands)
+    for name, its in grown.items():
+        if len(its) > 1:
+            bench.notes.append(f"collision, {name}, {bench.device}: time grows as nodes to the power of {exponent(its):.2f}")
     return rows
+
+
+def exponent(rows: Sequence[Row]) -> float:
+    """p of least time ~ nodes^p, by least squares of the logarithms."""
+    return float(np.polyfit(np.log([row.nodes for row in rows]), np.log([row.least for row in rows]), 1)[0])
 
 
 def _touch_alike(bench: Bench, peer: Simulator, twin: Twin, hands: np.ndarray) -> None:
     """Note how many nodes agree after a part of a frame. Rounding decides whether two nodes just touch, and contacts amplify it."""
     substeps, tolerance = 15, 1e-7
-    pair = [_frame(simulator, shortened(twin, substeps), hands, False) for simulator in (bench.ours, peer)]
+    pair = [frame_of(simulator, shortened(twin, substeps), hands, False) for simulator in (bench.ours, peer)]
     for frame in pair:
         frame.run()
     apart = distances(*pair)
@@ -261,7 +165,11 @@ SECTIONS: dict[str, Callable[[Bench], list[Row]]] = {
     "springs": by_neighbours,
     "substeps": by_substeps,
     "batch": by_batch,
+    "topologies": by_topologies,
+    "search": of_search,
     "collision": by_contacts,
     "memory": memory,
     "start": start,
 }
+ON_CUDA = ("frame", "batch", "topologies", "search", "collision")
+"""Sections of a run on CUDA, which is to end within two minutes; the others on demand."""

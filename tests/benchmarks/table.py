@@ -117,7 +117,8 @@ def _facts(row: Row) -> list[str]:
 
 
 def _shares(row: Row) -> list[str]:
-    return ["" if share is None else f"{100 * share:.2g} %" for share in (row.bandwidth, row.arithmetic)]
+    shares = (row.bandwidth, row.arithmetic)
+    return ["" if share is None else f"{100 * share:.{1 if share < 0.1 else 0}f} %" for share in shares]
 
 
 def _signed(relative: float | None) -> str:

@@ -12,13 +12,16 @@ from scipy.spatial.distance import cdist
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
-from tests.benchmarks import bench, limits, sections, table
+from neuspring.twin.search import SearchProblem, SearchResult
+from tests.benchmarks import bench, crowds, limits, rows, sections, table
 from tests.benchmarks.limits import Limits
-from tests.benchmarks.ours import Ours
+from tests.benchmarks.ours import Ours, reference_frame
 from tests.benchmarks.phystwin import DEVICE, PACKAGE, SETTINGS, SIMULATOR, PhysTwin, single_dashpot
+from tests.benchmarks.rows import Bench, Entry, timed
 from tests.benchmarks.scenes import GAP, SPACING, box, sheet, shortened
-from tests.benchmarks.sections import Bench, Entry, timed
 from tests.benchmarks.simulators import Frame, distances, gradient_difference
+from tests.benchmarks.table import Row
+from tests.support.small import search_problem
 
 LIMITS = Limits({2**20: 1e11}, 3e10, 2e9)
 STAND_IN = f"""
@@ -156,6 +159,9 @@ def test_our_frame_is_that_of_the_reference_and_its_gradient_is_that_of_the_loss
 
     # A few roundings of positions of 0.1 m.
     assert np.abs(ahead.positions() - after()).max() < 1e-7
+    specified = reference_frame(twin, hands)
+    specified.run()
+    np.testing.assert_array_equal(specified.positions(), after())
     assert not distances(ahead, learning).any()
     # Log stiffness up and down by a hundredth for all springs; positions are below 1 m, so the loss is half the mean square.
     up, down = (np.mean(after(scale) ** 2) / 2 for scale in (np.exp(0.01), np.exp(-0.01)))
@@ -186,13 +192,26 @@ def test_a_folded_sheet_has_two_layers_in_contact_and_no_spring_between_them():
     assert hands.shape == (2, len(twin.topology.controllers), 3)
 
 
+def test_the_first_of_several_twins_moves_as_if_alone():
+    """Whatever the topologies of the others; and its gradient is that of its own loss, in the order of its own springs."""
+    scenes = [box(30, 10, size) for size in (8, 5, 12)]
+    (twin, hands), alone, crowd = scenes[0], Ours(), [twin for twin, _ in scenes]
+    assert len({len(one.topology.springs) for one in crowd}) == 3
+    for gradient in (False, True):
+        single, several = rows.frame_of(alone, twin, hands, gradient), alone.together(crowd, hands, gradient=gradient)
+        for frame in (single, several, several):
+            frame.run()
+        assert not distances(single, several).any() and (several.gradient is None) != gradient
+    assert gradient_difference(several, single) < 1e-6
+
+
 class InTurn:
-    """An engine whose frames take no time; `together` for all but the counts that it lacks."""
+    """An engine whose frames take no time."""
 
     name = "stand-in"
 
-    def __init__(self, device: str = "cpu", lacks: tuple[int, ...] = ()) -> None:
-        self.device, self.lacks = device, lacks
+    def __init__(self, device: str = "cpu") -> None:
+        self.device = device
 
     def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
         return Frame(lambda: None, lambda: twin.topology.nodes)
@@ -201,39 +220,72 @@ class InTurn:
         return replace(self.forward(twin, hands), gradient=lambda: np.ones(3))
 
     def together(self, twins: list[Twin], hands: np.ndarray, *, gradient: bool) -> Frame:
-        if len(twins) in self.lacks:
-            raise NotImplementedError("several together")
         scales = [twin.material.stiffness[0] / twins[0].material.stiffness[0] for twin in twins]
         assert len(twins) == 1 or (scales[0], scales[-1]) == pytest.approx((1, 0.5))
         return self.forward_backward(twins[0], hands) if gradient else self.forward(twins[0], hands)
 
 
-def test_what_an_engine_cannot_do_together_is_left_out_with_a_note():
-    able, unable = (Bench("cpu", LIMITS, InTurn(lacks=lacks), quick=True) for lacks in ((), (1, 16)))
-    rows = sections.by_batch(able)
-    assert [(row.name, row.batch, row.reference) for row in rows[:2]] == [
+def test_a_batch_is_compared_with_one_twin():
+    found = crowds.by_batch(Bench("cpu", LIMITS, InTurn(), quick=True))
+    assert [(row.name, row.batch, row.reference) for row in found[:2]] == [
         ("1 together, forward", 1, ""), ("16 together, forward", 16, "1 together, forward"),
     ]  # fmt: skip
-    assert len(rows) == 4 and not able.notes
-    assert sections.by_batch(unable) == []
-    assert unable.notes and set(unable.notes) == {"left out on cpu: several together"}
+    assert len(found) == 4
+
+
+def test_twins_of_topologies_of_their_own_are_compared_with_themselves_one_by_one(monkeypatch):
+    monkeypatch.setitem(crowds.CASES, "a", (40, 5, 0))
+    its = Bench("cpu", LIMITS, Ours(), quick=True)
+    found = crowds.by_topologies(its)
+    assert [(row.batch, row.reference) for row in found[:2]] == [(16, ""), (16, found[0].name)]
+    assert found[0].springs == found[1].springs and len(found) == 4
+    # On a CPU no bit of the first twin depends on the others.
+    assert [note.count("to 0.0e+00") for note in its.notes] == [0, 1, 2]
+
+
+def test_a_search_has_the_same_costs_in_every_company(monkeypatch):
+    def small(rollouts: int, device: str) -> SearchProblem:
+        problem = search_problem(device=device)
+        return replace(problem, search=replace(problem.search, rollouts=rollouts))
+
+    monkeypatch.setattr(crowds, "problem", small)
+    its = Bench("cpu", LIMITS, InTurn(), quick=True)
+    found = crowds.of_search(its)
+    assert [row.reference for row in found] == ["", found[0].name, found[0].name] and all(row.median > 0 for row in found)
+    assert its.notes[0].startswith(f"search, cpu: {crowds.GENERATION} rollouts of {found[0].nodes} nodes over 4 frames")
+    real = crowds.search
+
+    def spoiled(problem: SearchProblem, seed: int) -> SearchResult:
+        result = real(problem, seed)
+        result.trace.loc[3, "cost"] *= 1 if problem.together else 1 + 1e-15
+        return result
+
+    monkeypatch.setattr(crowds, "search", spoiled)
+    with pytest.raises(AssertionError, match="in lanes, one thread: costs differ"):
+        crowds.of_search(its)
+
+
+def test_the_growth_of_contacts_is_an_exponent():
+    sizes = (2000, 4300, 8600)
+    found = [Row(section="x", name="", device="cpu", median=1, least=3 * size**1.5, nodes=size) for size in sizes]
+    assert sections.exponent(found) == pytest.approx(1.5)
 
 
 def test_the_first_section_sets_everybody_beside_the_twin_alone():
     found = Bench("cpu", LIMITS, InTurn(), InTurn(), quick=True)
-    rows = sections.frames(found)
+    made = sections.frames(found)
     alone = ["a: forward"] * 3 + ["a: forward + backward"] * 3
     company = ("", ", 16 together", ", stand-in") * 2
-    assert [row.name for row in rows] == [name + end for name, end in zip(alone, company, strict=True)]
-    assert [row.reference for row in rows] == ["", *alone[:2], "", *alone[3:5]]
-    assert len(found.notes) == 4
-    assert found.notes[-1].endswith("agree with those of the twin alone to 0.0e+00 m, gradients to 0.0e+00 of their norm")
+    assert [row.name for row in made[:6]] == [name + end for name, end in zip(alone, company, strict=True)]
+    assert [row.reference for row in made[:6]] == ["", *alone[:2], "", *alone[3:5]]
+    assert made[6].name == "a: forward, NumPy in float64" and len(made) == 7 and len(found.notes) == 5
+    assert found.notes[3].endswith("agree with those of 'a: forward + backward' to 0.0e+00 m, gradients to 0.0e+00 of their norm")
 
 
 def test_ratios_are_per_twin_and_contacts_have_no_share(monkeypatch):
     twin, _ = tiny()
     seconds = {"alone": (1.0, 2.0, 3.0), "four": (2.0, 4.0, 60.0)}
-    monkeypatch.setattr(sections, "take_turns", lambda actions, *_, **__: {name: sections.Times(seconds[name]) for name in actions})
+    monkeypatch.setattr(rows, "take_turns", lambda actions, *_, **__: {name: rows.Times(seconds[name]) for name in actions})
     frame = InTurn().forward(twin, np.zeros((2, 8, 3)))
     touching = replace(twin, simulation=replace(twin.simulation, self_collision=True))
     alone, four = timed(
@@ -247,7 +299,7 @@ def test_the_command_prints_and_writes_the_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(table, "ROOT", tmp_path)
     monkeypatch.setattr(limits, "measure", lambda device: LIMITS)
     monkeypatch.setitem(bench.SECTIONS, "nodes", lambda its: sections._scaling(its, "nodes", [("30 nodes", tiny())]))
-    bench.main(["--quick", "--only", "nodes"])
+    bench.main(["--quick", "--only", "nodes", "--device", "cpu"])
     printed = capsys.readouterr().out
     assert "| nodes   | 30 nodes, forward + backward | cpu " in printed and "is committed" in printed
     (file,) = (tmp_path / table.SCRATCH).glob("*.json")

@@ -1,0 +1,158 @@
+"""Sections of several twins at once: of one topology, of topologies of their own, and the candidates of a search."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.device import load
+from neuspring.physics import frame
+from neuspring.physics.lanes import WIDTHS
+from neuspring.physics.population import union
+from neuspring.twin import trial_kernels
+from neuspring.twin.search import SearchProblem, SearchResult, search
+from tests.benchmarks.plush import problem
+from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
+from tests.benchmarks.scenes import CASES, box
+from tests.benchmarks.simulators import Frame, Times
+from tests.benchmarks.table import Row
+
+GENERATION = 11
+"""Candidates of a generation: what CMA-ES proposes for 12 variables."""
+
+
+def softer(twin: Twin, count: int) -> list[Twin]:
+    """Twins of one topology, each softer than the one before, down to half the stiffness."""
+    materials = [replace(twin.material, stiffness=twin.material.stiffness * scale) for scale in np.linspace(1, 0.5, count)]
+    return [replace(twin, material=material) for material in materials]
+
+
+def together(bench: Bench, twin: Twin, hands: np.ndarray, count: int, *, gradient: bool) -> Frame:
+    """`count` twins of one topology in one call."""
+    return bench.ours.together(softer(twin, count), hands, gradient=gradient)
+
+
+def by_batch(bench: Bench) -> list[Row]:
+    """More twins in a call, on the small box."""
+    twin, hands = box(*CASES["a"])
+    rows = []
+    for kind, gradient in KINDS:
+        entries: list[Entry] = []
+        for count in (1, 16) if bench.quick else (1, 4, 8, 16, 64):
+            made = together(bench, twin, hands, count, gradient=gradient)
+            entries.append(Entry(f"{count} together, {kind}", twin, made, entries[0].name if entries else "", count))
+        rows += timed(bench, "batch", entries)
+    return rows
+
+
+def by_topologies(bench: Bench) -> list[Row]:
+    """Twins of the small box's nodes, each with a topology of its own: one after the other, and in one call."""
+    nodes, substeps, _ = CASES["a"]
+    count = 64 if bench.on_gpu else 16
+    scenes = [box(nodes, substeps, size) for size in np.linspace(16, 32, count).astype(int)]
+    twins, hands = [twin for twin, _ in scenes], scenes[0][1]
+    own = round(statistics.mean([len(twin.topology.springs) for twin in twins]))
+    every = len(union([twin.topology for twin in twins])[0])
+    bench.notes.append(f"{count} topologies, {bench.device}: {own:,} springs in the mean, {every:,} in the graph of all")
+    rows = []
+    for kind, gradient in KINDS:
+        first, second = f"{count} topologies one by one, {kind}", f"{count} topologies together, {kind}"
+        crowd = bench.ours.together(twins, hands, gradient=gradient)
+        entries = [
+            Entry(first, twins[0], one_by_one(bench, twins, hands, gradient), "", count, own),
+            Entry(second, twins[0], crowd, first, count, own),
+        ]
+        rows += timed(bench, "topologies", entries)
+        agree(bench, entries)
+    return rows
+
+
+def one_by_one(bench: Bench, twins: Sequence[Twin], hands: np.ndarray, gradient: bool) -> Frame:
+    """A frame of each twin by a solver of its own; positions and gradient are those of the first."""
+    frames = [frame_of(bench.ours, twin, hands, gradient) for twin in twins]
+
+    def run() -> None:
+        for each in frames:
+            each.run()
+
+    return replace(frames[0], run=run)
+
+
+def of_search(bench: Bench) -> list[Row]:
+    """A search of a plush, per rollout, with what it takes to make candidates and to judge them.
+
+    On a CPU a candidate's cost must be the same in every company; on CUDA one generation is compared, since the next one depends
+    on every cost.
+    """
+    rollouts = GENERATION if bench.quick or bench.on_gpu else 4 * GENERATION
+    alone = "one by one" if bench.on_gpu else "one by one, one thread"
+    ways = {alone: {"together": 1}}
+    if bench.on_gpu:
+        ways |= {f"{GENERATION} in one launch": {}}
+    else:
+        ways |= {"in lanes, one thread": {}, f"in lanes, {os.cpu_count()} threads": {"threads": os.cpu_count() or 1}}
+    case = problem(rollouts, bench.device)
+    warm(bench.device)
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    found: dict[str, SearchResult] = {}
+    for _ in range(1 if bench.quick else 2):
+        for name, way in ways.items():
+            begin = time.perf_counter()
+            found[name] = search(replace(case, **way), 0)
+            seconds[name].append((time.perf_counter() - begin) / rollouts)
+    judge_alike(bench, found, alone)
+    describe(bench, case, found[alone], {name: min(spent) for name, spent in seconds.items()})
+    rows = []
+    for name, spent in seconds.items():
+        its = Times(tuple(spent))
+        row = Row(
+            section="search", name=name, device=bench.device, median=its.median, least=its.least, unit="s", nodes=len(case.labels)
+        )
+        if name != alone:
+            ratio = its.over(Times(tuple(seconds[alone])))
+            row = replace(row, ratio=ratio.median, least_ratio=ratio.least, reference=alone)
+        rows.append(row)
+    return rows
+
+
+def judge_alike(bench: Bench, found: dict[str, SearchResult], alone: str) -> None:
+    """Costs of all candidates against those of the search one by one: equal bit for bit on a CPU, near on CUDA."""
+    wanted = found[alone].trace["cost"].to_numpy()
+    for name, result in found.items():
+        costs = result.trace["cost"].to_numpy()
+        if not bench.on_gpu:
+            assert np.array_equal(costs, wanted), f"{name}: costs differ from those one by one"
+        elif name != alone:
+            bench.notes.append(
+                f"search, {name}, {bench.device}: costs within {np.abs(costs / wanted - 1).max():.1e} of those one by one"
+            )
+
+
+def describe(bench: Bench, case: SearchProblem, result: SearchResult, seconds: dict[str, float]) -> None:
+    """Note the size of the search and how its ways compare; of the rounds, the fastest."""
+    trace = result.trace
+    frames = case.observations.scenario.train_end - 1
+    updates = frames * float((trace["springs"] * trace["substeps"]).mean())
+    first = next(iter(seconds.values()))
+    size = f"in the mean {trace['springs'].mean():,.0f} springs and {trace['substeps'].mean():.0f} substeps"
+    bench.notes.append(f"search, {bench.device}: {len(trace)} rollouts of {len(case.labels)} nodes over {frames} frames, {size}")
+    for name, spent in seconds.items():
+        each = f"{1e9 * spent / updates:.1f} ns per spring, substep and candidate, {first / spent:.2f} times as fast"
+        bench.notes.append(f"search, {bench.device}, {name}: {each}")
+
+
+def warm(device: str) -> None:
+    """Compile what a search runs, which depends on the widths of its groups."""
+    widths = (1,) if device != "cpu" else WIDTHS
+    for width in widths:
+        made = frame.kernels(wp.float32, width)
+        its = [made.begin, made.substep] if device != "cpu" else [made.forward]
+        for kernel in (*its, *trial_kernels.kernels(width)):
+            load(kernel, device)

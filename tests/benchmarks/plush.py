@@ -1,0 +1,82 @@
+"""A plush that is lifted at one end, as observations of the size of a real capture, for the section of the search.
+
+The body and its head are ellipsoids on the ground, filled with points 1 cm apart in the mean. The observed motion is made up and
+smooth: it need not be any spring's, since a search takes the same time whatever it finds.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.twin.search import SearchProblem
+
+FRAMES, RATE = 31, 30.0
+TRACKED, SURFACE, NODES, HANDS = 300, 150, 650, 30
+PARTS = (((0.0, 0.0, 0.041), (0.08, 0.05, 0.04)), ((0.095, 0.0, 0.051), (0.04, 0.035, 0.035)))
+"""Center and semi-axes of each part, m."""
+LIFT = 0.1
+"""How far the hands rise, m."""
+
+
+def problem(rollouts: int, device: str) -> SearchProblem:
+    """A search with the settings of the released code and as many substeps as are safe."""
+    return SearchProblem(
+        observations=observations(),
+        search=config.Search(rollouts=rollouts),
+        simulation=config.Simulation(),
+        losses=config.Losses(),
+        quirks=config.ReleasedQuirks(),
+        device=device,
+    )
+
+
+@functools.cache
+def observations() -> Observations:
+    """The plush: points near its surface first, which are tracked, then its inside."""
+    rng = np.random.default_rng(0)
+    points = filled(rng)
+    hands = points[np.argsort(points[:, 0])[-HANDS:]] + rng.normal(0, 2e-3, (HANDS, 3)) + np.array([0.02, 0, 0])
+    moved = np.stack([at(points, frame) for frame in range(FRAMES)])
+    seen = np.ones((FRAMES, TRACKED), dtype=bool)
+    seen[1:] = rng.random((FRAMES - 1, TRACKED)) > 0.2
+    valid = np.zeros_like(seen)
+    valid[:-1] = seen[:-1] & seen[1:]
+    scenario = Scenario(
+        name="plush", source="toy", category="plush", frame_count=FRAMES, train_end=FRAMES, frame_rate=RATE, up="+z"
+    )  # fmt: skip
+    return Observations(
+        scenario=scenario,
+        object_points=np.where(seen[..., None], moved[:, :TRACKED], 0.0),
+        object_visibility=seen,
+        object_motion_valid=valid,
+        controller_points=np.stack([at(hands, frame) for frame in range(FRAMES)]),
+        surface_points=points[TRACKED : TRACKED + SURFACE],
+        interior_points=points[TRACKED + SURFACE :],
+        tracks=moved[:, :10],
+    )
+
+
+def filled(rng: np.random.Generator) -> np.ndarray:
+    """NODES points in the parts, none nearer than 6 mm to another, outermost first."""
+    chosen = np.empty((0, 3))
+    depth: list[float] = []
+    centers, axes = (np.array(values) for values in zip(*PARTS, strict=True))
+    while len(chosen) < NODES:
+        point = rng.uniform([-0.08, -0.05, 0.0], [0.135, 0.05, 0.09])
+        # 1 at the surface of a part, 0 at its center.
+        level = float(np.linalg.norm((point - centers) / axes, axis=1).min())
+        if level <= 1 and not (np.linalg.norm(chosen - point, axis=1) < 0.006).any():
+            chosen = np.vstack([chosen, point])
+            depth.append(-level)
+    return chosen[np.argsort(depth)]
+
+
+def at(points: np.ndarray, frame: int) -> np.ndarray:
+    """Where points are in a frame: the end that is held rises most, the other one stays."""
+    share = np.clip((points[:, 0] + 0.08) / 0.215, 0, 1)
+    rise = LIFT * np.sin(np.pi / 2 * frame / (FRAMES - 1)) ** 2
+    return points + np.outer(share**2 * rise, [0, 0, 1])

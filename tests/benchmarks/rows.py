@@ -1,0 +1,106 @@
+"""From frames that are ready to run to rows of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from neuspring.core.artifacts import Twin
+from tests.benchmarks import work
+from tests.benchmarks.limits import Limits
+from tests.benchmarks.ours import Ours
+from tests.benchmarks.simulators import Frame, Simulator, Times, distances, gradient_difference, take_turns
+from tests.benchmarks.table import Row
+
+KINDS = (("forward", False), ("forward + backward", True))
+"""What is timed of a frame, and whether with its gradient."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What a section measures with."""
+
+    device: str
+    limits: Limits
+    ours: Ours
+    peer: Simulator | None = None
+    quick: bool = False
+    notes: list[str] = field(default_factory=list)
+    """What a reader of the table should know of this run."""
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether this is a run on CUDA."""
+        return self.device != "cpu"
+
+    def clock(self, actions: dict[str, Callable[[], object]]) -> dict[str, Times]:
+        """Times of actions that take turns."""
+        return take_turns(actions, self.device, rounds=5 if self.quick else 9, seconds=2.0 if self.quick else 5.0)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row to be."""
+
+    name: str
+    twin: Twin
+    """The twin, or one of several of the same nodes."""
+    frame: Frame
+    reference: str = ""
+    batch: int = 1
+    springs: int = 0
+    """Mean number of twins that differ in it; 0: that of `twin`."""
+
+    @property
+    def work(self) -> work.Work:
+        """Least work of a spring and substep."""
+        return work.FORWARD_BACKWARD if self.frame.gradient else work.FORWARD
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """Nodes, springs, substeps, twins."""
+        topology = self.twin.topology
+        return len(topology.nodes), self.springs or len(topology.springs), self.twin.simulation.substeps, self.batch
+
+
+def frame_of(simulator: Simulator, twin: Twin, hands: np.ndarray, gradient: bool) -> Frame:
+    """A frame of one twin, with or without its gradient."""
+    return simulator.forward_backward(twin, hands) if gradient else simulator.forward(twin, hands)
+
+
+def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
+    """The rows of entries that take turns. Ratios are in time per spring, substep and twin."""
+    times = bench.clock({entry.name: entry.frame.run for entry in entries})
+    named = {entry.name: entry for entry in entries}
+    rows = []
+    for entry in entries:
+        mine, (nodes, springs, substeps, batch) = times[entry.name], entry.counts
+        row = Row(
+            section=section, name=entry.name, device=bench.device, median=1e3 * mine.median, least=1e3 * mine.least,
+            nodes=nodes, springs=springs, substeps=substeps, batch=batch,
+        )  # fmt: skip
+        if not entry.twin.simulation.self_collision:
+            # What contacts cost is not in this count.
+            bandwidth, arithmetic = entry.work.shares(mine.median, *entry.counts, bench.limits)
+            row = replace(row, bandwidth=bandwidth, arithmetic=arithmetic)
+        if entry.reference:
+            other = named[entry.reference]
+            ratio, scale = mine.over(times[other.name]), np.prod(other.counts[1:]) / np.prod(entry.counts[1:])
+            median, least = float(scale * ratio.median), float(scale * ratio.least)
+            row = replace(row, ratio=median, least_ratio=least, reference=other.name)
+        rows.append(row)
+    return rows
+
+
+def agree(bench: Bench, entries: Sequence[Entry]) -> None:
+    """Note how far positions and gradients of frames that ran are from those of their references."""
+    named = {entry.name: entry for entry in entries}
+    for entry in entries:
+        if entry.reference:
+            frame, other = entry.frame, named[entry.reference].frame
+            found = f"positions agree with those of '{entry.reference}' to {distances(frame, other).max():.1e} m"
+            if frame.gradient and other.gradient:
+                found += f", gradients to {gradient_difference(frame, other):.1e} of their norm"
+            bench.notes.append(f"{entry.name}, {bench.device}: {found}")
