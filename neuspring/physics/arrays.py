@@ -1,9 +1,9 @@
 """The arrays of one solver, in the layout that kernels compute in, and sequences of launches captured as graphs.
 
-B twins lie in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors, in memory [points, G, 3,
-W]; one of springs an array [S, G] of Numbers; one of a twin an array [G] of Numbers. Torch tensors with the same storage are at
-hand by name. On a CPU W lanes share one thread's instructions (G = 1); on a GPU W = 1 and a thread is a point of one twin. Lanes
-that no twin needs repeat the last one.
+B twins lie in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors; one of springs an array [S,
+G] of Numbers; one of a twin an array [G] of Numbers. Torch tensors with the same storage are at hand by name. On a CPU W lanes
+share one thread's instructions (G = 1); on a GPU W = 1 and a thread is a point of one twin. Lanes that no twin needs repeat the
+last one.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -143,16 +143,22 @@ class Buffers:
         """Add arrays of Vectors, zero at first. Only a differentiable solver has adjoints (adj_...)."""
         for name, shape in shapes.items():
             if self.differentiable or not name.startswith("adj_"):
-                tensor = torch.zeros((*shape, self.groups, 3, self.width), dtype=self.dtype, device=self.device)
+                tensor = self._zeros(shape, (3, self.width))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Vector)
 
     def add_numbers(self, **sizes: int | None) -> None:
         """Add arrays of Numbers: [size, G], or [G] for a number of a twin (None). Adjoints (adj_...) as for Vectors."""
         for name, size in sizes.items():
             if self.differentiable or not name.startswith("adj_"):
-                shape = (self.groups, self.width) if size is None else (size, self.groups, self.width)
-                tensor = torch.zeros(shape, dtype=self.dtype, device=self.device)
+                tensor = self._zeros(() if size is None else (size,), (self.width,))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
+
+    def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:
+        """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else the data of a group together."""
+        kind: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
+        if self.threads:
+            return torch.zeros((*shape, self.groups, *entry), **kind)
+        return torch.zeros((self.groups, *shape, *entry), **kind).movedim(0, len(shape))
 
     def add_integers(self, **values: np.ndarray) -> None:
         """Add constant arrays of integers."""

@@ -13,11 +13,11 @@ import warp as wp
 
 MIN_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
-WIDTHS = (1, 4, 8, 16)
-"""Lanes that kernels are made for; 16 fill the registers of today's processors."""
+WIDTHS = (1, 4, 8)
+"""Lanes that kernels are made for. 16 were no faster per twin than 8 (tests/benchmarks/NOTES.md)."""
 
 
-COST = {1: 1.0, 4: 1.4, 8: 1.6, 16: 2.7}
+COST = {1: 1.0, 4: 1.4, 8: 1.5}
 """Time of a substep by width, over that of a twin alone, on one thread (tests/benchmarks/NOTES.md)."""
 
 

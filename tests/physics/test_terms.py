@@ -69,7 +69,7 @@ def forces(values: Arrays, way: str) -> np.ndarray:
     b.tensors["force"].zero_()
     model, state, _ = b.arguments()
     launch(*((kernels.rows, 1) if way == "rows" else (kernels.links, (4, 1))), model, state)
-    return b.get_vectors("force").numpy()
+    return b.get_vectors("force", count=b.nodes).numpy()
 
 
 def force_adjoints(values: Arrays, weight: np.ndarray, way: str, times: int = 1) -> Arrays:
@@ -81,7 +81,7 @@ def force_adjoints(values: Arrays, weight: np.ndarray, way: str, times: int = 1)
     for _ in range(times):
         launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments())
     stiffness, inverse_length, dashpot = springs.gradient(b).numpy().transpose(2, 0, 1)
-    state = {name: b.get_vectors(f"adj_{name}").numpy() for name in ("x", "v")}
+    state = {name: b.get_vectors(f"adj_{name}", count=b.nodes).numpy() for name in ("x", "v")}
     # d(1 / l0) = -d(l0) / l0^2
     return state | {"stiffness": stiffness, "rest_length": -inverse_length / values["rest_length"] ** 2, "dashpot": dashpot}
 
@@ -286,7 +286,7 @@ def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
     b.set_vectors("adj_moving", torch.tensor(weight))
     launch(terms.kernels(b.width).collide_adjoint, (6, 1), *b.arguments())
     e, mu = contact.gradient(b, "contact").numpy().T
-    return {"x": b.get_vectors("adj_x").numpy(), "v": b.get_vectors("adj_after").numpy(), "e": e, "mu": mu}
+    return {"x": b.get_vectors("adj_x", count=b.nodes).numpy(), "v": b.get_vectors("adj_after").numpy(), "e": e, "mu": mu}
 
 
 def crowd(friction: float, seed: int = 11) -> Arrays:
