@@ -101,8 +101,8 @@ class Config(Section):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
     twins_per_launch: Count | Literal["auto"] = "auto"
-    """How many candidates of a search, or fits of a scenario, are simulated together at most; auto: as many as pay. 1: one by one.
-    It changes no number on a CPU."""
+    """How many candidates of a search, or fits of a scenario, are simulated in one launch at most. auto: on a CPU as many as save
+    time, on CUDA a whole generation, and each fit alone. 1: one by one. On a CPU no result depends on it, bit for bit."""
     gpus: Gpus = field(default_factory=Gpus)
     simulation: Simulation = field(default_factory=Simulation)
     losses: Losses = field(default_factory=Losses)

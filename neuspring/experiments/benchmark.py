@@ -173,6 +173,8 @@ class Benchmark:
     """Chosen method with splats of its own -> the method in whose name they are made."""
     studies: dict[str, Study]
     """All rows of the study table; `config.studies` names those that are made without being asked for."""
+    on_gpu: bool = False
+    """Whether jobs take GPUs. `twins_per_launch: auto` lets no fits share launches there: nobody has measured whether it pays."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
@@ -248,9 +250,10 @@ class Benchmark:
     def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
         """The fits (method, seed) of a scenario that share launches: those of equal horizon, where they are not too few.
 
-        None where `twins_per_launch` is 1.
+        None where `twins_per_launch` is 1, or auto on a GPU.
         """
-        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
+        most = self.config.twins_per_launch
+        if most == 1 or (most == "auto" and self.on_gpu) or scenario not in self.config.scenarios:
             return ()
         rows, seeds = [name for name in self.fits if self.applies(name, scenario)], self.config.seeds
         alike = Counter(self._horizons[name] for name in rows)

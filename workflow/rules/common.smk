@@ -1,5 +1,6 @@
 # Checks the configuration before any job exists, and defines the helper functions of the rules.
 import atexit
+import dataclasses
 import gc
 import json
 import logging
@@ -54,11 +55,12 @@ def or_workflow_error(check, *arguments, **named):
 BENCHMARK = or_workflow_error(checked, config, ROOT, cluster=CLUSTER)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
-INPUTS = Inputs(BENCHMARK)
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
 GPU = int(
     CONFIG.device == "cuda" or (CONFIG.device == "auto" and (CLUSTER or bool(POOL)))
 )
+BENCHMARK = dataclasses.replace(BENCHMARK, on_gpu=bool(GPU))
+INPUTS = Inputs(BENCHMARK)
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
 GPU_FIRST = 10 * GPU

@@ -14,8 +14,8 @@ from neuspring.report.page.words import duration, hours, memory
 from neuspring.scores.metrics import DASH
 
 ORDER = (
-    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fit", "rollout", "train", "predict"),
-    *("transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
+    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fits", "fit", "rollout"),
+    *("train", "predict", "transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
 )
 """Rules in the order of the workflow."""
 
