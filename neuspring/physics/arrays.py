@@ -154,7 +154,7 @@ class Buffers:
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
 
     def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:
-        """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else the data of a group together."""
+        """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else each group's data together."""
         kind: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
         if self.threads:
             return torch.zeros((*shape, self.groups, *entry), **kind)

@@ -40,6 +40,8 @@ class Graph(NamedTuple):
 
     order: np.ndarray
     """Where each spring stands in the caller's list [S]."""
+    ranks: np.ndarray
+    """Where each spring of the caller's list stands here [S]."""
     rows: np.ndarray
     """First spring of each node's row [N + 1]."""
     partners: np.ndarray
@@ -63,6 +65,7 @@ class Graph(NamedTuple):
         places = np.arange(nodes + 1)
         return cls(
             order,
+            np.argsort(order),
             np.searchsorted(lower, places),
             upper,
             np.searchsorted(first[linked], places),
@@ -86,7 +89,7 @@ def allocate(b: Buffers, pairs: np.ndarray) -> None:
 
 def fill(b: Buffers, packed: torch.Tensor) -> None:
     """Take parameters [B, S, 3]."""
-    b.set_vectors("springs", packed[:, b.indices["order"]])
+    b.set_vectors("springs", packed.index_select(1, b.indices["order"]))
 
 
 def gradient(b: Buffers) -> torch.Tensor:
@@ -94,9 +97,7 @@ def gradient(b: Buffers) -> torch.Tensor:
     ordered, own = b.get_vectors("adj_springs"), b.get_vectors("springs")
     # The kernels leave the factor Y of dL/d(1 / l0) to the end.
     ordered[..., 1] *= own[..., 0]
-    result = torch.empty_like(ordered)
-    result[:, b.indices["order"]] = ordered
-    return result
+    return ordered.index_select(1, b.indices["ranks"])
 
 
 @functools.cache
