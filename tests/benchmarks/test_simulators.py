@@ -301,7 +301,9 @@ def test_the_command_prints_and_writes_the_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(bench.SECTIONS, "nodes", lambda its: sections._scaling(its, "nodes", [("30 nodes", tiny())]))
     bench.main(["--quick", "--only", "nodes", "--device", "cpu"])
     printed = capsys.readouterr().out
-    assert "| nodes   | 30 nodes, forward + backward | cpu " in printed and "is committed" in printed
+    assert "| nodes   | 30 nodes, forward + backward | cpu " in printed
+    # Whether a table of this kind of machine is committed depends on the machine.
+    assert "is committed" in printed or "compared with commit" in printed
     (file,) = (tmp_path / table.SCRATCH).glob("*.json")
     assert file.name in printed
     names = {row[1] for row in table.medians(json.loads(file.read_text()))}
