@@ -1,8 +1,7 @@
 """Writes data/tables/timings.csv from job records: python -m tests.benchmarks.timings RESULTS "MACHINE" [RULE ...].
 
 Run the benchmark alone on the machine before. Rules that are not named (default: all), or of which RESULTS has no jobs, keep their
-rows. What we cannot measure is what
-others published, converted, and says so.
+rows. What we cannot measure is what others published, converted, and says so.
 """
 
 import csv
@@ -56,7 +55,7 @@ def main(results: Path, machine: str, rules: Sequence[str] = ()) -> None:
     rows = {key: (rate.seconds, rate.source) for key, rate in shipped_rates().items()}
     for (rule, kind, scenario), seconds in History.of_records(jobs).rates.items():
         if kind == "cpu" and not scenario and rule in (rules or counts):
-            rows[rule, kind] = (seconds, f"{machine}, {counts[rule]} jobs")
+            rows[rule, kind] = (seconds, f"{machine}, {counts[rule]} job{'s' * (counts[rule] != 1)}")
     if not counts["transfer"]:
         seconds, source = rows["rollout", "cpu"]
         rows["transfer", "cpu"] = (seconds, f"{source} of rollout")
