@@ -66,8 +66,13 @@ def solver_for(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float
     """A solver of a twin, with its parameters set."""
     t, options = twin.topology, {"device": device, "dtype": dtype, "differentiable": differentiable}
     solver = FrameSolver(t.springs, len(t.nodes), len(t.controllers), twin.simulation, **options)  # type: ignore[arg-type]
-    solver.set_parameters(pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep))
+    solver.set_parameters(packed(twin, device, dtype))
     return solver
+
+
+def packed(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Parameters:
+    """A twin's parameters, packed."""
+    return pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep)
 
 
 def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:

@@ -175,6 +175,13 @@ def functions(real: Any, width: int) -> Functions:
         return (ut * (a - one) - n * ((one + e) * s)) * half
 
     @wp.func
+    def meeting(state: State, slot: int, inner: int, j: int, g: int, x: Vector, v: Vector):
+        """Node j seen from a node at x with velocity v: offset, relative velocity, distance, distance times closing speed."""
+        offset = state.x[slot, j, g] - x
+        relative = state.after[inner, j, g] - v
+        return offset, relative, root(dot(offset, offset)), dot(offset, relative)
+
+    @wp.func
     def collided(model: Model, state: State, slot: int, inner: int, i: int, g: int) -> Vector:
         x = state.x[slot, i, g]
         v = state.after[inner, i, g]
@@ -183,10 +190,7 @@ def functions(real: Any, width: int) -> Functions:
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             mask = model.near_lanes[i, k, g]
-            offset = state.x[slot, j, g] - x
-            relative = state.after[inner, j, g] - v
-            length = root(dot(offset, offset))
-            closing = dot(offset, relative)
+            offset, relative, length, closing = meeting(state, slot, inner, j, g, x, v)
             for q in range(width):
                 if hits(mask, q, length[q], closing[q], model.distance[g][q]):
                     push = impulse(column(offset, q), column(relative, q), length[q], model.contact_e[g][q], model.contact_mu[g][q])
@@ -238,19 +242,14 @@ def functions(real: Any, width: int) -> Functions:
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             mask = model.near_lanes[i, k, g]
-            offset = state.x[step, j, g] - x
-            length = root(dot(offset, offset))
-            closing = dot(offset, state.after[step, j, g] - v)
+            offset, relative, length, closing = meeting(state, step, step, j, g, x, v)
             for q in range(width):
                 if hits(mask, q, length[q], closing[q], model.distance[g][q]):
                     count[q] = count[q] + one
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             mask = model.near_lanes[i, k, g]
-            offset = state.x[step, j, g] - x
-            relative = state.after[step, j, g] - v
-            length = root(dot(offset, offset))
-            closing = dot(offset, relative)
+            offset, relative, length, closing = meeting(state, step, step, j, g, x, v)
             for q in range(width):
                 if hits(mask, q, length[q], closing[q], model.distance[g][q]):
                     share = column(h, q) * (-half / count[q])

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Topology, Twin
-from neuspring.physics.autograd import pack, twin_tensors
+from neuspring.physics.autograd import packed
 from neuspring.physics.solver import FrameSolver, Parameters
 
 
@@ -36,11 +36,6 @@ def solver_of(
     )
     solver.set_parameters(stacked([packed(twin, device, dtype) for twin in twins], places, len(pairs)))
     return solver
-
-
-def packed(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Parameters:
-    """A twin's parameters, packed."""
-    return pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep)
 
 
 def stacked(each: Sequence[Parameters], places: Sequence[np.ndarray], springs: int) -> Parameters:

@@ -138,6 +138,15 @@ def functions(real: Any, width: int) -> Functions:
         return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
 
     @wp.func
+    def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
+        """The force of spring e on an end at x with velocity v, from its other end j."""
+        return force(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g])
+
+    @wp.func
+    def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, c: Vector):
+        return force_adjoint(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g], c)
+
+    @wp.func
     def add_row(model: Model, state: State, slot: int, i: int, g: int):
         """Add the forces of node i's row to both ends."""
         x = state.x[slot, i, g]
@@ -146,11 +155,7 @@ def functions(real: Any, width: int) -> Functions:
         for each in range(model.rows[i], model.rows[i + 1]):
             e = place(each)
             j = place(model.partners[e])
-            f = force(
-                state.x[slot, j, g] - x,
-                state.v[slot, j, g] - v,
-                model.springs[e, g],
-            )
+            f = pull(model, state, slot, e, j, g, x, v)
             total = total + f
             state.force[j, g] = state.force[j, g] - f
         state.force[i, g] = total
@@ -166,12 +171,8 @@ def functions(real: Any, width: int) -> Functions:
         for each in range(model.rows[i], model.rows[i + 1]):
             e = place(each)
             j = place(model.partners[e])
-            offset, relative, parameters = force_adjoint(
-                state.x[slot, j, g] - x,
-                state.v[slot, j, g] - v,
-                model.springs[e, g],
-                adj_force - adjoint.force[turn, j, g],
-            )
+            c = adj_force - adjoint.force[turn, j, g]
+            offset, relative, parameters = pull_adjoint(model, state, slot, e, j, g, x, v, c)
             adj_x = adj_x - offset
             adj_v = adj_v - relative
             adjoint.x[j, g] = adjoint.x[j, g] + offset
@@ -190,11 +191,7 @@ def functions(real: Any, width: int) -> Functions:
             k = place(each)
             j = place(model.link_partners[k])
             e = place(model.link_springs[k])
-            total = total + force(
-                state.x[slot, j, g] - x,
-                state.v[slot, j, g] - v,
-                model.springs[e, g],
-            )
+            total = total + pull(model, state, slot, e, j, g, x, v)
         return total
 
     @wp.func
@@ -209,12 +206,8 @@ def functions(real: Any, width: int) -> Functions:
             k = place(each)
             j = place(model.link_partners[k])
             e = place(model.link_springs[k])
-            offset, relative, parameters = force_adjoint(
-                state.x[slot, j, g] - x,
-                state.v[slot, j, g] - v,
-                model.springs[e, g],
-                adj_force - adjoint.force[turn, j, g],
-            )
+            c = adj_force - adjoint.force[turn, j, g]
+            offset, relative, parameters = pull_adjoint(model, state, slot, e, j, g, x, v, c)
             adj_x = adj_x - offset
             adj_v = adj_v - relative
             if i < j:

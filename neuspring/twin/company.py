@@ -51,14 +51,19 @@ class Seat:
 
 
 class Company:
-    """Seats that share a solver. It is made anew when a twin's substeps change, or when a fit has ended."""
+    """Seats that share a solver. Another is made for the next frame when a twin's substeps change, or when a fit has ended."""
 
     def __init__(self, twins: Sequence[Twin], device: str) -> None:
         self.seats = [Seat(self, twin) for twin in twins]
         self._device = device
         self._active = list(self.seats)
         self._turn = threading.Condition()
+        self._end: BaseException | None = None
         self._solver: FrameSolver | None = None
+        self._stale = True
+        """Whether the next frame needs another solver. The old one holds the frames whose adjoints are still asked for."""
+        self._members: list[Seat] = []
+        """Seats of the solver, by lane."""
         self._places: list[np.ndarray] = []
         self._springs = 0
 
@@ -66,29 +71,35 @@ class Company:
         """Put a twin on a seat."""
         with self._turn:
             if seat.twin is not twin:
-                seat.twin, self._solver = twin, None
+                seat.twin, self._stale = twin, True
 
     def leave(self, seat: Seat) -> None:
         """End a seat's part, so that nobody waits for it."""
         with self._turn:
             self._active.remove(seat)
-            self._solver = None
+            self._stale = True
             self._serve_if_all_wait()
+
+    def stop(self, reason: BaseException) -> None:
+        """End every fit at its next frame, by the same error."""
+        with self._turn:
+            self._end = reason
+            self._turn.notify_all()
 
     def ask(self, seat: Seat, what: str, inputs: Sequence[torch.Tensor]) -> Results:
         """Wait for the launch that serves a request."""
         with self._turn:
             seat.request, seat.answer = (what, inputs), None
             self._serve_if_all_wait()
-            self._turn.wait_for(lambda: seat.answer is not None)
-            answer = seat.answer
+            self._turn.wait_for(lambda: seat.answer is not None or self._end is not None)
+            answer = self._end or seat.answer
         if isinstance(answer, BaseException):
             raise answer
         assert answer is not None
         return answer
 
     def _serve_if_all_wait(self) -> None:
-        if not self._active or any(seat.request is None for seat in self._active):
+        if self._end or not self._active or any(seat.request is None for seat in self._active):
             return
         try:
             self._serve()
@@ -107,10 +118,11 @@ class Company:
                     seat.request, seat.answer = None, answer
 
     def _run(self, asking: list[Seat], inputs: Sequence[Sequence[torch.Tensor]]) -> list[Results]:
-        solver = self._shared()
-        lanes = [self._active.index(seat) for seat in asking]
+        if self._stale or self._solver is None:
+            self._solver = self._made()
+        solver, lanes = self._solver, [self._members.index(seat) for seat in asking]
         # A lane that nobody asks for repeats the first that is asked for.
-        source = [lanes.index(lane) if lane in lanes else 0 for lane in range(len(self._active))]
+        source = [lanes.index(lane) if lane in lanes else 0 for lane in range(len(self._members))]
         begin, end, x, v, *_ = (torch.stack([inputs[k][place] for k in source]) for place in range(4))
         places = [self._places[lanes[k]] for k in source]
         parameters = stacked([Parameters(*inputs[k][4:]) for k in source], places, self._springs)
@@ -125,11 +137,12 @@ class Company:
         return [(after[0][lane].clone(), after[1][lane].clone()) for lane in lanes]
 
     def _backward(self, asking: list[Seat], inputs: Sequence[Sequence[torch.Tensor]]) -> list[Results]:
-        solver = self._shared()
+        solver = self._solver
+        assert solver is not None
         zero = torch.zeros_like(inputs[0][0])
-        given = {self._active.index(seat): adjoints for seat, adjoints in zip(asking, inputs, strict=True)}
+        given = {self._members.index(seat): adjoints for seat, adjoints in zip(asking, inputs, strict=True)}
         adj_x, adj_v = (
-            torch.stack([given[lane][place] if lane in given else zero for lane in range(len(self._active))]) for place in (0, 1)
+            torch.stack([given[lane][place] if lane in given else zero for lane in range(len(self._members))]) for place in (0, 1)
         )
         x, v, springs, *rest = solver.backward(adj_x, adj_v)
         assert x is not None
@@ -141,18 +154,15 @@ class Company:
             results.append((x[lane], v[lane], own, *(None if values is None else values[lane] for values in rest)))
         return results
 
-    def _shared(self) -> FrameSolver:
-        """The solver of all active seats; a new one holds no frame."""
-        if self._solver is None:
-            twins = [seat.twin for seat in self._active]
-            pairs, self._places = union([twin.topology for twin in twins])
-            self._springs = len(pairs)
-            first = twins[0].topology
-            simulations = [twin.simulation for twin in twins]
-            self._solver = FrameSolver(pairs, len(first.nodes), len(first.controllers), simulations, device=self._device)
-            for seat in self._active:
-                seat.frame_token += 1
-        return self._solver
+    def _made(self) -> FrameSolver:
+        """A solver of all active seats."""
+        self._members, self._stale = list(self._active), False
+        twins = [seat.twin for seat in self._members]
+        pairs, self._places = union([twin.topology for twin in twins])
+        self._springs = len(pairs)
+        first = twins[0].topology
+        simulations = [twin.simulation for twin in twins]
+        return FrameSolver(pairs, len(first.nodes), len(first.controllers), simulations, device=self._device)
 
 
 def together(twins: Sequence[Twin], device: str, works: Sequence[Callable[[Seat], T]]) -> list[T | Exception]:
@@ -170,4 +180,9 @@ def together(twins: Sequence[Twin], device: str, works: Sequence[Callable[[Seat]
             company.leave(seat)
 
     with ThreadPoolExecutor(len(works)) as pool:
-        return list(pool.map(run, company.seats, works))
+        try:
+            return list(pool.map(run, company.seats, works))
+        except BaseException as reason:
+            # An interrupt must not wait for the ends of all fits.
+            company.stop(reason)
+            raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,9 @@ import torch
 
 from neuspring import config
 from neuspring.core.errors import NumericalFailure
+from neuspring.physics.autograd import packed, solver_for
 from neuspring.twin import fit as module
-from neuspring.twin.company import together
+from neuspring.twin.company import Seat, together
 from neuspring.twin.fit import FitProblem, FitResult, fit
 from tests.support import small
 
@@ -103,3 +105,49 @@ def test_self_collision_in_company() -> None:
     for got, problem in zip(in_company(problems), problems, strict=True):
         assert_equal(got, fit(problem))
         assert torch.is_grad_enabled()
+
+
+def test_an_adjoint_that_is_asked_for_survives_a_new_solver() -> None:
+    """While one fit waits for the adjoint of its frame, the other takes more substeps, or ends: the frame must still be there."""
+    twin = small.fit_problem().twin
+    finer = replace(twin, simulation=replace(twin.simulation, substeps=2 * twin.simulation.substeps))
+    hands = torch.tensor(small.observations().controller_points[:2])
+    x = torch.tensor(twin.topology.nodes)
+    inputs = (hands[0], hands[1], x, torch.zeros_like(x), *packed(twin))
+    alone = solver_for(twin)
+    wanted = (alone.run(*inputs), alone.backward(x, x))
+
+    def asks(seat: Seat) -> object:
+        state = seat.run(*inputs)
+        return state, seat.backward(x, x)
+
+    for ends in (False, True):
+
+        def disturbs(seat: Seat, ends: bool = ends) -> None:
+            seat.run(*inputs)
+            other = seat.company.seats[0]
+            while other.request is None or other.request[0] != "backward":
+                time.sleep(0.001)
+            if not ends:
+                seat.sit(finer).run(*inputs[:4], *packed(finer))
+
+        (state, adjoints), nothing = together([twin, twin], "cpu", [asks, disturbs])  # type: ignore[list-item, misc]
+        assert nothing is None
+        for got, expected in zip((*state, *adjoints[:-1]), (*wanted[0], *wanted[1][:-1]), strict=True):
+            assert torch.equal(got, expected)
+
+
+def test_an_interrupt_ends_all_at_once() -> None:
+    problem = small.fit_problem(fit=config.Fit(epochs=10_000))
+    epochs = []
+
+    def stops(history: object) -> None:
+        raise KeyboardInterrupt
+
+    works = [
+        lambda seat: fit(problem, seat=seat, on_epoch=stops),
+        lambda seat: fit(problem, seat=seat, on_epoch=lambda history: epochs.append(len(history))),
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        together([problem.twin] * 2, "cpu", works)
+    assert len(epochs) < 100
