@@ -10,8 +10,8 @@ finished one with a larger budget: CMA-ES is replayed with the recorded costs.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -40,6 +40,8 @@ REGIONAL = ("object_radius", "object_neighbours")
 PENALTY = 1e6
 """Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
 UNSTABLE = "unstable"
+Map = Callable[..., Iterable[Any]]
+"""As the builtin `map`."""
 RELEASED_FRAME_TIME = 667 * 5e-5
 RELEASED_SUBSTEPS = 667
 
@@ -242,7 +244,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     budget = problem.search.rollouts
     progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
     start = 0
-    with _threads(problem.threads) as pool:
+    with _threads(problem.threads) as each:
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
         while start < budget:
             population = proposals.ask()[: budget - start]
@@ -254,7 +256,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                     attempts, earlier = 1, 0.0
             fresh = population[max(len(trace) - start, 0) :]
             if fresh:
-                trace += _evaluate(problem, fresh, loss, len(trace), proposals.generation, pool)
+                trace += _evaluate(problem, fresh, loss, len(trace), proposals.generation, each)
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])
             start = stop
@@ -274,13 +276,19 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[Executor]:
-    """Threads that make and simulate candidates. Torch has no others in them, so that `count` cores are busy and no more."""
+def _threads(count: int) -> Iterator[Map]:
+    """How candidates are made and simulated: by `count` threads, or by this one, which an interrupt ends at once.
+
+    Torch has no threads of its own meanwhile, so that `count` cores are busy and no more.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
+        if count == 1:
+            yield map
+            return
         with ThreadPoolExecutor(count) as pool:
-            yield pool
+            yield pool.map
     finally:
         torch.set_num_threads(before)
 
@@ -337,10 +345,10 @@ def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStr
 
 
 def _evaluate(
-    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, pool: Executor
+    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, each: Map
 ) -> list[dict[str, Any]]:
     """Rows of the trace for the candidates of a generation, numbered from `index` on."""
-    made = list(pool.map(lambda normalized: _made(problem, normalized), population))
+    made = list(each(lambda normalized: _made(problem, normalized), population))
     for number, (row, _) in enumerate(made):
         row |= {"rollout": index + number, "generation": generation}
     rows, twins = [row for row, twin in made if twin], [twin for _, twin in made if twin]
@@ -358,8 +366,8 @@ def _evaluate(
                 rows[k]["cost"] = min(result.cost, PENALTY)
 
     # Threads would meet in the one stream of a GPU.
-    each = pool.map if problem.device == "cpu" else map
-    list(each(simulate, groups(problem, twins) if twins else []))
+    simulated = each if problem.device == "cpu" else map
+    list(simulated(simulate, groups(problem, twins) if twins else []))
     return [row for row, _ in made]
 
 
