@@ -3,15 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from neuspring.core.errors import InputError
 from neuspring.twin.rollout import mean_trajectory, roll_out
-from neuspring.twin.transfer import rebase
+from neuspring.twin.transfer import corresponds, move, rebase
 from tests.support import small
 
 # Rest lengths are float32.
 SINGLE = 1e-6
+ROUNDED = 1e-6
+"""Points in float32 laid onto themselves, m."""
+PLACES = ("object_points", "surface_points", "controller_points")
+TRACKED = ("object_points", "object_visibility", "object_motion_valid")
 
 
 def test_the_same_recording_gives_the_same_twin():
@@ -64,11 +66,31 @@ def test_the_frame_time_follows_the_recording_unless_it_is_kept():
     assert rebase(released, problem.observations, keep_frame_time=True).simulation.frame_time == 0.03335
 
 
-def test_another_number_of_nodes_is_refused():
+def test_the_same_nodes_are_told_from_others():
     problem = small.fit_problem()
-    seen = problem.observations
-    with pytest.raises(InputError, match=r"as many nodes: \d+; received \d+.*mocap\.rings"):
-        rebase(problem.twin, replace(seen, surface_points=seen.surface_points[1:]))
+    topology, seen = problem.twin.topology, problem.observations
+    assert corresponds(topology, seen)
+    assert corresponds(topology, replace(seen, **{name: getattr(seen, name) * 3 for name in PLACES}))
+    assert not corresponds(topology, replace(seen, surface_points=seen.surface_points[1:]))
+    assert not corresponds(topology, replace(seen, controller_points=seen.controller_points[:, 1:]))
+    order = np.random.default_rng(0).permutation(seen.object_points.shape[1])
+    assert not corresponds(
+        topology, replace(seen, object_points=seen.object_points[:, order], surface_points=seen.surface_points[::-1])
+    )
+
+
+def test_the_same_nodes_in_another_order_make_the_same_motion():
+    problem = small.fit_problem()
+    seen, twin = problem.observations, problem.twin
+    order = np.random.default_rng(0).permutation(seen.object_points.shape[1])
+    shuffled = replace(seen, **{name: getattr(seen, name)[:, order] for name in TRACKED})
+    result = move(twin, shuffled)
+    assert result.facts["residual"] < ROUNDED
+    there = roll_out(result.twin, seen.controller_points).positions[:, : len(order)]
+    here = roll_out(twin, seen.controller_points).positions[:, order]
+    # The longest springs ask by rank among equal distances of a regular body, so a few differ.
+    moved = np.linalg.norm(here - here[0], axis=2).mean()
+    assert np.linalg.norm(there - here, axis=2).mean() < 0.05 * moved
 
 
 def test_the_mean_of_rollouts():
