@@ -43,13 +43,21 @@ class Method(Section):
     methods share."""
     carry_over: bool = False
     """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
+    pool: Literal["all", "others"] | None = None
+    """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
+    its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
     average_seeds: bool = False
     """Predict the mean of the trajectories of all seeds; this costs as many fits as there are seeds."""
+
+    @property
+    def searched(self) -> str:
+        """The name of its search: the row's, and on which recordings of the pool it is made."""
+        return f"{self.search}-{self.pool}" if self.pool else self.search or ""
 
     def __post_init__(self) -> None:
         if (self.search is None) == (self.model is None):
             raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
-        twins_only = {"fit": self.fit, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
+        twins_only = {"fit": self.fit, "pool": self.pool, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
         misplaced = [name for name, value in twins_only.items() if value]
         if self.model and misplaced:
             raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to model {self.model}")

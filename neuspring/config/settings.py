@@ -35,7 +35,7 @@ def _seed_list(value: Any) -> Any:
 
 
 def _transfers(value: Any) -> Any:
-    """`--config transfers=null` arrives as text."""
+    """`--config transfers=null` arrives as text; pools too."""
     if isinstance(value, dict):
         return {source: tuple(targets) if isinstance(targets, list) else targets for source, targets in value.items()}
     return None if value == "null" else value
@@ -84,6 +84,8 @@ class Config(Section):
     name."""
     transfers: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
+    pools: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
+    """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
     results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(os.path.normpath)] = "results"
     """Folder for everything that is written."""
     tables: Name = "tables"
@@ -124,6 +126,9 @@ class Config(Section):
             values = getattr(self, name)
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: entries must differ, received {list(values)}")
+        pooled = [name for members in (self.pools or {}).values() for name in members]
+        if len(set(pooled)) != len(pooled) or any(len(members) < 2 for members in (self.pools or {}).values()):
+            raise ValueError("pools: at least two scenarios each, and every scenario in one pool at most, are required")
         for source, targets in (self.transfers or {}).items():
             if not targets or len(set(targets)) != len(targets) or source in targets:
                 rule = "at least one other scenario is required, each once; leave the entry out for no transfer"

@@ -173,6 +173,10 @@ class Benchmark:
     """Chosen method with splats of its own -> the method in whose name they are made."""
     studies: dict[str, Study]
     """All rows of the study table; `config.studies` names those that are made without being asked for."""
+    pools: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Scenario of the whole configuration -> the other recordings of its pool, where a method has one."""
+    pooled: frozenset[str] = frozenset()
+    """Methods of the whole configuration that are judged on a pool, so that scenarios without any are left out."""
     on_gpu: bool = False
     """Whether jobs take GPUs. `twins_per_launch: auto` lets no fits share launches there: nobody has measured whether it pays."""
 
@@ -199,6 +203,8 @@ class Benchmark:
         _require_known("transfers", everyone, scenarios, config.scenario_table)
         transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
         targets = tuple(name for names in transfers.values() for name in names)
+        pools = _pools(whole, scenarios, methods, searches)
+        targets += tuple(other for name in config.scenarios for other in pools.get(name, ()))
         _require_alike(config, scenarios, transfers)
         if whole.tune:
             of = "this configuration's scenarios"
@@ -211,7 +217,7 @@ class Benchmark:
             {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + _tuned(whole))},
             {n: scenarios[n] for n in whole.scenarios},
             {n: methods[n] for n in config.methods},
-            {n: searches[n] for n in wanted},
+            {row.searched: searches[row.search] for n in config.methods if (row := methods[n]).search},
             {n: methods[n] for n in owners.values()},
             owners,
             transfers,
@@ -219,6 +225,8 @@ class Benchmark:
             {n: methods[n] for n in looks.values()},
             looks,
             studies,
+            pools,
+            frozenset(name for name in whole.methods if methods[name].pool),
         )
         for name in [*chosen.scenarios, *chosen.methods]:
             if name in (*RESERVED, config.tables) or name.startswith("search-"):
@@ -241,11 +249,18 @@ class Benchmark:
             appearance_of(self.config, method, name)
         if not (method.search and method.fit):
             return
-        wanted_low, wanted_high = search_of(self.config, self.searches[method.search], method.search).ranges.stiffness
+        wanted_low, wanted_high = search_of(self.config, self.searches[method.searched], method.search).ranges.stiffness
         low, high = fit_of(self.config, method, name).stiffness_range
         if not low <= wanted_low < wanted_high <= high:
             rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+
+    def pool_kind(self, job: Any) -> str | None:
+        """Of the search that a job makes, or of its method: whether it is judged on all of the pool, the others, or no pool."""
+        rows = self.fits | self.methods
+        if hasattr(job, "method"):
+            return rows[job.method].pool
+        return next((row.pool for row in rows.values() if row.search and row.searched == job.search), None)
 
     def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
         """The fits (method, seed) of a scenario that share launches: those of equal horizon, where they are not too few.
@@ -255,7 +270,9 @@ class Benchmark:
         most = self.config.twins_per_launch
         if most == 1 or (most == "auto" and self.on_gpu) or scenario not in self.config.scenarios:
             return ()
-        rows, seeds = [name for name in self.fits if self.applies(name, scenario)], self.config.seeds
+        # A fit on several recordings takes turns between them, and shares launches with nobody.
+        rows = [name for name, method in self.fits.items() if self.applies(name, scenario) and not method.pool]
+        seeds = self.config.seeds
         alike = Counter(self._horizons[name] for name in rows)
         return tuple((name, seed) for name in rows if alike[self._horizons[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
 
@@ -297,20 +314,23 @@ class Benchmark:
         return self.config.images.enabled and (source.films or (path is not None and source.images_beside(path)))
 
     def applies(self, method: str, scenario: str) -> bool:
-        """Whether a method can be run on a scenario: what is trained on silhouettes needs images."""
+        """Whether a method can be run on a scenario: what is trained on silhouettes needs images, what has a pool the others."""
+        if method in self.pooled and scenario not in self.pools:
+            return False
         return method not in self.pictured or self.has_images(scenario)
 
     @property
     def whole_left_out(self) -> dict[str, tuple[str, ...]]:
         """Of the whole configuration: method -> the scenarios to which it does not apply; methods that apply to all are no keys."""
-        without = tuple(name for name in self.whole_scenarios if self.pictured and not self.has_images(name))
-        return {name: without for name in self.whole.methods if name in self.pictured and without}
+        some = self.pictured | self.pooled
+        without = {n: tuple(s for s in self.whole_scenarios if not self.applies(n, s)) for n in self.whole.methods if n in some}
+        return {name: scenarios for name, scenarios in without.items() if scenarios}
 
     def _require_applying(self) -> None:
         """Raise InputError if nothing of what was asked for can be run."""
         if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
-            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images"
-            remedy = "Choose scenarios with images (and images.enabled), or a variant such as spring_gaus_points."
+            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"
+            remedy = "Choose scenarios with images (and images.enabled), name pools, or choose another method."
             raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
 
     def capture_folder(self, name: str) -> Path:
@@ -359,7 +379,23 @@ def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]
     """Method with a fit -> the first row of the table with the same search, stage and settings."""
     first: dict[tuple[Any, ...], str] = {}
     fitted = {name: method for name, method in methods.items() if method.fit}
-    return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+    return {name: first.setdefault((m.search, m.pool, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+
+
+def _pools(
+    whole: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method], searches: Mapping[str, SearchRow]
+) -> dict[str, tuple[str, ...]]:
+    """Scenario -> the others of its pool, of those that are in one; none where no method has a pool. Raises InputError."""
+    if not any(methods[name].pool for name in whole.methods):
+        return {}
+    taken = [name for name in searches if name.endswith(("-all", "-others"))]
+    if taken:
+        raise InputError(whole.search_table, "names that end with -all or -others belong to searches on a pool", ", ".join(taken))
+    members = {name: names for names in (whole.pools or {}).values() for name in names}
+    _require_known("pools", tuple(members), scenarios, whole.scenario_table)
+    pools = {name: tuple(other for other in names if other != name) for name, names in members.items()}
+    _require_alike(whole, scenarios, pools, "pools")
+    return pools
 
 
 def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
@@ -374,13 +410,15 @@ def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
     return bool(baseline and baseline.trained and baseline.takes_pictures(section_of(config, method, name)))
 
 
-def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]]) -> None:
-    """A twin moves only to a recording of the same object with as many nodes, which `mocap.spacing` does not promise."""
+def _require_alike(
+    config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]], key: str = "transfers"
+) -> None:
+    """Twins go to recordings of the same object; those of `mocap` with as many nodes, which `mocap.spacing` does not promise."""
     for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
         here, there = scenarios[source], scenarios[target]
         if (here.source, here.category) != (there.source, there.category):
             rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
-            raise InputError("configuration, transfers", rule, f"source {there.source}, category {there.category}")
+            raise InputError(f"configuration, {key}", rule, f"source {there.source}, category {there.category}")
         if here.source == "mocap" and config.mocap.rings is None:
             rule = "must be set where twins are transferred, so that all recordings have as many nodes"
             raise InputError("configuration, mocap.rings", rule, None)

@@ -9,6 +9,7 @@ import functools
 import hashlib
 import json
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -103,6 +104,7 @@ class Inputs:
             f"{self.results}/{scenario}/{method}/{seed}/transfer.json"
             for scenario in self.benchmark.transfers
             for method in methods
+            if self.benchmark.applies(method, scenario)
             for seed in self.config.seeds
         ]
 
@@ -179,7 +181,17 @@ class Inputs:
     def search_of_fit(self, job: Any) -> str:
         """The search that a method starts from."""
         method = (self.benchmark.methods | self.benchmark.fits)[job.method]
-        return self._record(job, f"search-{method.search}", "search")
+        return self._record(job, f"search-{method.searched}", "search")
+
+    def pool(self, job: Any) -> list[str]:
+        """Observations of the other recordings that a search or a fit is judged on."""
+        others = self.benchmark.pools[job.scenario] if self.benchmark.pool_kind(job) else ()
+        return [f"{self.results}/{name}/observations.npz" for name in others]
+
+    def pool_options(self, job: Any) -> str:
+        """The options of `neuspring search` and `fit` that name them."""
+        kind = self.benchmark.pool_kind(job)
+        return shlex.join(["--pool", *self.pool(job), *(["--leave-out"] if kind == "others" else [])]) if kind else ""
 
     def search(self, job: Any) -> list[str]:
         """The search's record; a baseline's model has none."""
@@ -261,11 +273,11 @@ class Inputs:
         assert method.search
         switches = {
             "search": method.search,
-            "clusters": self.benchmark.searches[method.search].clusters,
+            "clusters": self.benchmark.searches[method.searched].clusters,
             "fit": method.fit or "none",
             "carry_over": method.carry_over,
             "average_seeds": method.average_seeds,
-        }
+        } | ({"pool": method.pool} if method.pool else {})
         return _json(switches | settings)
 
     # --- settings and code

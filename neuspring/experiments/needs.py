@@ -169,19 +169,25 @@ class Needs:
         """Frames that a job simulates; frame 0 is given."""
         benchmark, body = self._benchmark, self.sizes.body(wildcards.scenario)
         if rule == "search":
-            return int(self._rollouts(wildcards.search) * (body.train_end - 1))
+            return int(self._rollouts(wildcards.search) * self._training_frames(wildcards))
         together = benchmark.fits_together(wildcards.scenario) if rule in ("fits", "fit") else ()
         if rule == "fits":
             return int(sum(self._epochs(method) for method, _ in together) * (body.train_end - 1))
         if rule == "fit":
             if (wildcards.method, int(wildcards.seed)) in together:
                 return 1  # what runs together is the work of `fits`
-            return int(self._epochs(wildcards.method) * (body.train_end - 1))
+            return int(self._epochs(wildcards.method) * self._training_frames(wildcards))
         if rule == "transfer":
             return sum(self.sizes.body(name).frames - 1 for name in benchmark.transfers[wildcards.scenario])
         method = benchmark.methods[wildcards.method]
         seeds = len(benchmark.whole.seeds) if method.average_seeds else 1
         return (body.frames - 1) * seeds * (CARRY_OVER if method.carry_over else 1)
+
+    def _training_frames(self, job: Any) -> int:
+        """Frames after frame 0 that a search or a fit is judged on, on all recordings that count."""
+        kind = self._benchmark.pool_kind(job)
+        counted = [*([] if kind == "others" else [job.scenario]), *(self._benchmark.pools[job.scenario] if kind else ())]
+        return sum(self.sizes.body(name).train_end - 1 for name in counted)
 
     def amount(self, rule: str, wildcards: Any) -> tuple[float | None, Size | None]:
         """A job's work in the unit of its times, and, if it simulates, the size of its twins.
@@ -195,10 +201,10 @@ class Needs:
             search = wildcards.search
         elif rule == "fits":
             together = self._benchmark.fits_together(wildcards.scenario)
-            search = self._benchmark.fits[together[0][0]].search if together else None
+            search = self._benchmark.fits[together[0][0]].searched if together else None
         else:
             rows = self._benchmark.fits if rule == "fit" else self._benchmark.methods
-            search = rows[wildcards.method].search
+            search = rows[wildcards.method].searched or None
         if search is None:
             return None, None
         size = self.sizes.of(wildcards.scenario, search, rule == "search")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial as partial_of
 from pathlib import Path
 
 from neuspring.config import Config, Kind
@@ -17,11 +19,13 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
 from neuspring.twin.fit import FitProblem, fit
+from neuspring.twin.pooled import PooledFit
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring fit`."""
     shared.add_observations(parser)
+    shared.add_pool(parser)
     shared.add_record(parser, "search", "search.json to start from")
     shared.add_settings(parser)
     about = "train each spring, or the neural spring field"
@@ -32,7 +36,7 @@ def options(parser: ArgumentParser) -> None:
 
 def command(a: Namespace) -> None:
     """`neuspring fit`."""
-    run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output)
+    run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output, a.pool, a.leave_out)
 
 
 @dataclass(frozen=True)
@@ -46,13 +50,23 @@ class Prepared:
     """What a checkpoint must match."""
 
 
-def recorder(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> Recorder:
+def recorder(
+    observations_path: Path,
+    search_record: Path,
+    settings: Config,
+    kind: Kind,
+    device: str,
+    output: Path,
+    pool: Sequence[Path] = (),
+    leave_out: bool = False,
+) -> Recorder:
     """The recorder of a fit, which digests its inputs."""
+    own = {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]} | ({"leave_out": True} if leave_out else {})
     return Recorder(
         "fit",
         output,
-        inputs={"observations": observations_path, "search": search_record},
-        settings=select(settings, STAGES["fit"].reads) | {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]},
+        inputs={"observations": observations_path, "search": search_record} | shared.pool_inputs(pool),
+        settings=select(settings, STAGES["fit"].reads) | own,
         device=device,
     )
 
@@ -71,26 +85,40 @@ def prepared(record: Recorder, observations_path: Path, search_record: Path, set
         record.settings["kind"],
         int(record.settings["seed"]),
     )
+    # What was read, the search by its twin alone.
     inputs = {"observations": record.inputs["observations"], "twin": before.files["twin"][1]}
+    inputs |= {name: digest for name, digest in record.inputs.items() if name.startswith("pool")}
     key = checkpoint_key(inputs, record.settings, record.device, "neuspring.twin.fit")
     return Prepared(problem, record.output.with_name("fit.partial.npz"), key)
 
 
-def run(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> None:
+def run(
+    observations_path: Path,
+    search_record: Path,
+    settings: Config,
+    kind: Kind,
+    device: str,
+    output: Path,
+    pool: Sequence[Path] = (),
+    leave_out: bool = False,
+) -> None:
     """Write twin.npz, history.parquet (losses per epoch), and the record `output`.
 
     `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
-    A checkpoint that a killed fit left, or one that ran together with others (`fits`), is continued.
+    A checkpoint that a killed fit left, or one that ran together with others (`fits`), is continued. With a `pool` of other
+    recordings' observations the twin is fitted on all; with `leave_out`, on those alone.
     """
-    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output)
+    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output, pool, leave_out)
     before = StageRecord.load(search_record)
     if before.status == "failed":
         record.save(failure=f"search: {before.reason}")
         return
     ready = prepared(record, observations_path, search_record, settings)
     problem, partial = ready.problem, ready.partial
+    fitted = [Observations.load(path) for path in pool]
+    run_of = partial_of(PooledFit, pool=fitted, leave_out=leave_out) if pool or leave_out else None
     try:
-        result = fit(problem, partial=partial, key=ready.key)
+        result = fit(problem, partial=partial, key=ready.key, run_of=run_of)
     except NumericalFailure as failure:
         record.save(failure=str(failure))
         return
@@ -100,7 +128,9 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     write_history(result.history["epoch"], columns, files["history"])
     counts = result.twin.counts
     # Those that ran together count in the record of `fits`.
-    frames = (len(result.history) - result.epochs_together) * (problem.observations.scenario.train_end - 1)
+    counted = [*([] if leave_out else [problem.observations]), *fitted]
+    per_epoch = sum(observations.scenario.train_end - 1 for observations in counted)
+    frames = (len(result.history) - result.epochs_together) * per_epoch
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,19 @@ def add_observations(parser: ArgumentParser, *, required: bool = True, help: str
 def add_record(parser: ArgumentParser, stage: str, help: str, *, required: bool = True) -> None:
     """The record of a stage before this one."""
     parser.add_argument(f"--{stage}", type=Path, required=required, help=help)
+
+
+def add_pool(parser: ArgumentParser) -> None:
+    """--pool and --leave-out."""
+    about = "observations of other recordings of the object with the same nodes, which one twin is judged on too"
+    parser.add_argument("--pool", type=Path, nargs="+", default=[], help=about)
+    about = "judge on the pool alone; of --observations only frame 0 is used, where the twin lies"
+    parser.add_argument("--leave-out", action="store_true", help=about)
+
+
+def pool_inputs(pool: Sequence[Path]) -> dict[str, Path]:
+    """Inputs of a record: the pool's observations, by place."""
+    return {f"pool{place}": path for place, path in enumerate(pool)}
 
 
 def add_settings(parser: ArgumentParser) -> None:

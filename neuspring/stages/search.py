@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
 from neuspring.config import Config
@@ -15,12 +16,14 @@ from neuspring.core.files import write_history
 from neuspring.core.records import Recorder
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
+from neuspring.twin.recordings import Recording
 from neuspring.twin.search import SearchProblem, search
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring search`."""
     shared.add_observations(parser)
+    shared.add_pool(parser)
     shared.add_settings(parser)
     parser.add_argument("--clusters", type=int, default=1, help="regions of the topology with values of their own (1: uniform)")
     shared.add_seed(parser)
@@ -32,7 +35,18 @@ def options(parser: ArgumentParser) -> None:
 def command(a: Namespace) -> None:
     """`neuspring search`."""
     together = shared.read_twins_per_launch(a)
-    run(a.observations, shared.read_settings(a.settings), a.clusters, a.seed, a.device, a.output, together, a.threads)
+    run(
+        a.observations,
+        shared.read_settings(a.settings),
+        a.clusters,
+        a.seed,
+        a.device,
+        a.output,
+        together,
+        a.threads,
+        a.pool,
+        a.leave_out,
+    )
 
 
 def run(
@@ -44,11 +58,14 @@ def run(
     output: Path,
     together: int = 0,
     threads: int = 1,
+    pool: Sequence[Path] = (),
+    leave_out: bool = False,
 ) -> None:
     """Write twin.npz, trace.parquet (every candidate with its cost and variables), history.parquet, and the record `output`.
 
     At most `together` candidates share a launch (0: as many as pay), and `threads` launches run at the same time on a CPU; neither
     changes a number there. A trace of the same search is continued, so a larger `search.rollouts` costs only the difference.
+    With a `pool` of other recordings' observations a candidate's cost is the mean over all; with `leave_out`, over those alone.
     """
     if threads < 1:
         raise InputError("--threads", "must be at least 1", threads)
@@ -57,8 +74,8 @@ def run(
     record = Recorder(
         "search",
         output,
-        inputs={"observations": observations_path},
-        settings=values | {"clusters": clusters, "seed": seed},
+        inputs={"observations": observations_path} | shared.pool_inputs(pool),
+        settings=values | {"clusters": clusters, "seed": seed} | ({"leave_out": True} if leave_out else {}),
         device=device,
     )
     problem = SearchProblem(
@@ -71,6 +88,11 @@ def run(
         clusters,
         together,
         threads,
+        tuple(
+            Recording.of(Observations.load(path), settings.simulation, settings.losses, settings.released_quirks, device)
+            for path in pool
+        ),
+        leave_out,
     )
     # The budget is not part of the key: a search with a larger one begins with the same candidates.
     without_budget = {name: value for name, value in values["search"].items() if name != "rollouts"}
@@ -90,8 +112,7 @@ def run(
         "rollouts": len(result.trace),
         "failed_rollouts": int((result.trace["reason"] != "").sum()),
         "collision_overflow": int(result.trace["collision_overflow"].max()),
-        "spring_updates": int((result.trace["springs"] * result.trace["substeps"]).sum())
-        * (problem.observations.scenario.train_end - 1),
+        "spring_updates": int((result.trace["springs"] * result.trace["substeps"]).sum()) * problem.simulated_frames,
         **result.twin.counts,
     }
     record.save(files, facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)

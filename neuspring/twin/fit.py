@@ -286,16 +286,18 @@ def fit(
     key: str = "",
     on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
     seat: Seat | None = None,
+    run_of: Callable[[FitProblem, Seat | None], TwinFit] | None = None,
 ) -> FitResult:
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
-    `seat` the simulation shares launches with other fits (company.py). Raises NumericalFailure if no epoch could be completed.
+    `seat` the simulation shares launches with other fits (company.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
+    several recordings (pooled.py). Raises NumericalFailure if no epoch could be completed.
     """
     label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(seat.company.seats) if seat else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
-    run = TwinFit(problem, seat)
+    run = (run_of or TwinFit)(problem, seat)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)

@@ -31,6 +31,7 @@ from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
+from neuspring.twin.recordings import Recording, mean_outcome, on_recording, require_pool
 from neuspring.twin.topology import isolated, piecewise_topology, regions
 from neuspring.twin.trials import Outcome, outcomes
 
@@ -61,15 +62,26 @@ class SearchProblem:
     """Candidates in one launch at most; 0: as many as pay (`together`). Costs do not depend on it, bit for bit on a CPU."""
     threads: int = 1
     """Threads that simulate at the same time, on a CPU."""
+    pool: tuple[Recording, ...] = ()
+    """Other recordings of the object. A candidate is moved to each, and its cost is the mean over all."""
+    leave_out: bool = False
+    """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     velocity: np.ndarray = field(init=False)
     """Velocity of each node in frame 0 [N, 3], m/s."""
 
     def __post_init__(self) -> None:
+        require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
         nodes = self.observations.canonical[: len(self.observations.nodes)]
         object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+
+    @property
+    def simulated_frames(self) -> int:
+        """Frames that a candidate is simulated over, on all recordings that count."""
+        counted = [*([] if self.leave_out else [self.observations]), *(recording.observations for recording in self.pool)]
+        return sum(observations.scenario.train_end - 1 for observations in counted)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -351,13 +363,17 @@ def _evaluate(
     made = list(each(lambda normalized: _made(problem, normalized), population))
     for number, (row, _) in enumerate(made):
         row |= {"rollout": index + number, "generation": generation}
-    rows, twins = [row for row, twin in made if twin], [twin for _, twin in made if twin]
+    rows, families = [row for row, family in made if family], [family for _, family in made if family]
+    twins = [family[0] for family in families]
 
     def simulate(members: list[int]) -> None:
         start = time.perf_counter()
-        results = judge(problem, [twins[k] for k in members], loss)
+        results = [] if problem.leave_out else [judge(problem, [twins[k] for k in members], loss)]
+        for place, recording in enumerate(problem.pool, start=1):
+            moved = [families[k][place] for k in members]
+            results.append(outcomes(moved, recording.hands, recording.velocity, recording.loss, problem.device))
         share = (time.perf_counter() - start) / len(members)
-        for k, result in zip(members, results, strict=True):
+        for k, result in zip(members, map(mean_outcome, zip(*results, strict=True)), strict=True):
             rows[k]["collision_overflow"] = result.collision_overflow
             rows[k]["seconds"] += share
             if result.left:
@@ -371,24 +387,29 @@ def _evaluate(
     return [row for row, _ in made]
 
 
-def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any], Twin | None]:
-    """A candidate's row, its cost the penalty, and its twin; none, with the reason in the row, if it cannot be integrated."""
+def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any], tuple[Twin, ...]]:
+    """A candidate's row, its cost the penalty, and its twin, here and on each recording of the pool.
+
+    None, with the reason in the row, if one cannot be integrated.
+    """
     start = time.perf_counter()
     values = problem.decode(normalized)
     row: dict[str, Any] = {"rollout": 0, "generation": 0, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
     row |= values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
-    twin = None
+    family: tuple[Twin, ...] = ()
     try:
         twin = candidate(problem, values)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
+        moved = (on_recording(twin, recording.observations, problem.quirks) for recording in problem.pool)
+        family = (twin, *(with_substeps(problem, one) for one in moved))
     except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
         # The candidate is too stiff for a fixed number of substeps.
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
-    return row, twin
+    return row, family
 
 
 def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +18,8 @@ from neuspring.config import Config, Method, SearchRow, parse
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.inputs import Inputs
+from neuspring.experiments.needs import Needs
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
 
@@ -314,6 +318,74 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
     assert benchmark(tmp_path, **chosen, mocap={"rings": 20}).transfers == {"one": ("other",)}
 
 
+def pooled(folder: Path, **changes: object) -> Benchmark:
+    """Two methods on the pool of a rope, and the same two alone."""
+    row = "{name}: {{search: uniform, fit: springs, pool: {pool}, description: x}}\n"
+    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="others"))
+    toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
+    write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
+    chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
+    return benchmark(folder, **(chosen | {"scenarios": ["a"], "methods": ["full", "one", "two"]} | changes))
+
+
+def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -> None:
+    made = pooled(tmp_path)
+    assert made.pools["a"] == ("b", "c")
+    assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
+    assert list(made.searches) == ["uniform", "uniform-all", "uniform-others"]
+    assert made.fit_of_method == {"full": "full", "one": "one", "two": "two"}
+    inputs, needs = Inputs(made), Needs(made, "cpu")
+    jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
+    assert [inputs.search_of_fit(job) for job in jobs.values()] == [
+        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-others")
+    ]
+    others = ["results/b/observations.npz", "results/c/observations.npz"]
+    assert [inputs.pool(job) for job in jobs.values()] == [[], others, others]
+    words = [inputs.pool_options(SimpleNamespace(scenario="a", search=name)) for name in made.searches]
+    assert words == ["", f"--pool {' '.join(others)}", f"--pool {' '.join(others)} --leave-out"]
+    assert [inputs.pool_options(job) for job in jobs.values()] == words
+    work = [needs.work("fit", job) for job in jobs.values()]
+    assert [count / work[0] for count in work] == [1, 3, 2]
+    work = [needs.work("search", SimpleNamespace(scenario="a", search=name)) for name in made.searches]
+    assert [count / work[0] for count in work] == [1, 3, 2]
+    assert [json.loads(inputs.variant(job)).get("pool") for job in jobs.values()] == [None, "all", "others"]
+    assert json.loads(inputs.variant(jobs["one"]))["clusters"] == 1
+
+
+def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) -> None:
+    made = pooled(tmp_path, scenarios=["a", "cloth"])
+    assert made.whole_left_out == {"one": ("cloth",), "two": ("cloth",)}
+    assert [path for path in Inputs(made).runs() if "cloth" in path] == ["results/cloth/full/0/run.json"]
+    assert made.applies("one", "a")
+
+
+def test_fits_on_a_pool_share_no_launches(tmp_path: Path) -> None:
+    together = pooled(tmp_path, seeds=[0, 1, 2], twins_per_launch=8).fits_together("a")
+    assert together == (("full", 0), ("full", 1), ("full", 2))
+
+
+def test_no_pool_is_asked_for_without_such_a_method(tmp_path: Path) -> None:
+    made = pooled(tmp_path, methods=["full"])
+    assert made.pools == {}
+    assert list(made.scenarios) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pools": None, "methods": ["one"]}, r"at least one method must apply to a scenario.* a pool `pools`"),
+        ({"pools": {"more": ["b", "c"]}, "methods": ["one", "two"]}, r"at least one method must apply"),
+        ({"pools": {"rope": ["a"]}}, r"pools: at least two scenarios each"),
+        ({"pools": {"rope": ["a", "b"], "more": ["a", "c"]}}, r"every scenario in one pool at most"),
+        ({"pools": {"rope": ["a", "nobody"]}}, r"configuration, pools: every entry must be a row of toys\.tsv"),
+        ({"pools": {"rope": ["a", "cloth"]}}, r"configuration, pools: cloth must be of the same object as a"),
+    ],
+)
+def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        pooled(tmp_path, **changes)
+
+
 def test_the_tables_of_the_project_are_valid_together() -> None:
     """Every row of the method table, with the search that it names."""
     root = ROOT
@@ -323,7 +395,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     for name, method in made.methods.items():
         if method.search:
             tables.fit_of(made.config, method, name)
-            tables.search_of(made.config, made.searches[method.search], method.search)
+            tables.search_of(made.config, made.searches[method.searched], method.search)
     for name in methods:
         if name.startswith("clusters_"):
             assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))

@@ -2,6 +2,7 @@
 rule search:
     input:
         observations=rules.observe.output,
+        pool=INPUTS.pool,
     output:
         f"{RESULTS}/{{scenario}}/search-{{search}}/{{seed}}/search.json",
     log:
@@ -16,12 +17,13 @@ rule search:
         runtime=NEEDS.minutes("search"),
     params:
         clusters=lambda wildcards: BENCHMARK.searches[wildcards.search].clusters,
+        pool=INPUTS.pool_options,
         settings=settings_of("search"),
         code=code_of("search"),
     shell:
         gpu_job(
             "search --observations {input.observations:q} --settings {params.settings:q}"
-            " --clusters {params.clusters} --seed {wildcards.seed}"
+            " {params.pool} --clusters {params.clusters} --seed {wildcards.seed}"
             f" --twins-per-launch {CONFIG.twins_per_launch} --output {{output:q}}"
         )
 
@@ -57,6 +59,7 @@ rule fit:
     input:
         observations=rules.observe.output,
         search=INPUTS.search_of_fit,
+        pool=INPUTS.pool,
         shared=lambda wildcards: [
             ancient(path) for path in INPUTS.shared_launches(wildcards)
         ],
@@ -74,12 +77,13 @@ rule fit:
         runtime=NEEDS.minutes("fit"),
     params:
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
+        pool=INPUTS.pool_options,
         settings=settings_of("fit"),
         code=code_of("fit"),
     shell:
         gpu_job(
             "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-            " --kind {params.kind} --output {output:q}"
+            " {params.pool} --kind {params.kind} --output {output:q}"
         )
 
 

@@ -48,7 +48,7 @@ def scores(results: Path, benchmark: Benchmark, name: str, method: str, seed: in
     """The workflow's scores of one run, and those of its restarted twin (task `restarted`)."""
     again = restarted(benchmark, Observations.load(results / name / "observations.npz"))
     row = benchmark.methods[method]
-    folder = benchmark.fit_of_method[method] if row.fit else f"search-{row.search}"
+    folder = benchmark.fit_of_method[method] if row.fit else f"search-{row.searched}"
     trained = bool(row.fit and fit_of(benchmark.config, row, method).rest_length_bound)
     twin = rebase(Twin.load(results / name / folder / str(seed) / "twin.npz"), again, keep_lengths=trained)
     velocity = initial_velocity(again, twin.simulation.initial_velocity)
