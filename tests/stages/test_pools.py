@@ -1,0 +1,67 @@
+"""Search and fit on several recordings, through their stages: what their records name, and that fits share nothing wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.core.job_records import SPRING_UPDATES
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.stages import fit, search
+from tests.support import small
+
+SETTINGS = config.Config(
+    search=config.Search(rollouts=6, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    fit=config.Fit(epochs=2, learning_rate=5e-2, checkpoint_every=1),
+)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Observations of one rope, moved in two ways."""
+    folder = tmp_path_factory.mktemp("pool")
+    paths = {name: folder / f"{name}.npz" for name in ("lift", "shake")}
+    for name, path in paths.items():
+        small.scene(f"rope/{name}/smooth").observations.save(path)
+    return paths
+
+
+def run(seen: dict[str, Path], folder: Path, **pool) -> tuple[StageRecord, StageRecord]:
+    """Search and fit of the lifted rope."""
+    found, fitted = folder / "search.json", folder / "fit" / "fit.json"
+    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", found, **pool)
+    fit.run(seen["lift"], found, SETTINGS, "springs", "cpu", fitted, **pool)
+    return StageRecord.load(found), StageRecord.load(fitted)
+
+
+def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
+    alone = run(seen, tmp_path / "alone")
+    pooled = run(seen, tmp_path / "pooled", pool=[seen["shake"]])
+    left_out = run(seen, tmp_path / "left_out", pool=[seen["shake"]], leave_out=True)
+    for one, both, other in zip(alone, pooled, left_out, strict=True):
+        assert "pool0" not in one.inputs
+        assert both.inputs["pool0"] == other.inputs["pool0"] == digest_file(seen["shake"])
+        assert [record.settings.get("leave_out") for record in (one, both, other)] == [None, None, True]
+        assert one.status == both.status == other.status == "ok"
+    ratio = [both.facts[SPRING_UPDATES] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
+    assert ratio[1] == 2 * ratio[0]
+    stiffness = [
+        Twin.load(record.file("twin", tmp_path / name / "fit" / "fit.json")).material.stiffness
+        for name, (_, record) in (("alone", alone), ("pooled", pooled), ("left_out", left_out))
+    ]
+    assert not np.array_equal(stiffness[0], stiffness[1])
+    assert not np.array_equal(stiffness[1], stiffness[2])
+
+
+def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):
+    record = tmp_path / "search.json"
+    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record)
+    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record, pool=[seen["shake"]])
+    assert "made with other inputs or settings" in capsys.readouterr().out
+    first = pd.read_parquet(tmp_path / "trace.parquet")
+    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record, pool=[seen["shake"]])
+    assert "continuing the search after 6 rollouts" in capsys.readouterr().out
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), first)
