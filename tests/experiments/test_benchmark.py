@@ -351,6 +351,7 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_free"],
         ["mocap", "mocap_fine"],
         ["mocap", "mocap_eval"],
+        ["mocap", "mocap_heldout"],
         ["mocap", "mocap_pieces"],
         ["mocap", "mocap_field"],
         ["mocap", "mocap_prediction"],
