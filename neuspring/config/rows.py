@@ -21,6 +21,8 @@ class SearchRow(Section):
     """What the row is, for people."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Search settings of this row alone (keys of `search`), on top of the configuration's."""
+    released_quirks: dict[str, Any] = field(default_factory=dict)
+    """Keys of `released_quirks`, on top of the configuration's, for this search and the fits that start from it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,10 @@ from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.gpus import Gpus
 from neuspring.config.images import Images
 from neuspring.config.perception import Perception
+from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
-from neuspring.config.twin import Fit, Losses, Search
+from neuspring.config.twin import Fit, Losses
 from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 

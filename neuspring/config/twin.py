@@ -1,9 +1,9 @@
-"""Settings of the twin's two stages: the zero-order search and the first-order fit, with their losses."""
+"""Settings of the training losses and of the first-order fit."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -23,123 +23,6 @@ class Losses(Section):
     """Weight of the smooth-L1 error of tracked points."""
     acceleration: NonNegative = 0.01
     """Weight of the acceleration loss, which the search alone uses, as in the released method."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchRanges(Section):
-    """Bounds of the zero-order search."""
-
-    stiffness: Range = (0.0, 1e5)
-    """Stiffness Y of the springs, N."""
-    object_radius: Range = (0.01, 0.05)
-    """Radius within which object nodes are joined, m."""
-    object_neighbours: Range = (10, 50)
-    """Most neighbors of an object node, itself included."""
-    controller_radius: Range = (0.01, 0.08)
-    """Radius within which a controller is joined to object nodes, m."""
-    controller_neighbours: Range = (10, 80)
-    """Most object nodes that a controller is joined to."""
-    ground_elasticity: Range = (0.0, 1.0)
-    """Restitution on the ground."""
-    ground_friction: Range = (0.0, 2.0)
-    """Friction on the ground."""
-    contact_elasticity: Range = (0.0, 1.0)
-    """Restitution between nodes."""
-    contact_friction: Range = (0.0, 2.0)
-    """Friction between nodes."""
-    contact_distance: Range = (0.01, 0.05)
-    """Distance at which nodes collide, m."""
-    drag: Range = (0.0, 20.0)
-    """Velocity decay, 1/s."""
-    dashpot: Range = (0.0, 200.0)
-    """Damping along springs, N s/m."""
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self):
-            low, high = getattr(self, spec.name)
-            if not 0 <= low < high:
-                raise ValueError(f"{spec.name}: 0 <= low < high is required, received [{low}, {high}]")
-        # An object node counts itself among its neighbors.
-        for name, least in (("object_neighbours", 2), ("controller_neighbours", 1)):
-            if getattr(self, name)[0] < least:
-                raise ValueError(f"{name}: at least {least} is required, received {getattr(self, name)[0]}")
-        if self.contact_distance[0] <= 0:
-            raise ValueError(f"contact_distance: must be positive, received {self.contact_distance[0]}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchStart(Section):
-    """Where the search starts; the defaults are those of the released configuration."""
-
-    stiffness: float = 3e4
-    """Stiffness Y of the springs, N."""
-    object_radius: float = 0.02
-    """Radius within which object nodes are joined, m."""
-    object_neighbours: float = 30
-    """Most neighbors of an object node, itself included."""
-    controller_radius: float = 0.04
-    """Radius within which a controller is joined to object nodes, m."""
-    controller_neighbours: float = 50
-    """Most object nodes that a controller is joined to."""
-    ground_elasticity: float = 0.5
-    """Restitution on the ground."""
-    ground_friction: float = 0.3
-    """Friction on the ground."""
-    contact_elasticity: float = 0.7
-    """Restitution between nodes."""
-    contact_friction: float = 0.3
-    """Friction between nodes."""
-    contact_distance: float = 0.02
-    """Distance at which nodes collide, m."""
-    drag: float = 3.0
-    """Velocity decay, 1/s."""
-    dashpot: float = 100.0
-    """Damping along springs, N s/m."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clusters(Section):
-    """Regions of a piecewise topology: agglomerative clustering of the nodes in the rest shape; a search row says how many."""
-
-    linkage: Literal["ward", "complete", "average", "single"] = "ward"
-    """Distance between regions; the two nearest regions merge. ward: the growth of their variance."""
-    connectivity: Annotated[int, Field(ge=0)] = 0
-    """Number of nearest neighbors in a graph of the nodes; only regions that this graph joins may merge. 0: any two may merge."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Search(Section):
-    """Zero-order stage: CMA-ES over homogeneous material and topology."""
-
-    rollouts: Count = 220
-    """Budget in candidate rollouts, the same for every method that is compared. The last generation may be cut short."""
-    sigma: Positive = 1 / 6
-    """Initial step in normalized variables."""
-    tied_rollouts: Annotated[int, Field(ge=0)] = 0
-    """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
-    candidate."""
-    freed_sigma: Positive = 0.06
-    """Step in normalized variables after `tied_rollouts`, when each region becomes free."""
-    stiffness_scale: Literal["linear", "log"] = "linear"
-    """Scale on which stiffness is normalized; log needs a positive lower bound."""
-    isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
-    """Nodes without any spring. repair: join them to their 3 nearest nodes. penalise: refuse the candidate. allow: leave them, as
-    released."""
-    clusters: Clusters = field(default_factory=Clusters)
-    ranges: SearchRanges = field(default_factory=SearchRanges)
-    start: SearchStart = field(default_factory=SearchStart)
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self.start):
-            low, high = getattr(self.ranges, spec.name)
-            value = getattr(self.start, spec.name)
-            if not low <= value <= high:
-                raise ValueError(f"start.{spec.name} = {value} lies outside ranges.{spec.name} = [{low}, {high}]")
-        if self.stiffness_scale == "log" and self.ranges.stiffness[0] <= 0:
-            rule = "stiffness_scale: log needs a positive lower bound of ranges.stiffness"
-            raise ValueError(f"{rule}, received {list(self.ranges.stiffness)}")
-        if self.tied_rollouts >= self.rollouts:
-            raise ValueError(f"tied_rollouts must be below rollouts ({self.rollouts}), received {self.tied_rollouts}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from neuspring.config import (
     Config,
     Fit,
     Method,
+    ReleasedQuirks,
     ScenarioRow,
     Search,
     SearchRow,
@@ -99,6 +100,11 @@ def fit_of(config: Config, method: Method, name: str) -> Fit:
 def search_of(config: Config, row: SearchRow, name: str) -> Search:
     """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
     return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
+
+
+def quirks_of(config: Config, row: SearchRow, name: str) -> ReleasedQuirks:
+    """The quirks of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
+    return parse(ReleasedQuirks, _overlaid(config.released_quirks, row.released_quirks), f"search {name}, released_quirks")
 
 
 def section_of(config: Config, method: Method, name: str) -> Any:
@@ -239,6 +245,8 @@ class Benchmark:
                     # Named weights that are missing or wrong are an error before the first job.
                     BASELINES[method.model].features(section)
             appearance_of(self.config, method, name)
+        if method.search:
+            quirks_of(self.config, self.searches[method.search], method.search)
         if not (method.search and method.fit):
             return
         wanted_low, wanted_high = search_of(self.config, self.searches[method.search], method.search).ranges.stiffness

@@ -266,7 +266,9 @@ class Inputs:
             "carry_over": method.carry_over,
             "average_seeds": method.average_seeds,
         }
-        return _json(switches | settings)
+        quirks = self.benchmark.searches[method.search].released_quirks
+        on = {"released_quirks": sorted(key for key, value in quirks.items() if value)} if quirks else {}
+        return _json(switches | on | settings)
 
     # --- settings and code
 
@@ -296,12 +298,15 @@ class Inputs:
         if stage == "search":
             row = self.benchmark.searches[name]
             values["search"] = plain(benchmarks.search_of(config, row, name))
+            values["released_quirks"] = plain(benchmarks.quirks_of(config, row, name))
             if row.clusters == 1:
                 # What concerns regions alone changes nothing here, so it must not start the search again.
                 values["search"] = {key: value for key, value in values["search"].items() if key not in REGIONS_ONLY}
         if stage == "fit":
             method = self.benchmark.fits[name]
             values["fit"] = plain(benchmarks.fit_of(config, method, name))
+            search = method.search or ""
+            values["released_quirks"] = plain(benchmarks.quirks_of(config, self.benchmark.searches[search], search))
             if method.fit == "springs":
                 del values["fit"]["field"]
         if stage == "appearance":

@@ -1,10 +1,10 @@
-"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
+"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code), then a polish (polish.py).
 
-Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
-whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
-candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology; then
-the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so does a
-finished one with a larger budget: CMA-ES is replayed with the recorded costs.
+Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them, less `search.fixed`. A
+candidate is a whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss.
+The best candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology;
+then the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so
+does a finished one with a larger budget: CMA-ES is replayed with the recorded costs, the polish with the recorded products.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import pandas as pd
 import torch
 
 from neuspring import config
+from neuspring.config.search import LENGTHS
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
@@ -31,8 +32,12 @@ from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
+from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
+from neuspring.twin.residuals import Residuals
+from neuspring.twin.rollout import FAR
+from neuspring.twin.spacing import controller_reach, node_spacing
 from neuspring.twin.topology import isolated, piecewise_topology, regions
-from neuspring.twin.trials import Outcome, outcomes
+from neuspring.twin.trials import Outcome, motions, outcomes
 
 INTEGERS = ("object_neighbours", "controller_neighbours")
 REGIONAL = ("object_radius", "object_neighbours")
@@ -65,43 +70,66 @@ class SearchProblem:
     """Region of each node [N]."""
     velocity: np.ndarray = field(init=False)
     """Velocity of each node in frame 0 [N, 3], m/s."""
+    spacing: float = field(init=False)
+    """Distance between neighboring nodes in the rest shape, m (spacing.py)."""
+    reach: float = field(init=False)
+    """Smallest distance between a controller and a node in the rest shape, m."""
 
     def __post_init__(self) -> None:
-        nodes = self.observations.canonical[: len(self.observations.nodes)]
+        canonical, count = self.observations.canonical, len(self.observations.nodes)
+        nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+        object.__setattr__(self, "spacing", node_spacing(nodes))
+        object.__setattr__(self, "reach", controller_reach(nodes, hands))
 
     @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of the variables: those of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one region)."""
+    def names(self) -> tuple[str, ...]:
+        """All that makes a candidate: the fields of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
         for f in fields(config.SearchRanges):
             regional = f.name in REGIONAL and self.clusters > 1
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
         return tuple(names)
 
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of what is searched: `names` without `search.fixed`."""
+        return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
+
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
-        """Physical values of normalized variables [2K + 10]; neighbor counts are truncated to integers."""
+        """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
+        searched = dict(zip(self.variables, normalized, strict=True))
         values = {}
-        for name, u in zip(self.variables, normalized, strict=True):
-            base, low, high, logarithmic = self._range(name)
-            value = float(low * (high / low) ** float(u)) if logarithmic else low + float(u) * (high - low)
-            values[name] = float(int(value)) if base in INTEGERS else value
+        for name in self.names:
+            base = name.partition(".")[0]
+            if name in searched:
+                low, high = getattr(self.search.ranges, base)
+                u = float(searched[name])
+                value = float(low * (high / low) ** u) if self._is_log(base) else low + u * (high - low)
+            else:
+                value = float(getattr(self.search.start, base))
+            values[name] = float(int(value)) if base in INTEGERS else self._meters(base, value)
         return values
 
     def encode(self) -> np.ndarray:
-        """Normalized variables [2K + 10] of the starting values."""
+        """Normalized `variables` of the starting values."""
         normalized = []
         for name in self.variables:
-            base, low, high, logarithmic = self._range(name)
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
             value = getattr(self.search.start, base)
-            normalized.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
+            normalized.append(np.log(value / low) / np.log(high / low) if self._is_log(base) else (value - low) / (high - low))
         return np.array(normalized)
 
-    def _range(self, name: str) -> tuple[str, float, float, bool]:
-        """The setting of a variable, its range, and whether its scale is logarithmic."""
-        base = name.partition(".")[0]
-        return base, *getattr(self.search.ranges, base), base == "stiffness" and self.search.stiffness_scale == "log"
+    def _is_log(self, base: str) -> bool:
+        return bool(getattr(self.search.scales, base) == "log")
+
+    def _meters(self, base: str, value: float) -> float:
+        """A setting's value; of a length in m, whatever unit it is searched in."""
+        if base not in LENGTHS or self.search.lengths == "meter":
+            return value
+        return value * self.spacing + (self.reach if base == "controller_radius" else 0.0)
 
     def of_regions(self, values: dict[str, float], name: str) -> list[float]:
         """A regional variable's value in each region."""
@@ -166,17 +194,22 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
-    """A material that is the same everywhere; `values` has a number for every field of `Material`."""
-    numbers: dict[str, Any] = {f.name: values[f.name] for f in fields(Material)}
-    arrays = {f.name: np.full(springs, values[f.name]) for f in fields(Material) if "shape" in f.metadata}
+    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
+    every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
+    numbers: dict[str, Any] = {name: values[name] for name in every}
+    arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}
     return Material(**(numbers | arrays))
 
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of candidates that are rolled out together over the training frames."""
+    return outcomes(twins, *_motion(problem), loss, problem.device)
+
+
+def _motion(problem: SearchProblem) -> tuple[torch.Tensor, torch.Tensor]:
+    """Hands [T, C, 3], m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    return outcomes(twins, hands, start, loss, problem.device)
+    return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
 
 
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
@@ -237,12 +270,20 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
     clock = time.perf_counter()
-    trace, attempts, earlier = _recorded(record, key)
+    rows, attempts, earlier = _recorded(record, key)
+    trace = [row for row in rows if row["stage"] == CMAES]
     saved = len(trace)
     proposals = _Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    budget = problem.search.rollouts
-    progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
+    budget = problem.search.cma_rollouts
+    progress = Progress(
+        f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", problem.search.rollouts
+    )
+
+    def save(kept: list[dict[str, Any]]) -> None:
+        if record is not None:
+            _save(record, key, kept, attempts, earlier + time.perf_counter() - clock)
+
     start = 0
     with _threads(problem.threads) as each:
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
@@ -260,19 +301,93 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])
             start = stop
-            if record is not None and len(trace) > saved:
-                _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
-    table = pd.DataFrame(trace[:budget])
-    best = table.iloc[int(table["cost"].to_numpy().argmin())]
+            if len(trace) > saved:
+                save(trace)
+        polished: list[dict[str, Any]] = []
+        recorded = [row for row in rows if row["stage"] != CMAES]
+        for polished in _polished(problem, trace[:budget], recorded, loss, proposals.generation, each):
+            if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
+                save(trace + polished)
+            progress.update(budget + len(polished), "polish")
+    table = pd.DataFrame(trace[:budget] + polished)
+    judged = table[table["stage"] != SLOPES]
+    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
         if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
             rule = f"at least one of {len(table)} candidates must be stable with this count"
             raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
-    values = {name: float(best[name]) for name in problem.variables}
+    values = {name: float(best[name]) for name in problem.names}
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+
+
+def _polished(
+    problem: SearchProblem,
+    trace: Sequence[dict[str, Any]],
+    recorded: Sequence[dict[str, Any]],
+    loss: FrameLoss,
+    generation: int,
+    each: Map,
+) -> Iterator[list[dict[str, Any]]]:
+    """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
+    best = min(trace, key=lambda row: row["cost"])
+    if not problem.search.polish_rounds or best["cost"] >= PENALTY:
+        return
+    start = np.array([best[f"normalised.{name}"] for name in problem.variables])
+    columns = [problem.variables.index(name) for name in problem.search.polished]
+    polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
+    while not polish.done:
+        generation += 1
+        population, first = polish.ask(), len(trace) + len(rows)
+        made = list(recorded[len(rows) : len(rows) + len(population)])
+        same = len(made) == len(population) and all(row["rollout"] == first + k for k, row in enumerate(made))
+        if not same or not _replays(made, population, problem.variables):
+            made, recorded = [], []
+            if polish.stage == SLOPES:
+                made = _slopes(problem, population, polish.steps(), loss, first, generation, each)
+            else:
+                made = [row | {"stage": POLISH} for row in _evaluate(problem, population, loss, first, generation, each)]
+        rows = rows + made
+        polish.tell(made)
+        yield rows
+
+
+def _slopes(
+    problem: SearchProblem,
+    population: Sequence[np.ndarray],
+    steps: np.ndarray,
+    loss: FrameLoss,
+    index: int,
+    generation: int,
+    each: Map,
+) -> list[dict[str, Any]]:
+    """Rows of a base and its neighbors, with the products of their slopes.
+
+    All take as many substeps as the one that needs most: another step would move a twin as a small change of a variable does.
+    """
+    clock = time.perf_counter()
+    made = list(each(lambda normalized: _made(problem, normalized), population))
+    base = made[0][1]
+    assert base is not None, "the base was simulated before"
+    twins = [twin or base for _, twin in made]
+    most = max(twin.simulation.substeps for twin in twins)
+    twins = [replace(twin, simulation=replace(twin.simulation, substeps=most)) for twin in twins]
+    hands, start = _motion(problem)
+    positions, velocities = motions(twins, hands, start, problem.device)
+    fine = [made[k][1] is not None and bool((positions[:, k].abs() < FAR).all()) for k in range(len(twins))]
+    costs, products, gradient = slopes(Residuals.of(loss, start), positions, velocities, fine, steps)
+    share = (time.perf_counter() - clock) / len(made)
+    rows = []
+    for k, (row, _) in enumerate(made):
+        row |= {"rollout": index + k, "generation": generation, "stage": SLOPES, "substeps": most, "seconds": share}
+        row["cost"] = min(float(costs[k]), PENALTY)
+        own = (0.0, np.zeros(len(steps))) if k == 0 else (gradient[k - 1], products[k - 1])
+        row |= {RESIDUAL: float(own[0])}
+        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.search.polished, own[1], strict=True)}
+        rows.append(row)
+    return rows
 
 
 @contextmanager
@@ -375,7 +490,7 @@ def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any
     """A candidate's row, its cost the penalty, and its twin; none, with the reason in the row, if it cannot be integrated."""
     start = time.perf_counter()
     values = problem.decode(normalized)
-    row: dict[str, Any] = {"rollout": 0, "generation": 0, "cost": PENALTY, "reason": ""}
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
     row |= values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
     twin = None

@@ -22,6 +22,7 @@ from neuspring.experiments import size
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.needs import CARRY_OVER, Needs
 from neuspring.twin.search import RELEASED_SUBSTEPS, SearchProblem, candidate
+from tests.support import small
 from tests.support.project import ROOT, config_with
 from tests.support.scenarios import observations
 
@@ -80,11 +81,10 @@ def test_bodies_follow_the_released_table_and_the_sampling():
 def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(name):
     shape = {"rope": "rope/lift/smooth", "cloth": "cloth/lift/smooth", "blob": "blob/lift/smooth"}[name]
     row = config.ScenarioRow(scenario="a", source="toy", category=name, path=shape, self_collision=False, ground=True)
-    search = config.parse(config.Search, {"start": {"object_radius": 0.045, "stiffness": 1e4}}, "test")
-    simulation = config.Simulation()
+    search, simulation = config.Search(), config.Simulation()
     settings = config.parse(config.Config, config_with({"toy": {"frames": 8}}), "test")
     problem = SearchProblem(toy.make(row, settings.toy).observations, search, simulation, config.Losses(), config.ReleasedQuirks())
-    start = candidate(problem, dataclasses.asdict(search.start))
+    start = candidate(problem, problem.decode(problem.encode()))
     springs, substeps = size.expected_size(expected(row, settings), search, simulation)
     assert 1 / OFF < springs / len(start.topology.springs) < OFF
     assert 1 / OFF < substeps / start.simulation.substeps < OFF
@@ -99,7 +99,7 @@ def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(nam
 )
 def test_twice_the_nodes_are_twice_the_springs_and_a_stiffer_start_has_more_substeps(nodes, neighbours, radius, stiffness, spacing):
     start = {"object_neighbours": neighbours, "object_radius": radius, "stiffness": stiffness}
-    search = config.parse(config.Search, {"start": start}, "test")
+    search = small.released(start=start)
     stiffer = dataclasses.replace(search, start=dataclasses.replace(search.start, stiffness=min(4 * stiffness, 1e5)))
     simulation = config.Simulation(max_substeps=10**9)
     body = Expected(nodes=nodes, spacing=spacing, frames=50, controllers=0)

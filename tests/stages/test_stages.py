@@ -20,7 +20,7 @@ from neuspring.stages import fit, observe, rollout, score, search, transfer
 from tests.support import small
 
 SETTINGS = config.Config(
-    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    search=config.Search(rollouts=11),
     fit=config.Fit(epochs=2),
     toy=config.Toy(frames=8),
     device="cpu",

@@ -25,6 +25,7 @@ from neuspring.twin.search import PENALTY, SearchProblem, candidate, groups, jud
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import small
+from tests.support.searches import assert_same_trace, budget
 
 RELEASED = {
     "stiffness": 0.3,
@@ -50,7 +51,7 @@ FLOAT32_LENGTHS = 1e-6
 def plain(**changes: object) -> SearchProblem:
     """A search with the released settings, for its coding."""
     clusters = {"clusters": changes.pop("clusters")} if "clusters" in changes else {}
-    return small.search_problem(search=config.Search(**changes), **clusters)
+    return small.search_problem(search=small.released(**changes), **clusters)
 
 
 # Variables ------------------------------------------------------------------------------------------------------------
@@ -75,10 +76,10 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     assert np.unique(problem.labels).tolist() == list(range(clusters))
 
 
-@pytest.mark.parametrize("changes", [{}, {"stiffness_scale": "log", "ranges": config.SearchRanges(stiffness=(1e2, 1e5))}])
+@pytest.mark.parametrize("changes", [{}, {"scales": {"stiffness": "log"}, "ranges": {"stiffness": [1e2, 1e5]}}])
 def test_the_start_is_decoded_to_itself(changes):
     problem = plain(clusters=3, **changes)
-    start = config.plain(config.SearchStart())
+    start = config.plain(problem.search.start)
     for name, value in problem.decode(problem.encode()).items():
         # Counts are truncated, and 30 may come back as 29.999...
         slack = {"abs": 1} if name.partition(".")[0] in module.INTEGERS else {"rel": CODING}
@@ -86,9 +87,9 @@ def test_the_start_is_decoded_to_itself(changes):
 
 
 def test_the_logarithmic_scale_of_stiffness():
-    ranges = config.SearchRanges(stiffness=(1e1, 1e5))
+    ranges = {"stiffness": [1e1, 1e5]}
     middle = np.full(12, 0.5)
-    logarithmic = plain(stiffness_scale="log", ranges=ranges).decode(middle)
+    logarithmic = plain(scales={"stiffness": "log"}, ranges=ranges).decode(middle)
     linear = plain(ranges=ranges).decode(middle)
     assert (logarithmic["stiffness"], linear["stiffness"]) == (pytest.approx(1e3), pytest.approx(50005))
     # No other variable is touched.
@@ -97,12 +98,11 @@ def test_the_logarithmic_scale_of_stiffness():
 
 @given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
 def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalised, scale):
-    ranges = config.SearchRanges(stiffness=(1.0, 1e5))
     for clusters in (1, 3):
-        problem = plain(clusters=clusters, ranges=ranges, stiffness_scale=scale)
+        problem = plain(clusters=clusters, ranges={"stiffness": [1.0, 1e5]}, scales={"stiffness": scale})
         for name, value in problem.decode(np.array(normalised[: 2 * clusters + 10])).items():
             base = name.partition(".")[0]
-            low, high = getattr(ranges, base)
+            low, high = getattr(problem.search.ranges, base)
             assert low * (1 - CODING) <= value <= high * (1 + CODING)
             assert base not in module.INTEGERS or value == int(value)
 
@@ -147,7 +147,7 @@ def test_regions_and_candidates_are_made_on_the_rest_shape():
 
 def loosely(**changes: object) -> SearchProblem:
     """A search whose radii may be so small that only nodes at the controllers have springs."""
-    return small.search_problem(search=config.Search(ranges=config.SearchRanges(object_radius=(0.001, 0.05)), **changes))
+    return small.search_problem(search=small.released(ranges={"object_radius": [0.001, 0.05]}, **changes))
 
 
 def test_isolated_nodes_are_repaired_penalised_or_left():
@@ -176,8 +176,8 @@ def test_allow_is_the_released_topology():
 
 def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
     """Radii around the distance of the rope's rings: some candidates leave nodes alone."""
-    ranges, start = config.SearchRanges(object_radius=(0.001, 0.03)), config.SearchStart(object_radius=0.012)
-    settings = config.Search(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
+    ranges, start = {"object_radius": [0.001, 0.03]}, {"object_radius": 0.012}
+    settings = small.released(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
     trace = search(small.search_problem(search=settings), seed=0).trace
     refused = trace[trace["reason"].str.contains("nodes have no spring")]
     assert 0 < len(refused) < len(trace)
@@ -242,17 +242,6 @@ def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
     assert (whole.attempts, continued.attempts) == (1, 2)
     assert continued.earlier_seconds > 0
     assert_same_trace(continued.trace, whole.trace)
-
-
-def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
-    """The default search with another budget."""
-    problem = small.search_problem(clusters=clusters)
-    return replace(problem, search=replace(problem.search, rollouts=rollouts))
-
-
-def assert_same_trace(trace: pd.DataFrame, expected: pd.DataFrame) -> None:
-    """Equal bit for bit, but for the time that each candidate took."""
-    pd.testing.assert_frame_equal(trace.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)
 
 
 @pytest.mark.parametrize(("clusters", "population"), [(1, 11), (3, 12)])
@@ -529,8 +518,7 @@ def test_threads_of_a_search_have_none_of_torch(monkeypatch):
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     """Some diverge, some are unstable, some have isolated nodes, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
-    start = config.SearchStart(object_radius=0.0145, stiffness=3e4)
-    settings = config.Search(rollouts=22, isolated_nodes="penalise", start=start)
+    settings = small.released(rollouts=22, isolated_nodes="penalise", start={"object_radius": 0.0145, "stiffness": 3e4})
     chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
     check = stability.check
 
