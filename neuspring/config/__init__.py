@@ -17,7 +17,7 @@ from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
 from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Clusters, Fit, Losses, Search, SearchRanges, SearchStart, SpringField
+from neuspring.config.twin import Clusters, Fit, Losses, RestShape, Search, SearchRanges, SearchStart, SpringField
 
 __all__ = [
     "Clusters",
@@ -28,6 +28,7 @@ __all__ = [
     "Method",
     "Mocap",
     "ReleasedQuirks",
+    "RestShape",
     "ScenarioRow",
     "Search",
     "SearchRanges",
