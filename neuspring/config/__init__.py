@@ -18,7 +18,7 @@ from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.search import Clusters, Polish, Search, SearchRanges, SearchScales, SearchStart
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Fit, Losses, SpringField
+from neuspring.config.twin import Fit, Losses, RestShape, SpringField
 
 __all__ = [
     "Clusters",
@@ -30,6 +30,7 @@ __all__ = [
     "Mocap",
     "Polish",
     "ReleasedQuirks",
+    "RestShape",
     "ScenarioRow",
     "Search",
     "SearchRanges",

@@ -129,7 +129,7 @@ class Needs:
         # Thousands of jobs share a few rows.
         config = benchmark.config
         self._rollouts = cache(lambda name: benchmarks.search_of(config, benchmark.searches[name], name).rollouts)
-        self._epochs = cache(lambda name: benchmarks.fit_of(config, benchmark.fits[name], name).epochs)
+        self._epochs = cache(lambda name: benchmarks.fit_of(config, benchmark.fits[name], name).total_epochs)
 
     @cached_property
     def history(self) -> History:

@@ -105,9 +105,11 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
         "epochs": len(result.history),
+        "epochs_asked": problem.fit.total_epochs,
         "epochs_together": result.epochs_together,
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
+        **result.figures,
         "spring_updates": frames * counts["springs"] * counts["substeps"],
         **counts,
     }
