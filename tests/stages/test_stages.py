@@ -141,6 +141,19 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
     assert counts == {"loss": 2, "tail_loss": 2, "gradient_norm": 2, "learning_rate": 2}
 
 
+def test_a_fit_that_its_settings_held_says_so_in_the_notes():
+    facts = {"at_bound": 0.25, "texels_moved": 0.0125}
+    settings = {"fit": {"epochs": 2}}
+    held = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
+    notes = score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
+    assert notes == [
+        "fit: 25% of the springs lie at the bound of their stiffness (fit.output_bound)",
+        "fit: only 1.2% of the texels moved by a tenth of their first scale",
+    ]
+    free = StageRecord(stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05}, settings=settings)
+    assert score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
+
+
 def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     seen = finished[0] / "small" / "observations.npz"
     larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
