@@ -44,7 +44,7 @@ class SearchRanges(Section):
     """Distance at which nodes collide, in units of `lengths`."""
     drag: Range = (0.05, 50.0)
     """Velocity decay, 1/s."""
-    dashpot: Range = (0.1, 5000.0)
+    dashpot: Range = (0.1, 500.0)
     """Damping along springs, N s/m."""
 
     def __post_init__(self) -> None:

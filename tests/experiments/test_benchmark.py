@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from neuspring.config import Config, Method, SearchRow, parse
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.inputs import Inputs
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
 
@@ -253,7 +256,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
         benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
     benchmark(tmp_path, methods=["coarse"], **narrow)
-    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [0.0, 4.0e+4]}}}\n"
+    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [10.0, 4.0e+4]}}}\n"
     write(tmp_path / "soft.yaml", text)
     benchmark(tmp_path, search_table="soft.yaml", **narrow)
 
@@ -451,3 +454,39 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
     three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
     assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))
+
+
+def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
+    values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "released_search", "phystwin_released"], "seeds": [0]}
+    inputs = Inputs(Benchmark.of(values, ROOT))
+
+    def settings(stage: str, **job: str) -> dict[str, Any]:
+        found = json.loads(inputs.settings(stage, SimpleNamespace(scenario="toy_rope_lift_smooth", seed="0", **job)))
+        parse(Config, found, "what the command reads")
+        return found
+
+    for row, method, on in (("uniform", "baseline", False), ("released_quirks", "phystwin_released", True)):
+        for found in (settings("search", search=row), settings("fit", method=method)):
+            assert found["released_quirks"] == dict.fromkeys(config.plain(config.ReleasedQuirks()), on)
+    assert not any(settings("search", search="released_uniform")["released_quirks"].values())
+    fitted = settings("fit", method="phystwin_released")["fit"]
+    assert (fitted["horizon"], fitted["learning_rate"]) == (1, 1e-3)
+    variant = json.loads(inputs.variant(SimpleNamespace(method="phystwin_released")))
+    assert variant["released_quirks"] == sorted(config.plain(config.ReleasedQuirks()))
+    assert "released_quirks" not in json.loads(inputs.variant(SimpleNamespace(method="baseline")))
+
+
+def test_the_released_rows_have_the_released_search() -> None:
+    made = Benchmark.of({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
+    for name, row in made.searches.items():
+        search = tables.search_of(made.config, row, name)
+        assert set(config.plain(search.scales).values()) == {"linear"}
+        assert (search.lengths, search.polish_rounds, search.fixed) == ("meter", 0, ())
+        assert (search.ranges.stiffness, search.start.stiffness, search.start.object_radius) == ((0.0, 1e5), 3e4, 0.02)
+    assert tables.search_of(made.config, made.searches["released_quirks"], "x").isolated_nodes == "allow"
+
+
+def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "odd.yaml", SEARCHES.replace("uniform: {", "uniform: {released_quirks: {no_such: true}, ", 1))
+    with pytest.raises(InputError, match=r"search uniform, released_quirks:(?s:.*)no_such: unknown key"):
+        benchmark(tmp_path, search_table="odd.yaml")
