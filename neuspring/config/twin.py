@@ -53,9 +53,13 @@ class SearchRanges(Section):
     """Velocity decay, 1/s."""
     dashpot: Range = (0.0, 200.0)
     """Damping along springs, N s/m."""
+    drag_quadratic: Range | None = None
+    """Velocity decay per speed, 1/m; null: none, and no variable of the search."""
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
+            if getattr(self, spec.name) is None:
+                continue
             low, high = getattr(self, spec.name)
             if not 0 <= low < high:
                 raise ValueError(f"{spec.name}: 0 <= low < high is required, received [{low}, {high}]")
@@ -95,6 +99,8 @@ class SearchStart(Section):
     """Velocity decay, 1/s."""
     dashpot: float = 100.0
     """Damping along springs, N s/m."""
+    drag_quadratic: float = 0.0
+    """Velocity decay per speed, 1/m, where it is searched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,6 +137,8 @@ class Search(Section):
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self.start):
+            if getattr(self.ranges, spec.name) is None:
+                continue
             low, high = getattr(self.ranges, spec.name)
             value = getattr(self.start, spec.name)
             if not low <= value <= high:

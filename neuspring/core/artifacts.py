@@ -321,6 +321,8 @@ class Material(Artifact):
     contact_friction: float
     contact_distance: float
     """Distance below which approaching nodes collide, m."""
+    drag_quadratic: float = 0.0
+    """Velocity decay per speed, 1/m: the drag is dv/dt = -(drag + drag_quadratic |v|) v."""
 
     def check(self) -> None:
         for name in ("stiffness", "dashpot"):
@@ -331,11 +333,20 @@ class Material(Artifact):
             value = getattr(self, name)
             if not np.isfinite(value):
                 raise InputError(f"material.{name}", "must be finite", value)
-        if self.drag < 0 or self.contact_distance <= 0:
-            raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
+        if min(self.drag, self.drag_quadratic) < 0 or self.contact_distance <= 0:
+            rule = "drag >= 0, drag_quadratic >= 0 and contact_distance > 0 are required"
+            raise InputError("material", rule, (self.drag, self.drag_quadratic, self.contact_distance))
 
 
-SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
+SCALARS = (
+    "drag",
+    "ground_elasticity",
+    "ground_friction",
+    "contact_elasticity",
+    "contact_friction",
+    "contact_distance",
+    "drag_quadratic",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

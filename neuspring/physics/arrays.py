@@ -53,6 +53,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         substep: of_twin
         inverse_time: of_twin
         decay: of_twin
+        quadratic: of_twin
         ground_e: of_twin
         ground_mu: of_twin
         contact_e: of_twin
@@ -82,6 +83,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         force: slots
         springs: vectors
         decay: numbers
+        quadratic: numbers
         ground_e: numbers
         ground_mu: numbers
         contact_e: numbers

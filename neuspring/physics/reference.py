@@ -29,6 +29,7 @@ class Scene:
     contact: tuple[float, float]
     contact_distance: float
     simulation: Simulation
+    drag_quadratic: float = 0.0
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:
@@ -45,6 +46,7 @@ class Scene:
             contact=(m.contact_elasticity, m.contact_friction),
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
+            drag_quadratic=m.drag_quadratic,
         )
 
 
@@ -93,12 +95,20 @@ def substep(
     dt = sim.substep
     force = spread @ spring_forces(scene, np.concatenate([x, hands]), np.concatenate([v, hands_velocity]))
     gravity = np.array([0.0, 0.0, -sim.gravity * sim.up_sign])
-    v = (v + dt * (force + gravity)) * np.exp(-dt * scene.drag)
+    v = dragged(v + dt * (force + gravity), dt, scene.drag, scene.drag_quadratic)
     if pairs is not None:
         v = collide(x, v, pairs, scene.contact_distance, *scene.contact)
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
+
+
+def dragged(v: np.ndarray, dt: float, linear: float, quadratic: float) -> np.ndarray:
+    """The exact solution of dv/dt = -(linear + quadratic |v|) v after dt."""
+    decay = np.exp(-dt * linear)
+    mean = -np.expm1(-dt * linear) / linear if linear else dt
+    slower: np.ndarray = v * decay / (1 + quadratic * mean * np.linalg.norm(v, axis=1, keepdims=True))
+    return slower
 
 
 def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:

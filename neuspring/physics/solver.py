@@ -32,7 +32,7 @@ class Parameters(NamedTuple):
     springs: torch.Tensor
     """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent."""
     decay: torch.Tensor
-    """[1]: exp(-substep * drag)."""
+    """[2]: exp(-substep * drag), and how much less a substep leaves of fast velocities, s/m (velocity.py)."""
     ground: torch.Tensor
     """[2]: elasticity in [0, 1], friction in [0, 2]."""
     contact: torch.Tensor
@@ -94,7 +94,7 @@ class FrameSolver:
         """Copy packed parameters into the solver's buffers."""
         b, values = self.buffers, Parameters(*map(self._stacked, parameters))
         springs.fill(b, values.springs)
-        b.set_numbers("decay", values.decay[:, 0])
+        velocity.fill(b, values.decay)
         for kind in ("ground", "contact"):
             contact.fill(b, kind, getattr(values, kind))
         b.set_numbers("distance", values.distance[:, 0])

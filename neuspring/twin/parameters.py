@@ -7,7 +7,8 @@ rest lengths stay free per spring unless `rest_lengths_by` says otherwise). With
     dashpot      g = g0 exp(b(o_g))                                     if damping is trained
     rest length  l = l0 exp(r tanh(o_l))                                if rest_length_bound r > 0
 
-Beside them: four contact scalars, drag = drag0 exp(.), and the homogeneous factors of a warm start.
+Beside them: four contact scalars, drag = drag0 exp(.), quadratic drag likewise where there is some, and the homogeneous factors of
+a warm start.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class TwinParameters(nn.Module):
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict()
         names = ["stiffness"] if settings.homogeneous_epochs else []
-        for name in names + (["drag", "dashpot"] if settings.damping != "fixed" else []):
+        damped = ["drag", "dashpot"] + (["drag_quadratic"] if twin.material.drag_quadratic else [])
+        for name in names + (damped if settings.damping != "fixed" else []):
             self.factors[name] = nn.Parameter(torch.zeros(()))
         self.homogeneous = False
         """While true, offsets are not trained."""
@@ -146,6 +148,8 @@ class TwinParameters(nn.Module):
         if "drag" in self.factors:
             values["drag"] = self.start["drag"] * self.factors["drag"].exp()
             values["dashpot"] = self.start["dashpot"] * self.factors["dashpot"].exp()
+        if "drag_quadratic" in self.factors:
+            values["drag_quadratic"] = self.start["drag_quadratic"] * self.factors["drag_quadratic"].exp()
         if "dashpot" in raw:
             values["dashpot"] = values["dashpot"] * bounded(raw["dashpot"], s.output_bound).exp()
         if "rest_lengths" in raw:

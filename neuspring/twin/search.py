@@ -76,6 +76,8 @@ class SearchProblem:
         """Names of the variables: those of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one region)."""
         names: list[str] = []
         for f in fields(config.SearchRanges):
+            if getattr(self.search.ranges, f.name) is None:
+                continue
             regional = f.name in REGIONAL and self.clusters > 1
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
         return tuple(names)
@@ -166,9 +168,9 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
-    """A material that is the same everywhere; `values` has a number for every field of `Material`."""
-    numbers: dict[str, Any] = {f.name: values[f.name] for f in fields(Material)}
-    arrays = {f.name: np.full(springs, values[f.name]) for f in fields(Material) if "shape" in f.metadata}
+    """A material that is the same everywhere; `values` has a number for every field of `Material` without default."""
+    numbers: dict[str, Any] = {f.name: values[f.name] for f in fields(Material) if f.name in values}
+    arrays = {name: np.full(springs, values[name]) for name in ("stiffness", "dashpot")}
     return Material(**(numbers | arrays))
 
 

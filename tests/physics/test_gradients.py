@@ -18,7 +18,8 @@ from tests.support.scenes import VARIANTS, packed, random_scene, scene, solver_f
 FRAMES = 1e-5
 """Relative to the largest entry of the gradient compared, over one to three frames of 10 substeps."""
 LEARNED = (
-    "stiffness", "rest_lengths", "dashpot", "drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction"
+    "stiffness", "rest_lengths", "dashpot", "drag", "ground_elasticity", "ground_friction", "contact_elasticity",
+    "contact_friction", "drag_quadratic",
 )  # fmt: skip
 
 

@@ -54,6 +54,9 @@ def member(number: int, variant: str) -> Member:
         contact_distance=rng.uniform(0.02, 0.045),
         simulation=replace(body.simulation, substeps=SUBSTEPS[number % len(SUBSTEPS)], frame_time=rng.uniform(0.018, 0.022)),
     )
+    if body.drag_quadratic:
+        # Some twins have none, and must not notice those that have.
+        body = replace(body, drag_quadratic=body.drag_quadratic * max(rng.uniform(-0.5, 2.0), 0.0))
     shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
     return Member(body, x + shift[0], v + shift[1], hands + shift[2])
 

@@ -85,6 +85,19 @@ def test_the_start_is_decoded_to_itself(changes):
         assert value == pytest.approx(start[name.partition(".")[0]], **slack)
 
 
+def test_quadratic_drag_is_a_variable_where_it_has_a_range():
+    """It comes last, so that searches without it keep their variables."""
+    values = small.start_values()
+    free = small.search_problem()
+    searched = small.search_problem(search=replace(free.search, ranges=config.SearchRanges(drag_quadratic=(0.0, 4.0))))
+    assert searched.variables == (*free.variables, "drag_quadratic")
+    assert searched.decode(np.full(13, 0.25))["drag_quadratic"] == 1.0
+    assert candidate(free, values).material.drag_quadratic == 0.0
+    assert candidate(searched, values | {"drag_quadratic": 1.5}).material.drag_quadratic == 1.5
+    with pytest.raises(ValueError, match=r"start\.drag_quadratic = 0\.0 lies outside"):
+        config.Search(ranges=config.SearchRanges(drag_quadratic=(0.1, 4.0)))
+
+
 def test_the_logarithmic_scale_of_stiffness():
     ranges = config.SearchRanges(stiffness=(1e1, 1e5))
     middle = np.full(12, 0.5)
