@@ -23,6 +23,7 @@ from neuspring.core.npz import DamagedFile, read_npz, write_npz
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed"]
+ControllerPath = Literal["linear", "cubic"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 NO_REST_SHAPE = np.zeros((0, 3))
@@ -367,6 +368,8 @@ class Simulation:
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
     """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
+    controller_path: ControllerPath = "linear"
+    """How controllers move within a frame: straight, as in the released simulator, or along a cubic through neighboring frames."""
 
     def __post_init__(self) -> None:
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
@@ -374,6 +377,8 @@ class Simulation:
             raise InputError("simulation", rule, self)
         if self.up not in ("+z", "-z"):
             raise InputError("simulation.up", "must be '+z' or '-z'", repr(self.up))
+        if self.controller_path not in ("linear", "cubic"):
+            raise InputError("simulation.controller_path", "must be 'linear' or 'cubic'", repr(self.controller_path))
 
     @property
     def substep(self) -> float:

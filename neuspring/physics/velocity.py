@@ -1,4 +1,4 @@
-"""Controller motion, and the velocity update by force, gravity and drag (the paper's equation 4) with its adjoint.
+"""Controller motion (path.py), and the velocity update by force, gravity and drag (the paper's equation 4) with its adjoint.
 
 w = v + dt (f + g),   v' = w delta / (1 + q |w|),   unit mass. Positions follow in position.py.
 
@@ -82,7 +82,16 @@ def functions(real: Any, width: int) -> Functions:
         fraction = Number()
         for q in range(width):
             fraction[q] = wp.min(real(step + 1) / model.counts[g][q], one)
-        state.x[slot, model.nodes + c, g] = state.begin[c, g] + scaled(travel, fraction)
+        place = state.begin[c, g] + scaled(travel, fraction)
+        if model.cubic != 0:
+            first = state.bend_begin[c, g]
+            last = state.bend_end[c, g]
+            rest = ones - fraction
+            both = wp.cw_mul(fraction, rest)
+            place = place + scaled(first, wp.cw_mul(both, rest)) - scaled(last, wp.cw_mul(both, fraction))
+            travel = travel + scaled(first, wp.cw_mul(rest, rest - fraction - fraction))
+            travel = travel - scaled(last, wp.cw_mul(fraction, rest + rest - fraction))
+        state.x[slot, model.nodes + c, g] = place
         state.v[slot, model.nodes + c, g] = scaled(travel, model.inverse_time[g])
 
     @wp.func

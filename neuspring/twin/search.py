@@ -29,6 +29,7 @@ from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.physics.path import waypoints
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.topology import isolated, piecewise_topology, regions
@@ -123,6 +124,7 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         collision_capacity=settings.collision_capacity,
         controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
+        controller_path=settings.controller_path,
     )
 
 
@@ -178,6 +180,7 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
     """What becomes of candidates that are rolled out together over the training frames."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
     start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
+    hands = waypoints(hands, twins[0].simulation)
     return outcomes(twins, hands, start, loss, problem.device)
 
 

@@ -25,6 +25,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "moving hands": {"controller_velocity": True},
     "all": {"up": "-z", "self_collision": True, "controller_velocity": True, "drag_quadratic": 1.0},
     "thick air": {"drag_quadratic": 5.0},
+    "cubic path": {"controller_path": "cubic"},
+    "cubic path with velocity": {"controller_path": "cubic", "controller_velocity": True},
     "odd substeps": {"substeps": 21},
     "one substep": {"substeps": 1, "frame_time": 1e-3},
 }

@@ -14,6 +14,7 @@ import torch
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack
+from neuspring.physics.path import waypoints
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver, Parameters
 from tests.support.devices import CUDA
@@ -31,6 +32,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "self-collision": {"self_collision": True},
     "thick air": {"drag_quadratic": 2.0},
     "all": {"self_collision": True, "up": "-z", "controller_velocity": True, "drag_quadratic": 0.5},
+    "cubic path": {"controller_path": "cubic", "controller_velocity": True},
 }
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
@@ -139,7 +141,7 @@ def warp(
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
-    hands = tensor(controllers)
+    hands = waypoints(tensor(controllers), scene.simulation)
     states = [(tensor(x), tensor(v))]
     for begin, end in pairwise(hands):
         states.append(solver.forward(*states[-1], begin, end))
