@@ -99,7 +99,8 @@ class Buffers:
     """Torch tensors by name, each with a Warp view of the same storage.
 
     State: x, v [slots, N + C], nodes first, then controllers; velocities [history, N] `after` the forces, and those that nodes are
-    `moving` with; begin and end [C] of the controllers' path, and how its tangents there differ from a line's. Every term adds its own arrays.
+    `moving` with; begin and end [C] of the controllers' path, and how its tangents there differ from a line's. Every term
+    adds its own arrays.
 
     A differentiable solver keeps all substeps of the last frame, slot k before substep k. Otherwise one slot serves where one
     thread goes through the nodes, and two take turns where each node has a thread.

@@ -5,8 +5,8 @@ meters per frame, the cubic is Hermite's,
 
     p(u) = p0 + u d + u (1 - u)^2 (m0 - d) - u^2 (1 - u) (m1 - d),
 
-the straight line where m0 = m1 = d. Tangents are those of the parabola through three neighboring frames (Catmull and Rom 1974): half
-the way from the frame before to the frame after, and one-sided in the first and the last frame.
+the straight line where m0 = m1 = d. Tangents are those of the parabola through three neighboring frames (Catmull and Rom 1974):
+half the way from the frame before to the frame after, and one-sided in the first and the last frame.
 """
 
 from __future__ import annotations

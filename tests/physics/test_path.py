@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ def way(hands: np.ndarray, device: str = "cpu", threads: bool = False, **options
     solver = solver_for(scene(1, **options), hands.shape[1], device, threads=threads)
     points = waypoints(torch.tensor(hands, device=device), solver.simulation)
     states, node = [], torch.zeros(1, 3, dtype=torch.float64, device=device)
-    for begin, end in zip(points[:-1], points[1:], strict=True):
+    for begin, end in pairwise(points):
         solver.forward(node, node, begin, end)
         every = [[solver.buffers.get_vectors(name, k)[0, 1:] for k in range(SUBSTEPS)] for name in ("x", "v")]
         states.append([torch.stack(each).cpu().numpy() for each in every])
