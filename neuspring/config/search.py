@@ -13,6 +13,8 @@ from neuspring.config.types import Count, NonNegative, Positive, Range, Section
 Scale = Literal["linear", "log"]
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
+EXTRA = ("drag_quadratic",)
+"""Variables beyond the released ones."""
 TOPOLOGY = ("object_radius", "object_neighbours", "controller_radius", "controller_neighbours")
 """Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
@@ -46,6 +48,8 @@ class SearchRanges(Section):
     """Velocity decay, 1/s."""
     dashpot: Range = (0.1, 500.0)
     """Damping along springs, N s/m."""
+    drag_quadratic: Range = (0.001, 5.0)
+    """Velocity decay per speed, 1/m; searched where `extra` names it."""
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
@@ -88,6 +92,8 @@ class SearchScales(Section):
     """Velocity decay."""
     dashpot: Scale = "log"
     """Damping along springs."""
+    drag_quadratic: Scale = "log"
+    """Velocity decay per speed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +124,8 @@ class SearchStart(Section):
     """Velocity decay, 1/s."""
     dashpot: float = 20.0
     """Damping along springs, N s/m."""
+    drag_quadratic: float = 0.2
+    """Velocity decay per speed, 1/m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +180,8 @@ class Search(Section):
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `ranges` and `start`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
+    extra: tuple[Literal["drag_quadratic"], ...] = ()
+    """Variables beyond the released ones that are searched too; without them what they describe is absent."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     clusters: Clusters = field(default_factory=Clusters)
@@ -181,6 +191,8 @@ class Search(Section):
     polish: Polish = field(default_factory=Polish)
 
     def __post_init__(self) -> None:
+        if len(set(self.extra)) != len(self.extra):
+            raise ValueError(f"extra: different ones are required, received {list(self.extra)}")
         names = [spec.name for spec in dataclasses.fields(self.start)]
         unknown = [name for name in self.fixed if name not in names]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(names) - len(self.fixed) < 2:
@@ -200,9 +212,14 @@ class Search(Section):
             raise ValueError(f"{rule}, received {self.tied_rollouts}")
 
     @property
+    def absent(self) -> tuple[str, ...]:
+        """Variables beyond the released ones that are not asked for."""
+        return tuple(name for name in EXTRA if name not in self.extra)
+
+    @property
     def polished(self) -> tuple[str, ...]:
         """Variables of the polish."""
-        return tuple(name for name in self.polish.variables if name not in self.fixed)
+        return tuple(name for name in self.polish.variables if name not in self.fixed and name not in self.absent)
 
     @property
     def polish_rounds(self) -> int:

@@ -15,6 +15,7 @@ import torch
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.physics.autograd import solver_for
+from neuspring.physics.path import waypoints
 from neuspring.twin.motion import recent_velocity, spread
 from neuspring.twin.rollout import Diverged, frames
 
@@ -55,7 +56,7 @@ class _Continuation:
     def __init__(self, twin: Twin, observations: Observations, device: str) -> None:
         self.twin, self.observations, self.device = twin, observations, device
         self._solver = solver_for(twin, device, differentiable=False)
-        self._hands = torch.tensor(observations.controller_points, device=device)
+        self._hands = waypoints(torch.tensor(observations.controller_points, device=device), twin.simulation)
         nodes, points = len(observations.nodes), observations.object_points.shape[1]
         self._nodes, self._points = observations.canonical[:nodes], observations.canonical[:points]
         self._controllers = observations.canonical[nodes:]

@@ -32,6 +32,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame, solver_for
+from neuspring.physics.path import waypoints
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.company import Seat
 from neuspring.twin.losses import FrameLoss
@@ -138,7 +139,8 @@ class TwinFit:
             observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators
         )
         end = observations.scenario.train_end
-        self.hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        self.hands = waypoints(hands, problem.twin.simulation)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end

@@ -30,6 +30,7 @@ from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.physics.path import waypoints
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
@@ -88,6 +89,8 @@ class SearchProblem:
         """All that makes a candidate: the fields of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
         for f in fields(config.SearchRanges):
+            if f.name in self.search.absent:
+                continue
             regional = f.name in REGIONAL and self.clusters > 1
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
         return tuple(names)
@@ -149,6 +152,7 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         collision_capacity=settings.collision_capacity,
         controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
+        controller_path=settings.controller_path,
     )
 
 
@@ -207,8 +211,9 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 
 
 def _motion(problem: SearchProblem) -> tuple[torch.Tensor, torch.Tensor]:
-    """Hands [T, C, 3], m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
+    """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
+    hands = waypoints(hands, simulation_of(problem, 1))
     return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
 
 

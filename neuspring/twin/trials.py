@@ -37,7 +37,10 @@ class Outcome:
 
 
 def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
-    """Roll twins of the same nodes out over hands [T, C, 3] from velocity [N, 3], m/s, and judge the frames that the loss holds."""
+    """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
+
+    hands are the controllers' positions [T, C, 3], or what `path.waypoints` makes of them.
+    """
     solver = solver_of(twins, device, differentiable=False)
     count = len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)

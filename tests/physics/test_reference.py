@@ -23,7 +23,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "upside down": {"up": "-z"},
     "self-collision": {"self_collision": True},
     "moving hands": {"controller_velocity": True},
-    "all": {"up": "-z", "self_collision": True, "controller_velocity": True},
+    "all": {"up": "-z", "self_collision": True, "controller_velocity": True, "drag_quadratic": 1.0},
+    "thick air": {"drag_quadratic": 5.0},
+    "cubic path": {"controller_path": "cubic"},
+    "cubic path with velocity": {"controller_path": "cubic", "controller_velocity": True},
     "odd substeps": {"substeps": 21},
     "one substep": {"substeps": 1, "frame_time": 1e-3},
 }
@@ -72,6 +75,7 @@ def test_node_order_does_not_matter(variant: str) -> None:
         dashpot=body.dashpot,
         drag=body.drag,
         contact_distance=body.contact_distance,
+        drag_quadratic=body.drag_quadratic,
         frame_time=body.simulation.frame_time,
     )
     shuffled = replace(shuffled, simulation=body.simulation)
