@@ -17,7 +17,6 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import cma
 import numpy as np
 import pandas as pd
 import torch
@@ -26,14 +25,15 @@ from neuspring import config
 from neuspring.config.search import LENGTHS
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.physics.path import waypoints
+from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
+from neuspring.twin.proposals import Proposals
 from neuspring.twin.residuals import Residuals
 from neuspring.twin.rollout import FAR
 from neuspring.twin.spacing import controller_reach, node_spacing
@@ -275,10 +275,10 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
     clock = time.perf_counter()
-    rows, attempts, earlier = _recorded(record, key)
+    rows, attempts, earlier = trace_file.recorded(record, key)
     trace = [row for row in rows if row["stage"] == CMAES]
     saved = len(trace)
-    proposals = _Proposals(problem, seed)
+    proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.cma_rollouts
     progress = Progress(
@@ -287,7 +287,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
     def save(kept: list[dict[str, Any]]) -> None:
         if record is not None:
-            _save(record, key, kept, attempts, earlier + time.perf_counter() - clock)
+            trace_file.save(record, key, kept, attempts, earlier + time.perf_counter() - clock)
 
     start = 0
     with _threads(problem.threads) as each:
@@ -295,7 +295,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
         while start < budget:
             population = proposals.ask()[: budget - start]
             stop = start + len(population)
-            if not _replays(trace[start:stop], population, problem.variables):
+            if not trace_file.replays(trace[start:stop], population, problem.variables):
                 print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
                 trace, saved = trace[:start], start
                 if not start:
@@ -348,7 +348,7 @@ def _polished(
         population, first = polish.ask(), len(trace) + len(rows)
         made = list(recorded[len(rows) : len(rows) + len(population)])
         same = len(made) == len(population) and all(row["rollout"] == first + k for k, row in enumerate(made))
-        if not same or not _replays(made, population, problem.variables):
+        if not same or not trace_file.replays(made, population, problem.variables):
             made, recorded = [], []
             if polish.stage == SLOPES:
                 made = _slopes(problem, population, polish.steps(), loss, first, generation, each)
@@ -413,57 +413,6 @@ def _threads(count: int) -> Iterator[Map]:
         torch.set_num_threads(before)
 
 
-class _Proposals:
-    """The candidates of CMA-ES, in all 2K + 10 normalized variables.
-
-    In the first `tied_rollouts` it searches the 12 variables of the uniform topology; then it starts again in all variables, from
-    the best candidate so far. K regions have too many variables for a few hundred rollouts: free from the start, the piecewise
-    search of cables ended above the uniform one on training frames, although its space contains the other's.
-    """
-
-    def __init__(self, problem: SearchProblem, seed: int) -> None:
-        self._problem, self._seed = problem, seed
-        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
-        self._columns = np.arange(len(problem.variables))
-        """Which of the searched variables each variable takes its value from."""
-        searched = problem
-        if self._tied:
-            searched = replace(problem, clusters=1)
-            self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
-        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
-        self._population: list[np.ndarray] = []
-        self._best = (np.inf, problem.encode())
-        self._evaluated = 0
-        self.generation = -1
-
-    def ask(self) -> list[np.ndarray]:
-        """The next generation; the last one with tied regions may be cut short."""
-        if self._tied and self._evaluated == self._tied:
-            self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
-            self._columns = np.arange(len(self._problem.variables))
-        self._population = self._strategy.ask()
-        if self._evaluated < self._tied:
-            self._population = self._population[: self._tied - self._evaluated]
-        self.generation += 1
-        return [np.asarray(searched)[self._columns] for searched in self._population]
-
-    def tell(self, costs: list[float]) -> None:
-        """Take the costs of the first candidates of the last generation; CMA-ES learns from whole generations only."""
-        least = int(np.argmin(costs))
-        if costs[least] < self._best[0]:
-            self._best = (costs[least], np.asarray(self._population[least])[self._columns])
-        self._evaluated += len(costs)
-        if len(costs) == self._strategy.popsize:
-            self._strategy.tell(self._population, costs)
-
-
-def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
-    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
-    no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
-    return cma.CMAEvolutionStrategy(start, sigma, options)
-
-
 def _evaluate(
     problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, each: Map
 ) -> list[dict[str, Any]]:
@@ -509,35 +458,3 @@ def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
     return row, twin
-
-
-def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
-    table = pd.DataFrame(trace)
-    table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
-    write_atomically(path, lambda p: table.to_parquet(p))
-
-
-def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
-    """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
-    fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
-    if path is None or not path.is_file():
-        return fresh
-    try:
-        table = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        print(f"{path}: unreadable ({error}); the search starts afresh")
-        return fresh
-    if table.attrs.get("key") != key:
-        print(f"{path}: made with other inputs or settings; the search starts afresh")
-        return fresh
-    print(f"continuing the search after {len(table)} rollouts")
-    records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
-    return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
-
-
-def _replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
-    """Whether recorded candidates are those that CMA-ES proposes now."""
-    return all(
-        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), normalized)
-        for row, normalized in zip(rows, population, strict=False)
-    )

@@ -17,6 +17,7 @@ from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
 from neuspring.stages import fit, observe, rollout, score, search, transfer
+from neuspring.twin.spacing import node_spacing
 from tests.support import small
 
 SETTINGS = config.Config(
@@ -64,6 +65,10 @@ def test_every_step_leaves_what_its_record_names(finished):
     twin = Twin.load(record.file("twin", run.with_name("fit.json")))
     observations = Observations.load(folder / "small" / "observations.npz")
     assert len(twin.topology.nodes) == len(observations.nodes)
+    found = StageRecord.load(folder / "small" / "search-uniform" / "0" / "search.json").facts
+    assert found["spacing"] == node_spacing(observations.nodes)
+    assert 0 < found["controller_reach"] < found["controller_radius"]
+    assert found["cost_before_polish"] == found["cost"], "too few rollouts for a polish"
     assert Twin.load(folder / "small" / "truth.npz").topology.nodes.shape == twin.topology.nodes.shape
     assert not list(folder.rglob("*partial*"))
     assert not list(folder.rglob("*.part"))

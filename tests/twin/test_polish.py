@@ -11,6 +11,7 @@ from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
 from neuspring.twin import search as module
+from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import CMAES, POLISH, REACH, SLOPES, Polish, damped_step, slopes
 from neuspring.twin.residuals import Residuals
@@ -223,7 +224,7 @@ def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
     """Killed after some of its generations: slopes, or steps."""
     record, problem = tmp_path / "trace.parquet", polished(35, rounds=3)
     whole, count = search(problem, seed=2), 0
-    save = module._save
+    save = trace_file.save
 
     def dying(*arguments):
         nonlocal count
@@ -233,7 +234,7 @@ def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_save", dying)
+        patch.setattr(trace_file, "save", dying)
         with pytest.raises(KeyboardInterrupt):
             search(problem, seed=2, record=record, key="k")
     kept = len(pd.read_parquet(record))
