@@ -15,7 +15,7 @@ from neuspring.config.images import Images
 from neuspring.config.perception import Perception
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
-from neuspring.config.twin import Fit, Losses, Search
+from neuspring.config.twin import Fit, LastFrame, Losses, Search
 from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
@@ -108,6 +108,7 @@ class Config(Section):
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
+    last_frame: LastFrame = field(default_factory=LastFrame)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)

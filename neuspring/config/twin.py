@@ -223,3 +223,22 @@ class Fit(Section):
             raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
         if not self.field.triplane and self.field.fourier not in ("coordinates", "both"):
             raise ValueError(f"field.fourier: coordinates is required without the tri-plane, received {self.field.fourier}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastFrame(Section):
+    """Prediction from the last training frame (methods with `carry_over: state`): the state there, from the frames before it."""
+
+    window: Count = 8
+    """Training frames over which the state is estimated, besides their first."""
+    modes: Annotated[int, Field(ge=1, le=64)] = 16
+    """Softest modes of the body along which its position and its velocity at the window's first frame may be corrected."""
+    iterations: Count = 4
+    """Gauss-Newton steps."""
+    weights: tuple[Positive, ...] = (1e-3, 1e-2, 1e-1, 1.0)
+    """Weights of the prior that keeps the correction small, over the mean squared distance from the observed points; training
+    frames choose one."""
+
+    def __post_init__(self) -> None:
+        if not self.weights:
+            raise ValueError("weights: at least one is required")

@@ -87,7 +87,7 @@ def test_hidden_points_do_not_speak():
 
 def test_a_continuation_that_diverges_is_not_used(monkeypatch):
     trajectory, twin, seen, velocity = kicked()
-    monkeypatch.setattr(carry._Continuation, "corrected", lambda *_: None)
+    monkeypatch.setattr(carry.Residuals, "corrected", lambda *_: [None])
     corrected, facts = carry_over(trajectory, twin, seen, velocity)
     assert corrected is trajectory
     assert facts == {"gain": -1.0, "carried": 0.0}
