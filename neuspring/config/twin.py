@@ -233,9 +233,9 @@ class LastFrame(Section):
     """Training frames over which the state is estimated, besides their first."""
     modes: Annotated[int, Field(ge=1, le=64)] = 16
     """Softest modes of the body along which its position and its velocity at the window's first frame may be corrected."""
-    iterations: Count = 4
-    """Gauss-Newton steps."""
-    weights: tuple[Positive, ...] = (1e-3, 1e-2, 1e-1, 1.0)
+    iterations: Count = 2
+    """Levenberg-Marquardt steps with each weight; from the strongest to the weakest, each goes on where the one before it ended."""
+    weights: tuple[Positive, ...] = (1e-3, 1e-2, 1e-1)
     """Weights of the prior that keeps the correction small, over the mean squared distance from the observed points; training
     frames choose one."""
 

@@ -6,8 +6,8 @@ The unknowns are a smooth displacement and a smooth velocity of the body at the 
 
 with the body's softest modes phi_m at x(s - w), of unit root mean square: a correction along them strains no spring much, and the
 simulation over the window relaxes the rest. They minimize the mean squared distance between the nodes and the visible points in
-frames s - w to s, plus mu (|a|^2 + |b|^2). The minimum is sought by Gauss-Newton; its Jacobian is made of 2 M + 1 simulations of
-the window, which run in lanes, from differences of 1 mm. Controllers are where they were observed; nothing moves them.
+frames s - w to s, plus mu (|a|^2 + |b|^2). The minimum is sought by Levenberg-Marquardt; a Jacobian is made of 2 M + 1 simulations
+of the window, which run in lanes, from differences of 1 mm. Controllers are where they were observed; nothing moves them.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ State = tuple[np.ndarray, np.ndarray]
 """Positions, m, and velocities, m/s, of all nodes, [N, 3] each."""
 STEP = 1e-3
 """Differences of the unknowns that the Jacobian is made of, m."""
-SHORTER = 0.25
-"""What is left of a Gauss-Newton step that did not lower the objective."""
+DAMPINGS = 10.0 ** np.arange(-2, 6)
+"""Levenberg-Marquardt dampings that are tried in one launch, over the one that was best before."""
+FIRST_DAMPING, DAMPING_RANGE = 1e-3, (1e-6, 1e3)
+"""Over the diagonal of the Gauss-Newton matrix."""
 TURNING = 1e-3
 """A spring's resistance to being turned, over that to being stretched, in the modes. Without it nothing would keep a fabric's nodes
 together across its plane."""
@@ -96,7 +98,7 @@ class StateEstimator:
     def __init__(self, twin: Twin, observations: Observations, settings: LastFrame, device: str = "cpu") -> None:
         self.twin, self.observations, self.settings = twin, observations, settings
         unknowns = 2 * min(settings.modes, 3 * len(twin.topology.nodes) - 1)
-        self._lanes = WIDTHS[-1] if device == "cpu" else max(unknowns + 1, len(settings.weights))
+        self._lanes = WIDTHS[-1] if device == "cpu" else max(unknowns + 1, len(DAMPINGS))
         self._solver = solver_of([twin] * self._lanes, device, differentiable=False)
         self._hands = torch.tensor(observations.controller_points, dtype=torch.float32, device=device)
 
@@ -134,32 +136,32 @@ class StateEstimator:
             found: np.ndarray = (windows.positions[:, :, : targets.shape[1]] - targets)[:, seen].reshape(len(windows.positions), -1)
             return found
 
-        weights, size = np.array(self.variants), 2 * len(modes)
-        start = run(np.concatenate([np.zeros((1, size)), STEP * np.eye(size)]))
-        base, *moved = residuals(start)
-        jacobian = (np.array(moved) - base).T / STEP
-        best = [(start.positions[0, -1], start.velocities[0])] * len(weights)
-        if not seen.any() or not np.isfinite(jacobian).all():
-            return best
-        scale = 1 / seen.sum()
-        curvature = scale * jacobian.T @ jacobian
-        unknowns, errors = np.zeros((len(weights), size)), np.tile(base, (len(weights), 1))
-        objective, length = np.full(len(weights), scale * (base @ base)), np.ones(len(weights))
-        for _ in range(self.settings.iterations):
-            slope = scale * errors @ jacobian + weights[:, None] * unknowns
-            step = np.array([np.linalg.solve(curvature + w * np.eye(size), -g) for w, g in zip(weights, slope, strict=True)])
-            trial = unknowns + length[:, None] * step
-            windows = run(trial)
-            found = residuals(windows)
-            value = scale * (found**2).sum(axis=1) + weights * (trial**2).sum(axis=1)
-            for k in range(len(weights)):
-                # What diverged is not finite and compares false.
-                if value[k] < objective[k]:
-                    unknowns[k], errors[k], objective[k] = trial[k], found[k], value[k]
-                    best[k] = (windows.positions[k, -1], windows.velocities[k])
-                else:
-                    length[k] *= SHORTER
-        return best
+        size = 2 * len(modes)
+        unknowns, scale = np.zeros(size), 1 / max(int(seen.sum()), 1)
+        state, damping = (states[frame][0].astype(np.float64), states[frame][1].astype(np.float64)), FIRST_DAMPING
+        found: dict[float, State] = {}
+        # From the strongest prior to the weakest: each estimate begins where the one before it ended.
+        for weight in sorted(self.variants, reverse=True):
+            for _ in range(self.settings.iterations if seen.any() else 0):
+                base, *moved = residuals(run(np.concatenate([unknowns[None], unknowns + STEP * np.eye(size)])))
+                jacobian = (np.array(moved) - base).T / STEP
+                if not np.isfinite(jacobian).all():
+                    break
+                slope = scale * base @ jacobian + weight * unknowns
+                curvature = scale * jacobian.T @ jacobian + weight * np.eye(size)
+                tried = damping * DAMPINGS
+                steps = [np.linalg.solve(curvature + factor * np.diag(np.diag(curvature)), -slope) for factor in tried]
+                trials = unknowns + np.array(steps)
+                windows = run(trials)
+                values = scale * np.square(residuals(windows)).sum(axis=1) + weight * np.square(trials).sum(axis=1)
+                # What diverged is not a number, and is the worst.
+                best = int(np.argmin(np.nan_to_num(values, nan=np.inf)))
+                if not values[best] < scale * base @ base + weight * unknowns @ unknowns:
+                    break
+                unknowns, damping = trials[best], float(np.clip(tried[best], *DAMPING_RANGE))
+                state = (windows.positions[best, -1], windows.velocities[best])
+            found[weight] = state
+        return [found[weight] for weight in self.variants]
 
     def _observed(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         """Points [w + 1, No, 3], m, of the frames from `first` to `last`, and where they are visible and moved validly."""
