@@ -51,7 +51,8 @@ def test_noise_is_not_carried_into_a_right_prediction():
 
 
 @pytest.mark.parametrize("how", ["residuals", "state"])
-def test_the_future_is_not_read(how):
+def test_the_future_is_not_read(how, monkeypatch):
+    monkeypatch.setattr(carry, "ORIGINS", 3)
     trajectory, twin, seen, velocity = kicked()
     end = seen.scenario.train_end
     points, visible, valid = (np.array(a) for a in (seen.object_points, seen.object_visibility, seen.object_motion_valid))

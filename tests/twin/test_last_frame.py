@@ -7,6 +7,7 @@ import pytest
 
 from neuspring.config import LastFrame
 from neuspring.core.artifacts import Observations, Twin
+from neuspring.twin import carry
 from neuspring.twin.carry import carry_over, training_states
 from neuspring.twin.last_frame import STEP, State, StateEstimator, soft_modes
 from neuspring.twin.rollout import roll_out
@@ -14,6 +15,7 @@ from tests.support import small
 
 FRAMES = 30
 SETTINGS = LastFrame(window=5, modes=16, iterations=3, weights=(1e-3, 1e2))
+QUICK = LastFrame(window=3, modes=8, iterations=1, weights=(1e-3,))
 
 
 def disturbed(noise: float = 0.0) -> tuple[Twin, Observations, np.ndarray, list[State], list[State]]:
@@ -46,10 +48,11 @@ def test_a_smoothly_disturbed_state_is_recovered():
     assert away(held, states[last])[0] < 0.05 * before
 
 
-def test_prediction_goes_on_from_the_recovered_state():
+def test_prediction_goes_on_from_the_recovered_state(monkeypatch):
+    monkeypatch.setattr(carry, "ORIGINS", 2)
     twin, seen, velocity, _, _ = disturbed()
     trajectory = roll_out(twin, seen.controller_points, velocity=velocity)
-    corrected, facts = carry_over(trajectory, twin, seen, velocity, "cpu", "state", SETTINGS)
+    corrected, facts = carry_over(trajectory, twin, seen, velocity, "cpu", "state", QUICK)
     end, points = seen.scenario.train_end, seen.object_points.shape[1]
     errors = [
         np.linalg.norm(one.positions[end:, :points] - seen.object_points[end:], axis=2).mean() for one in (trajectory, corrected)
@@ -59,13 +62,12 @@ def test_prediction_goes_on_from_the_recovered_state():
     np.testing.assert_array_equal(corrected.positions[:end], trajectory.positions[:end])
 
 
-def test_the_guard_refuses_where_it_does_not_help():
+def test_the_guard_refuses_where_it_does_not_help(monkeypatch):
+    monkeypatch.setattr(carry, "ORIGINS", 4)
     scene = small.scene(frames=FRAMES, noise=0.01)
     rest = np.zeros_like(scene.observations.nodes)
     trajectory = roll_out(scene.truth, scene.observations.controller_points)
-    corrected, facts = carry_over(
-        trajectory, scene.truth, scene.observations, rest, "cpu", "state", replace(SETTINGS, weights=(1e-3,))
-    )
+    corrected, facts = carry_over(trajectory, scene.truth, scene.observations, rest, "cpu", "state", QUICK)
     assert corrected is trajectory
     assert facts["carried"] == 0 and facts["gain"] < 0.02
 
