@@ -230,8 +230,8 @@ class LastFrame(Section):
     """Prediction from the last training frame (methods with `carry_over: state`): the state there, from the frames before it."""
 
     window: Count = 2
-    """Training frames over which the state is estimated, besides their first. Longer ones average noise, and hold on to what is wrong
-    with the model."""
+    """Training frames over which the state is estimated, besides their first. Longer ones average noise, and hold on to what is
+    wrong with the model."""
     modes: Annotated[int, Field(ge=1, le=64)] = 16
     """Softest modes of the body along which its position and its velocity at the window's first frame may be corrected."""
     iterations: Count = 2
