@@ -250,13 +250,17 @@ class Benchmark:
         if not (method.search and method.fit):
             return
         wanted_low, wanted_high = search_of(self.config, self.searches[method.search], method.search).ranges.stiffness
-        low, high = fit_of(self.config, method, name).stiffness_range
+        fit = fit_of(self.config, method, name)
+        if method.oracle and fit.selection == "tail":
+            rule = "an oracle is fitted on all frames and holds none back"
+            raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")
+        low, high = fit.stiffness_range
         if not low <= wanted_low < wanted_high <= high:
             rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
-        """The fits (method, seed) of a scenario that share launches: those of equal horizon, where they are not too few.
+        """The fits (method, seed) of a scenario that share launches: those in step (horizon, frames), if not too few.
 
         None where `twins_per_launch` is 1, or auto on a GPU.
         """
@@ -264,13 +268,13 @@ class Benchmark:
         if most == 1 or (most == "auto" and self.on_gpu) or scenario not in self.config.scenarios:
             return ()
         rows, seeds = [name for name in self.fits if self.applies(name, scenario)], self.config.seeds
-        alike = Counter(self._horizons[name] for name in rows)
-        return tuple((name, seed) for name in rows if alike[self._horizons[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
+        alike = Counter(self._steps[name] for name in rows)
+        return tuple((name, seed) for name in rows if alike[self._steps[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
 
     @cached_property
-    def _horizons(self) -> dict[str, int]:
-        """Frames per step of each fit."""
-        return {name: fit_of(self.config, method, name).horizon for name, method in self.fits.items()}
+    def _steps(self) -> dict[str, tuple[int, bool]]:
+        """Of each fit: frames per step, and whether it goes over all frames (an oracle) or over those before the split."""
+        return {name: (fit_of(self.config, method, name).horizon, method.oracle) for name, method in self.fits.items()}
 
     @property
     def tuned(self) -> tuple[str, ...]:
@@ -364,10 +368,10 @@ def _tuned(whole: Config) -> tuple[str, ...]:
 
 
 def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
-    """Method with a fit -> the first row of the table with the same search, stage and settings."""
+    """Method with a fit -> the first row of the table with the same search, stage, frames (all for an oracle) and settings."""
     first: dict[tuple[Any, ...], str] = {}
     fitted = {name: method for name, method in methods.items() if method.fit}
-    return {name: first.setdefault((m.search, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+    return {name: first.setdefault((m.search, m.fit, m.oracle, fit_of(config, m, name)), name) for name, m in fitted.items()}
 
 
 def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:

@@ -91,13 +91,13 @@ class Inputs:
     def transfers(self) -> list[str]:
         """Records of transfers: per source, method and seed.
 
-        Carrying over and averaging concern the future of the same recording, so such methods are not transferred.
+        Carrying over, averaging and oracles concern the future of the same recording, so such methods are not transferred.
         """
         methods = [
             name
             for name, method in self.benchmark.methods.items()
             if (method.search or (method.model and BASELINES[method.model].transfers))
-            and not (method.carry_over or method.average_seeds)
+            and not (method.carry_over or method.average_seeds or method.oracle)
         ]
         return [
             f"{self.results}/{scenario}/{method}/{seed}/transfer.json"
@@ -199,7 +199,7 @@ class Inputs:
                 "kind": self.benchmark.fits[name].fit,
                 "settings": self._settings("fit", source, name),
                 "fits": {},
-            }
+            } | ({"oracle": True} if self.benchmark.fits[name].oracle else {})
             rows.setdefault(name, row)["fits"][self._record(member, name, "fit")] = self.search_of_fit(member)
         return _json(list(rows.values()))
 
@@ -266,6 +266,11 @@ class Inputs:
             "carry_over": method.carry_over,
             "average_seeds": method.average_seeds,
         }
+        if method.oracle:
+            # Named only where it is one, so that other runs' records stay as they were.
+            switches["oracle"] = True
+        if method.carry_over:
+            switches["task"] = method.task
         quirks = self.benchmark.searches[method.search].released_quirks
         on = {"released_quirks": sorted(key for key, value in quirks.items() if value)} if quirks else {}
         return _json(switches | on | settings)
@@ -276,7 +281,7 @@ class Inputs:
         """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
         # Thousands of jobs share a few texts: those of one source and one row.
         source = self.benchmark.scenarios[job.scenario].source
-        own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage)
+        own = {"search": "search", "fit": "method", "train": "method", "rollout": "method", "appearance": "looks"}.get(stage)
         return self._settings(stage, source, getattr(job, own) if own else "")
 
     @functools.cache  # noqa: B019 - one benchmark a process
@@ -292,6 +297,8 @@ class Inputs:
             return _json(select(config, declared.reads))
         if stage == "observe":
             return _json(select(config, ("perception.sample", "perception.seed") if declared.films else declared.reads))
+        if stage == "rollout" and self.benchmark.methods[name].carry_over != "state":
+            return "{}"
         if stage == "train":
             return self._training_settings(name)
         values = select(config, STAGES[stage].reads)

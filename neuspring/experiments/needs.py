@@ -18,7 +18,7 @@ from neuspring.experiments import benchmark as benchmarks
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.plan import History, Kind, Planned
-from neuspring.experiments.size import TRAIN, Size, Sizes
+from neuspring.experiments.size import TRAIN, Body, Size, Sizes
 from neuspring.stages import STAGES
 
 CARRY_OVER = 4
@@ -172,16 +172,20 @@ class Needs:
             return int(self._rollouts(wildcards.search) * (body.train_end - 1))
         together = benchmark.fits_together(wildcards.scenario) if rule in ("fits", "fit") else ()
         if rule == "fits":
-            return int(sum(self._epochs(method) for method, _ in together) * (body.train_end - 1))
+            return int(sum(self._epochs(method) * self._fitted(method, body) for method, _ in together))
         if rule == "fit":
             if (wildcards.method, int(wildcards.seed)) in together:
                 return 1  # what runs together is the work of `fits`
-            return int(self._epochs(wildcards.method) * (body.train_end - 1))
+            return int(self._epochs(wildcards.method) * self._fitted(wildcards.method, body))
         if rule == "transfer":
             return sum(self.sizes.body(name).frames - 1 for name in benchmark.transfers[wildcards.scenario])
         method = benchmark.methods[wildcards.method]
         seeds = len(benchmark.whole.seeds) if method.average_seeds else 1
         return (body.frames - 1) * seeds * (CARRY_OVER if method.carry_over else 1)
+
+    def _fitted(self, method: str, body: Body) -> int:
+        """Frames that an epoch of a fit simulates."""
+        return (body.frames if self._benchmark.fits[method].oracle else body.train_end) - 1
 
     def amount(self, rule: str, wildcards: Any) -> tuple[float | None, Size | None]:
         """A job's work in the unit of its times, and, if it simulates, the size of its twins.

@@ -26,13 +26,15 @@ def options(parser: ArgumentParser) -> None:
     shared.add_settings(parser)
     about = "train each spring, or the neural spring field"
     parser.add_argument("--kind", choices=("springs", "field"), default="springs", help=about)
+    oracle = "fit all frames, the future included: no prediction, but what fitting could reach at best; the record says oracle"
+    parser.add_argument("--oracle", action="store_true", help=oracle)
     shared.add_device(parser)
     shared.add_output(parser)
 
 
 def command(a: Namespace) -> None:
     """`neuspring fit`."""
-    run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output)
+    run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output, oracle=a.oracle)
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,16 @@ class Prepared:
     """What a checkpoint must match."""
 
 
-def recorder(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> Recorder:
-    """The recorder of a fit, which digests its inputs."""
+def recorder(
+    observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path, *, oracle: bool = False
+) -> Recorder:
+    """The recorder of a fit, which digests its inputs. Only an oracle names the word: other digests stay."""
+    own = {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]} | ({"oracle": True} if oracle else {})
     return Recorder(
         "fit",
         output,
         inputs={"observations": observations_path, "search": search_record},
-        settings=select(settings, STAGES["fit"].reads) | {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]},
+        settings=select(settings, STAGES["fit"].reads) | own,
         device=device,
     )
 
@@ -70,19 +75,23 @@ def prepared(record: Recorder, observations_path: Path, search_record: Path, set
         record.device,
         record.settings["kind"],
         int(record.settings["seed"]),
+        record.settings.get("oracle", False),
     )
     inputs = {"observations": record.inputs["observations"], "twin": before.files["twin"][1]}
     key = checkpoint_key(inputs, record.settings, record.device, "neuspring.twin.fit")
     return Prepared(problem, record.output.with_name("fit.partial.npz"), key)
 
 
-def run(observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path) -> None:
+def run(
+    observations_path: Path, search_record: Path, settings: Config, kind: Kind, device: str, output: Path, *, oracle: bool = False
+) -> None:
     """Write twin.npz, history.parquet (losses per epoch), and the record `output`.
 
     `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
+    `oracle`: all frames are fitted, the future included, and the record says so.
     A checkpoint that a killed fit left, or one that ran together with others (`fits`), is continued.
     """
-    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output)
+    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output, oracle=oracle)
     before = StageRecord.load(search_record)
     if before.status == "failed":
         record.save(failure=f"search: {before.reason}")
@@ -100,7 +109,7 @@ def run(observations_path: Path, search_record: Path, settings: Config, kind: Ki
     write_history(result.history["epoch"], columns, files["history"])
     counts = result.twin.counts
     # Those that ran together count in the record of `fits`.
-    frames = (len(result.history) - result.epochs_together) * (problem.observations.scenario.train_end - 1)
+    frames = (len(result.history) - result.epochs_together) * (problem.frame_end - 1)
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,

@@ -1,9 +1,9 @@
 """First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
-An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training
-span) one optimiser step is made with the gradient through those frames; the state is detached there and goes on while
-parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the
-training frames, to which the start counts too; test frames are never read. A non-finite loss or gradient restores the
+An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training span) one
+optimiser step is made with the gradient through those frames; the state is detached there and goes on while parameters change. The
+best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the training frames, to which the
+start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
 parameters of the epoch's start, halves the learning rates and is reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
@@ -35,7 +35,7 @@ from neuspring.physics.autograd import simulate_frame, solver_for
 from neuspring.physics.path import waypoints
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.company import Seat
-from neuspring.twin.losses import FrameLoss
+from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.movement import median_gradient, movement, watched
 from neuspring.twin.parameters import TwinParameters
@@ -65,6 +65,17 @@ class FitProblem:
     kind: Kind = "springs"
     seed: int = 0
     """Of the field's first weights."""
+    oracle: bool = False
+    """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
+
+    def __post_init__(self) -> None:
+        if self.oracle and self.fit.selection == "tail":
+            raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
+
+    @property
+    def frame_end(self) -> int:
+        """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
+        return frames_seen(self.observations, oracle=self.oracle)
 
 
 @dataclass(frozen=True)
@@ -136,9 +147,13 @@ class TwinFit:
         observations, settings = problem.observations, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
-            observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators
+            observations,
+            problem.losses,
+            problem.device,
+            frozen_counts=problem.quirks.frozen_loss_denominators,
+            oracle=problem.oracle,
         )
-        end = observations.scenario.train_end
+        end = problem.frame_end
         hands = torch.tensor(observations.controller_points[:end], device=problem.device)
         self.hands = waypoints(hands, problem.twin.simulation)
         if settings.selection == "tail" and end < 3:
@@ -325,7 +340,7 @@ def fit(
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
     `seat` the simulation shares launches with other fits (company.py). Raises NumericalFailure if no epoch could be completed.
     """
-    label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
+    label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(seat.company.seats) if seat else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.total_epochs, problem.fit.checkpoint_every, partial, key, share=share)
     run = TwinFit(problem, seat)

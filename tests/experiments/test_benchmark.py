@@ -437,7 +437,12 @@ def test_every_method_that_is_shipped_is_valid():
         "plus_average": "neuspring",
         "neuspring_plus_carry_over": "neuspring_plus",
         "neuspring_plus_average": "neuspring_plus",
+        "baseline_from_last_frame": "baseline",
+        "neuspring_from_last_frame": "neuspring",
+        "neuspring_plus_from_last_frame": "neuspring_plus",
     }
+    # An oracle's fit has seen the future: it is shared with nobody, not even where all settings are equal.
+    assert {benchmark.fit_of_method[name] for name in ("oracle_neuspring", "oracle_plus")} == {"oracle_neuspring", "oracle_plus"}
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():

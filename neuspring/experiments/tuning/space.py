@@ -53,6 +53,8 @@ class Plan:
         """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
         methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
         method = _row("tune.method", tune.method, methods, settings.method_table)
+        if method.oracle:
+            raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
         base = {name: config.plain(getattr(settings, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
         base["fit"] = config.plain(fit_of(settings, method, tune.method))
