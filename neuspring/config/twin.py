@@ -125,6 +125,9 @@ class Search(Section):
     isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
     """Nodes without any spring. repair: join them to their 3 nearest nodes. penalise: refuse the candidate. allow: leave them, as
     released."""
+    controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
+    """Where springs of controllers have no force, if the rest shape is not frame 0. rest_shape: where the body's have none.
+    first_frame: in frame 0, as a hand takes hold of a body that is bent already."""
     clusters: Clusters = field(default_factory=Clusters)
     ranges: SearchRanges = field(default_factory=SearchRanges)
     start: SearchStart = field(default_factory=SearchStart)

@@ -79,7 +79,7 @@ def _mocap(row: ScenarioRow, config: Config) -> Expected:
     return Expected(
         nodes=rings * mocap.ring,
         spacing=CABLE / (rings - 1),
-        controllers=GRIPS,
+        controllers=GRIPS * (1 + (mocap.ring if mocap.grip == "clamp" else 0)),
         frames=min(recorded, mocap.frames or recorded),
         frame_rate=RECORD_RATE / mocap.stride,
     )
