@@ -184,6 +184,9 @@ class Search(Section):
     """Variables beyond the released ones that are searched too; without them what they describe is absent."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
+    controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
+    """Where the springs of controllers are at rest: in the rest shape, as released, or in frame 0, as grips hold what they hold. It
+    matters where a capture has a rest shape of its own."""
     clusters: Clusters = field(default_factory=Clusters)
     ranges: SearchRanges = field(default_factory=SearchRanges)
     scales: SearchScales = field(default_factory=SearchScales)

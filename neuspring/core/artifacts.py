@@ -274,6 +274,8 @@ class Topology(Artifact):
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
+    controller_rest: str = "rest_shape"
+    """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
@@ -287,6 +289,8 @@ class Topology(Artifact):
             raise InputError("topology.springs", "object springs must come before controller springs")
         if (self.springs >= nodes).all(axis=1).any():
             raise InputError("topology.springs", "a spring may not join two controllers")
+        if self.controller_rest not in ("rest_shape", "first_frame"):
+            raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
         short = np.flatnonzero(~(self.rest_lengths > 0))
         if len(short):
             raise InputError(

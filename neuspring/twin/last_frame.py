@@ -22,6 +22,7 @@ from scipy.sparse.linalg import eigsh
 from neuspring.config import LastFrame
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.physics.lanes import WIDTHS
+from neuspring.physics.path import waypoints
 from neuspring.physics.population import solver_of
 from neuspring.twin.rollout import FAR
 

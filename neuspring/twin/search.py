@@ -186,6 +186,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         int(values["controller_neighbours"]),
         repair=isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
+        controller_rest=problem.search.controller_rest,
     )
     count = len(topology.springs)
     if count == 0:

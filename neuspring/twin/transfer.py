@@ -9,7 +9,7 @@ import numpy as np
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
-from neuspring.twin.topology import distances
+from neuspring.twin.topology import unloaded
 
 
 def rebase(
@@ -17,10 +17,11 @@ def rebase(
 ) -> Twin:
     """The twin on the nodes and hands of another recording, node i on node i. The rest shape is frame 0 unless recorded.
 
-    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends in the rest shape.
-    With `keep_lengths` it keeps the rest length itself: trained lengths belong to the body. Up, ground and, unless
-    `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more. Raises InputError if
-    the numbers of nodes or controllers differ, or a spring would have no length.
+    A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends where it has no force:
+    in the rest shape, or in frame 0 where the twin's controllers rest there. With `keep_lengths` it keeps the rest length itself:
+    trained lengths belong to the body. Those of controllers that rest in frame 0 belong to the grip, and follow the new one. Up,
+    ground and, unless `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more.
+    Raises InputError if the numbers of nodes or controllers differ, or a spring would have no length.
     """
     topology, scenario = twin.topology, observations.scenario
     nodes, hands = observations.nodes, observations.controller_points[0]
@@ -28,8 +29,13 @@ def rebase(
         if len(old) != len(new):
             rule = f"a twin moves only to a recording of the same object with as many {name}: {len(old)}"
             raise InputError(f"transfer to {scenario.name}", rule, len(new), "Sample both alike (mocap.rings).")
-    ratio = distances(observations.canonical, topology.springs) / distances(topology.canonical, topology.springs)
-    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else ratio)
+    rest, springs = topology.controller_rest, topology.springs
+    ratio = unloaded(nodes, hands, springs, observations.rest_shape, rest)
+    ratio /= unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
+    if keep_lengths:
+        calibrated = rest == "first_frame"
+        ratio[: topology.object_spring_count if calibrated else None] = 1.0
+    lengths = topology.rest_lengths.astype(np.float64) * ratio
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         rule = "the ends of a spring may not coincide in the rest shape"

@@ -77,6 +77,23 @@ def test_bodies_follow_the_released_table_and_the_sampling():
     assert expected(dataclasses.replace(row, path="x/mine"), settings) == USUAL
 
 
+def test_a_limit_of_nodes_widens_the_spacing_and_never_narrows_it():
+    row = config.ScenarioRow(
+        scenario="a", source="phystwin_raw", category="cloth", path="x/weird_package", self_collision=True, ground=True
+    )
+    for most, nodes, spacing in ((4532, 4532, 0.005), (1133, 1133, 0.01), (10**6, 4532, 0.005)):
+        values = {"perception": {"sample": {"voxel": 0.005, "nodes": most}}}
+        body = expected(row, config.parse(config.Config, config_with(values), "test"))
+        assert (body.nodes, body.spacing) == (nodes, pytest.approx(spacing))
+
+
+def test_clamped_cables_have_the_controllers_that_are_read():
+    row = config.ScenarioRow(scenario="a", source="mocap", category="DLO1", path="x", self_collision=False, ground=False)
+    for grip, controllers in (("markers", 4), ("clamp", 4 + 4 * 3)):
+        settings = config.parse(config.Config, config_with({"mocap": {"grip": grip, "ring": 3}}), "test")
+        assert expected(row, settings).controllers == controllers
+
+
 @pytest.mark.parametrize("name", TOYS)
 def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(name):
     shape = {"rope": "rope/lift/smooth", "cloth": "cloth/lift/smooth", "blob": "blob/lift/smooth"}[name]
