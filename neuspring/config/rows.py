@@ -45,6 +45,8 @@ class Method(Section):
     """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
     average_seeds: bool = False
     """Predict the mean of the trajectories of all seeds; this costs as many fits as there are seeds."""
+    oracle: bool = False
+    """The method is fitted on all frames, those of the future too. Tables show it on lines of its own, outside every comparison."""
 
     def __post_init__(self) -> None:
         if (self.search is None) == (self.model is None):

@@ -266,7 +266,9 @@ class Inputs:
             "carry_over": method.carry_over,
             "average_seeds": method.average_seeds,
         }
-        return _json(switches | settings)
+        # Only where it is on, so that records of other methods stay as they were.
+        oracle = {"oracle": True} if method.oracle else {}
+        return _json(switches | oracle | settings)
 
     # --- settings and code
 

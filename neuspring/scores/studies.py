@@ -15,7 +15,20 @@ from neuspring.core.errors import InputError
 from neuspring.scores import paper
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
-TAKEN = ("summary", "scores", "runs", "averages", "differences", "held", "transfers", "perception", "pictures")
+TAKEN = (
+    "summary",
+    "scores",
+    "runs",
+    "averages",
+    "differences",
+    "held",
+    "floors",
+    "ratios",
+    "seeds",
+    "transfers",
+    "perception",
+    "pictures",
+)
 """Names of files that other commands write into the folder of tables."""
 
 

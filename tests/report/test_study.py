@@ -37,8 +37,8 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
     for (scenario, method, seed), scores in values.items():
         counts = (frames or {}).get(scenario, 10)
         rows += [(scenario, "rope", method, seed, *key, value, "", counts) for key, value in scores.items()]
-        runs.append((scenario, method, seed, "ok", "", "", None, source, "k"))
-    runs += [(*run, "failed", "it diverged", "", None, source, "k") for run in failed]
+        runs.append((scenario, method, seed, "ok", "", "", None, source, "k", False, "{}"))
+    runs += [(*run, "failed", "it diverged", "", None, source, "k", False, "{}") for run in failed]
     return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(RUN_COLUMNS)))
 
 

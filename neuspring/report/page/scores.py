@@ -25,6 +25,7 @@ from neuspring.scores.metrics import (
     averages,
     headings_of,
     present,
+    published,
 )
 from neuspring.scores.runs import Collected, finished_scores, pairs
 
@@ -43,13 +44,13 @@ def section(material: Material, usable: pd.DataFrame, differences: pd.DataFrame)
         reasons = [Text(text=text, tone="mute"), *([Text(text=coverage)] if coverage else [])]
         return Section(key="scores", title="Scores", blocks=[*reasons, *frozen.averages(collected)])
     blocks: list[Block] = [Text(text=f"{_coverage(collected, usable)} {coverage}".rstrip())]
-    blocks.append(_averages("Errors, mm", usable, collected, HEADINGS))
+    blocks.append(_averages("Errors, mm", usable, collected, published(HEADINGS, usable)))
     blocks += frozen.averages(collected)
     images = {key: text for key, text in IMAGE_HEADINGS.items() if key in present(usable)}
     if images:
         blocks.append(_averages("Pictures: PSNR in dB, SSIM, LPIPS, IoU", usable, collected, images))
     if len(differences):
-        blocks.append(_differences(f"Paired difference to {baseline}, mm", differences, HEADINGS))
+        blocks.append(_differences(f"Paired difference to {baseline}, mm", differences, published(HEADINGS, usable)))
         blocks.append(Fold(summary="Ratios", blocks=[_ratios(f"Ratio of the error to that of {baseline}", differences)]))
         if images:
             table = _differences(f"Pictures: paired difference to {baseline}", differences, images)
@@ -134,7 +135,7 @@ def _ratios(caption: str, differences: pd.DataFrame) -> Table:
         return Cell(text=f"{row.ratio:.3f}", small=small, value=float(row.ratio))
 
     note = "Geometric mean and 95 % interval; below 1 is better. No single scenario of large errors decides it."
-    return _by_method(caption, differences, HEADINGS, cell, note)
+    return _by_method(caption, differences, published(HEADINGS, differences), cell, note)
 
 
 def _by_method(caption: str, differences: pd.DataFrame, headings: Headings, cell: Callable[[Any], Cell], note: str) -> Table:
@@ -155,9 +156,10 @@ def _transfers(material: Material) -> list[Block]:
     if not len(usable):
         return []
     caption = "Transfer to other recordings of the same object: errors, mm"
-    blocks: list[Block] = [_averages(caption, usable, collected, TRANSFER_HEADINGS)]
+    headings = published(TRANSFER_HEADINGS, usable)
+    blocks: list[Block] = [_averages(caption, usable, collected, headings)]
     if len(differences):
-        blocks.append(_differences(f"Transfer: paired difference to {baseline}, mm", differences, TRANSFER_HEADINGS))
+        blocks.append(_differences(f"Transfer: paired difference to {baseline}, mm", differences, headings))
     return blocks
 
 

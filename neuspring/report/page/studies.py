@@ -17,7 +17,7 @@ from neuspring.report.page.words import number, several, signed
 from neuspring.report.tables import cells as tables_cells
 from neuspring.report.tables.cells import BETTER, CONFIRMED, OPPOSITE, WITHIN, WORSE
 from neuspring.scores import paper
-from neuspring.scores.metrics import DASH, IN_PAPER, Metric
+from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
 from neuspring.scores.studies import Study
 
 TASKS = {"reconstruction": "Reconstruction and resimulation", "future": "Future prediction"}
@@ -128,13 +128,13 @@ def _values(study: Study, cells: pd.DataFrame, title: str) -> Table:
     def first(cell: Any) -> Cell:
         return Cell(text=str(cell.label), small=(cell.method, _runs(cell)))
 
-    best = {name: _best(part["ours"], IN_PAPER[str(name)]) for name, part in cells.groupby("metric")}
+    best = {name: _best(part["ours"], IN_STUDIES[str(name)]) for name, part in cells.groupby("metric")}
     return _table(cells, title, first, lambda cell, metric: _value(cell, metric, best[metric.name], bool(study.reference)))
 
 
 def _table(cells: pd.DataFrame, title: str, first: Callable[[Any], Cell], value: Callable[[Any, Metric], Cell]) -> Table:
     """A line per label: its heading by `first`, then a cell per metric by `value`."""
-    metrics = [IN_PAPER[name] for name in dict.fromkeys(cells["metric"])]
+    metrics = [IN_STUDIES[name] for name in dict.fromkeys(cells["metric"])]
     rows = []
     for _, part in cells.groupby("label", sort=False):
         own: dict[Any, Any] = {cell.metric: cell for cell in part.itertuples()}

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.markdown import markdown
-from neuspring.report.tables.cells import in_order
+from neuspring.report.tables.cells import ORACLE_LINE, in_order
 from neuspring.scores import paper
 from neuspring.scores.failures import DASHES, WHY, mean_rows
-from neuspring.scores.metrics import DASH, IN_PAPER, SHORT, Metric, present
+from neuspring.scores.metrics import DASH, IN_STUDIES, SHORT, Metric, present
 from neuspring.scores.studies import Study
 
 Mark = Literal["", "best", "second"]
@@ -67,7 +67,7 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
     columns = _columns(cells)
     marks = {source: _marks(study, cells, columns, source) for source in ("paper", "ours")}
     lines: list[Line] = []
-    for label, part in _rows(cells):
+    for label, part in _rows(cells[~cells["oracle"]]):
         printed, ours, verdicts = [], [], []
         for task, metric in columns:
             cell = part[task, metric.name]
@@ -79,6 +79,7 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
         lines += [((label, "", "paper"), printed)] if study.reference else []
         lines.append((("" if study.reference else label, _runs(cell), "ours"), ours))
         lines += [(("", "", "verdict"), verdicts)] if study.reference else []
+    lines += [((names[0], "", names[1]), texts) for names, texts in _oracle_lines(cells, columns)]
     note = (
         f"{_units(columns)} Ours: mean over scenarios, seeds averaged within each, ± standard deviation over seeds"
         f"{_conventions(columns)}."
@@ -86,6 +87,37 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
     if cells["failed"].any():
         note += f" {FAILED_MARK} Some runs failed; the table of failures has both averages, without and with them."
     return Grid(title="", note=note, stub=("Method", "Runs", ""), columns=columns, lines=lines)
+
+
+def _oracle_lines(cells: pd.DataFrame, columns: list[tuple[str, Metric]]) -> list[Line]:
+    """A line that says what oracles are, then theirs; never marked."""
+    lines: list[Line] = []
+    for label, part in _rows(cells[cells["oracle"]]):
+        texts = [Text(metric.paper_text(part[task, metric.name].ours)) for task, metric in columns]
+        lines += [] if lines else [((ORACLE_LINE, ""), [Text("")] * len(columns))]
+        lines.append(((label, "ours"), texts))
+    return lines
+
+
+def beyond_grid(study: Study, cells: pd.DataFrame) -> Grid:
+    """Metrics that the paper does not have: ours, its interval, the change against the baseline and its verdict."""
+    columns, lines = _columns(cells), list[Line]()
+    for label, part in _rows(cells[~cells["oracle"]]):
+        here = [(part[task, metric.name], metric) for task, metric in columns]
+        spreads = [f" ± {metric.paper_text(cell.spread)}" if np.isfinite(cell.spread) else "" for cell, metric in here]
+        ours = [metric.paper_text(cell.ours) + spread for (cell, metric), spread in zip(here, spreads, strict=True)]
+        lines.append(((label, "ours"), [Text(text) for text in ours]))
+        intervals = [_interval(cell.low, cell.high, metric.paper_text) or DASH for cell, metric in here]
+        lines.append((("", "95 %"), [Text(text) for text in intervals]))
+        if label != study.baseline:
+            lines.append((("", "change"), [Text(our_change(cell, metric)) for cell, metric in here]))
+            lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
+    lines += _oracle_lines(cells, columns)
+    note = (
+        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. CD and TE have "
+        f"a floor, their value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
+    )
+    return Grid(title="Without a floor", note=note, stub=("Method", ""), columns=columns, lines=lines)
 
 
 def interval_grid(cells: pd.DataFrame) -> Grid:
@@ -107,7 +139,7 @@ def interval_grid(cells: pd.DataFrame) -> Grid:
 def change_grid(study: Study, cells: pd.DataFrame) -> Grid:
     """The change against the baseline, in the paper and here."""
     columns, lines = _columns(cells), list[Line]()
-    for label, part in _rows(cells):
+    for label, part in _rows(cells[~cells["oracle"]]):
         if label == study.baseline:
             continue
         here = [(part[task, metric.name], metric) for task, metric in columns]
@@ -188,7 +220,7 @@ def _percent(value: float) -> str:
 
 def _columns(cells: pd.DataFrame) -> list[tuple[str, Metric]]:
     pairs = dict.fromkeys(zip(cells["task"], cells["metric"], strict=True))
-    return [(str(task), IN_PAPER[str(metric)]) for task, metric in pairs]
+    return [(str(task), IN_STUDIES[str(metric)]) for task, metric in pairs]
 
 
 def _rows(cells: pd.DataFrame) -> Iterable[tuple[str, dict[tuple[str, str], Any]]]:
@@ -218,7 +250,7 @@ def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Metric]],
     """Best and, where the paper marks it, second best of every column, as far as the printed digits tell."""
     marks: dict[tuple[str, str, str], Mark] = {}
     for task, metric in columns:
-        part = cells[(cells["task"] == task) & (cells["metric"] == metric.name)]
+        part = cells[(cells["task"] == task) & (cells["metric"] == metric.name) & ~cells["oracle"]]
         values = pd.to_numeric(part[source]).round(metric.paper_digits)
         ranked = sorted(values.dropna().unique(), reverse=metric.higher_is_better)
         if values.notna().sum() < 2:

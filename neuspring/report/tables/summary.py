@@ -16,6 +16,7 @@ from neuspring.report.figures.clusters import NAME as CLUSTERS
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.figures.ratios import NAME as RATIOS
 from neuspring.report.figures.ratios import ratios_figure
+from neuspring.report.tables.cells import ORACLE_LINE
 from neuspring.scores.failures import both_averages, failures_text, left_out_lines, removed_lines
 from neuspring.scores.metrics import (
     COLUMNS,
@@ -28,6 +29,7 @@ from neuspring.scores.metrics import (
     Headings,
     averages,
     headings_of,
+    published,
 )
 from neuspring.scores.runs import Collected, comparable, finished_scores, mixed_settings, pairs
 from neuspring.scores.statistics import paired_differences
@@ -39,7 +41,7 @@ LISTED = 12
 
 def compared(collected: Collected, baseline: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The scores that can be compared, and the paired differences of every method to `baseline`."""
-    scores = comparable(collected)
+    scores = comparable(collected.comparison)
     return scores, paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
 
 
@@ -48,6 +50,7 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
 
     `differences` are the paired ones if the caller has them already; the bootstrap takes seconds on a large benchmark.
     """
+    everything, collected = collected, collected.comparison
     if differences is None:
         scores, differences = compared(collected, baseline)
     else:
@@ -56,19 +59,24 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     scenarios, seeds = runs["scenario"].nunique(), runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
     spread = ", ± standard deviation over seeds" if several else ""
-    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES)
+    shown = {metric for _, metric in published(HEADINGS, scores)}
+    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES if metric.name in shown)
     lines = [f"Errors in mm, lower is better ({size}; {explained}).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
     if removed := removed_lines(runs, collected.left_out):
         lines += [" ".join([_kept_line(scores, runs), *removed]), ""]
     if warning := mixed_settings(runs):
         lines += [f"**{warning}**", ""]
-    lines += _method_table(scores, runs, runs)
+    headings = published(HEADINGS, scores)
+    lines += [*_method_table(scores, runs, runs, headings), *_oracle_rows(everything, scores, headings)]
+    lines += floor_lines(runs)
     if len(differences):
         intro = f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios and seeds], same scenario and seed:"
         ratio = f"Ratio to {baseline}, geometric mean [95 % interval], which no single scenario of large errors decides:"
-        lines += ["", intro, "", *_difference_table(differences), "", ratio, "", *_difference_table(differences, cell=_ratio)]
+        lines += ["", intro, "", *_difference_table(differences, headings), "", ratio, ""]
+        lines += _difference_table(differences, headings, _ratio)
     lines += image_lines(collected, scores, differences, baseline)
+    runs = everything.runs
     bad = runs[runs["status"] != "ok"]
     if len(bad):
         lines += ["", "Not in the averages:", "", *_not_counted(bad)]
@@ -118,7 +126,7 @@ def _averaged_notes(runs: pd.DataFrame) -> list[str]:
 
 
 def _method_table(
-    scores: pd.DataFrame, runs: pd.DataFrame, counted: pd.DataFrame, headings: Headings = HEADINGS, absent: str = DASH
+    scores: pd.DataFrame, runs: pd.DataFrame, counted: pd.DataFrame, headings: Headings, absent: str = DASH
 ) -> list[str]:
     """Both averages of every method of `runs`, and how many of its runs in `counted` finished; `absent` stands for no value."""
     several = _several_seeds(scores)
@@ -133,6 +141,43 @@ def _method_table(
     return markdown(["Method", *headings.values(), "Runs"], rows)
 
 
+def _oracle_rows(collected: Collected, scores: pd.DataFrame, headings: Headings) -> list[str]:
+    """A line that says what oracles are, then theirs, to be added to the table of methods; on the pairs of `scores`."""
+    oracles = collected.of(collected.oracles)
+    if not len(oracles.runs):
+        return []
+    keys = ["scenario", "seed"]
+    own = finished_scores(oracles)
+    own = own.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else own
+    _, _, *rows = _method_table(own, oracles.runs, oracles.runs, headings)
+    return [f"| *{ORACLE_LINE}* |{' |' * (len(headings) + 1)}", *rows]
+
+
+def floor_lines(runs: pd.DataFrame) -> list[str]:
+    """The errors in frame 0, which is given: mean over scenarios, and the range. Nothing where records do not have them."""
+    found = floors_of(runs)
+    parts = []
+    for metric in DISTANCES:
+        values = found.loc[found["metric"] == f"{metric.name}_floor", "value"]
+        if len(values) and metric.paper_name:
+            spread = f" ({metric.text(values.min())} to {metric.text(values.max())})" if len(values) > 1 else ""
+            parts.append(f"{metric.heading} {metric.text(values.mean())} mm{spread}")
+    if not parts:
+        return []
+    of = f", mean of {count} scenarios (least to largest)" if (count := found["scenario"].nunique()) > 1 else ""
+    text = f"Floor in frame 0{of}: {', '.join(parts)}; TE bound 0 by construction."
+    return ["", f"{text} A floor is the distance between nodes, not motion, and part of every score of its metric."]
+
+
+def floors_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Floors per scenario: scenario, metric (chamfer_floor, ...), value [m]. Methods of a scenario begin with the same nodes."""
+    rows: dict[tuple[str, str], float] = {}
+    for row in runs.itertuples() if "floors" in runs else ():
+        values = json.loads(row.floors) if isinstance(row.floors, str) else {}
+        rows |= {(row.scenario, f"{name}_floor"): value for name, value in values.items()}
+    return pd.DataFrame([(*key, value) for key, value in rows.items()], columns=["scenario", "metric", "value"])
+
+
 def _mean(row: Any, several: bool, absent: str) -> str:
     if row is None:
         return absent
@@ -141,9 +186,7 @@ def _mean(row: Any, several: bool, absent: str) -> str:
     return f"{metric.text(row.equal)}{spread} ({metric.text(row.frames)})"
 
 
-def _difference_table(
-    differences: pd.DataFrame, headings: Headings = HEADINGS, cell: Callable[[Any], str] | None = None
-) -> list[str]:
+def _difference_table(differences: pd.DataFrame, headings: Headings, cell: Callable[[Any], str] | None = None) -> list[str]:
     rows = []
     for method, part in differences.groupby("method", sort=False):
         values = {(row.task, row.metric): row for row in part.itertuples()}
@@ -277,33 +320,35 @@ def transfer_text(collected: Collected, baseline: str) -> str:
     scores, differences = compared(collected, baseline)
     what = "Each twin on other recordings of the same object, all frames after the first: mean over targets, then over sources"
     lines = ["", "## Transfer", "", f"{what} (in brackets weighted by frames). A run is one source and seed.", ""]
-    lines += _method_table(scores, collected.runs, collected.runs, TRANSFER_HEADINGS)
+    headings = published(TRANSFER_HEADINGS, scores)
+    lines += _method_table(scores, collected.runs, collected.runs, headings)
     if len(differences):
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"
         lines += ["", f"Paired difference to {baseline}, mm [{interval}]:", ""]
-        lines += _difference_table(differences, TRANSFER_HEADINGS)
+        lines += _difference_table(differences, headings)
         lines += ["", f"Ratio to {baseline}, geometric mean [95 % interval]:", ""]
-        lines += _difference_table(differences, TRANSFER_HEADINGS, _ratio)
+        lines += _difference_table(differences, headings, _ratio)
     return "\n".join(lines) + "\n"
 
 
 def write(collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None) -> str:
     """Write the tables of a benchmark, and return the summary.
 
-    Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), transfers.csv,
-    summary.md. Where a method can be compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png;
-    summary.md shows them.
+    Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), floors.csv (errors
+    in frame 0), transfers.csv, summary.md. Where a method can be compared on several scenarios, also ratios.png, and with methods
+    clusters_<K>, clusters.png; summary.md shows them.
     """
     scores = collected.scores
     usable, differences = compared(collected, baseline)
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
-    failures = both_averages(scores, collected.runs, collected.frozen)
+    failures = both_averages(*collected.comparison.parts)
     tables = {
         "scores": scores,
         "runs": collected.runs,
         "averages": averages(usable) if len(usable) else pd.DataFrame(),
         "differences": differences,
         "held": failures,
+        "floors": floors_of(collected.runs),
         "transfers": transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS)),
     }
     for name, table in tables.items():
