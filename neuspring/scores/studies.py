@@ -25,6 +25,7 @@ TAKEN = (
     "floors",
     "ratios",
     "seeds",
+    "aims",
     "transfers",
     "perception",
     "pictures",

@@ -15,6 +15,7 @@ from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import number, several, signed
 from neuspring.report.tables import cells as tables_cells
+from neuspring.report.tables import differing
 from neuspring.report.tables.cells import BETTER, CONFIRMED, OPPOSITE, WITHIN, WORSE
 from neuspring.scores import paper
 from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
@@ -94,7 +95,8 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     """The tables of the studies; those without any run are folded."""
     blocks: list[Block] = []
     for name, study in material.studies.items():
-        inner = [*_tables(study, cells[name]), *frozen.of_table(study, material.collected)]
+        labels = {method: label for label, method in study.rows.items()}
+        inner = [*_tables(study, cells[name]), *_footnote(material, labels), *frozen.of_table(study, material.collected)]
         has_runs = len(cells[name]) > 0 and bool(cells[name]["ours"].notna().any())
         summary = f"{name}: {study.title}" + ("" if has_runs else " (not run)")
         blocks.append(Fold(summary=summary, blocks=inner, open=has_runs, key=f"study-{name}"))
@@ -106,6 +108,16 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     if not blocks:
         return Section(key="studies", title="The paper's tables", blocks=[Text(text="No table of studies was given.", tone="mute")])
     return Section(key="studies", title="The paper's tables", blocks=blocks, about=about)
+
+
+def _footnote(material: Material, labels: Mapping[str, str]) -> list[Block]:
+    """Which settings differ between the rows; nothing if none does."""
+    rows = differing.differing(material.collected.records.values(), labels)
+    if not rows:
+        return []
+    cells = [[Cell(text=row.setting), Cell(text=row.text)] for row in rows]
+    table = Table(caption="Settings that differ", header=["Setting", "Value: rows"], rows=cells, note=differing.ABOUT)
+    return [Fold(summary="Settings that differ between the rows", blocks=[table])]
 
 
 def _tables(study: Study, cells: pd.DataFrame) -> list[Block]:

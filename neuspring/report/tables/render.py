@@ -12,6 +12,7 @@ import pandas as pd
 
 from neuspring.core.markdown import markdown
 from neuspring.report.tables.cells import ORACLE_LINE, in_order
+from neuspring.report.tables.differing import ABOUT, Differing
 from neuspring.scores import paper
 from neuspring.scores.failures import DASHES, WHY, mean_rows
 from neuspring.scores.metrics import DASH, IN_STUDIES, SHORT, Metric, present
@@ -114,8 +115,8 @@ def beyond_grid(study: Study, cells: pd.DataFrame) -> Grid:
             lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
     lines += _oracle_lines(cells, columns)
     note = (
-        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. CD and TE have "
-        f"a floor, their value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
+        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. CD and TE "
+        f"have a floor, their value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
     )
     return Grid(title="Without a floor", note=note, stub=("Method", ""), columns=columns, lines=lines)
 
@@ -305,6 +306,19 @@ def as_latex(grid: Grid, label: str, title: str) -> str:
     caption = f"\\caption{{\\textbf{{{tex(title)}.}} {tex(grid.note)}}}"
     lines += ["\\bottomrule", "\\end{tabular}}", caption, f"\\label{{tab:{label}}}", "\\end{table*}"]
     return "\n".join(lines) + "\n"
+
+
+def differing_latex(rows: list[Differing], label: str, title: str) -> list[str]:
+    """The footnote on settings that differ, as a float of its own; nothing if none does."""
+    if not rows:
+        return []
+    lines = ["\\begin{table*}[t]\n\\centering\n\\footnotesize", "\\begin{tabular}{@{} l p{0.75\\linewidth} @{}}", "\\toprule"]
+    lines += [_tex_row([tex("Setting"), tex("Value: rows")]), "\\midrule"]
+    lines += [_tex_row([tex(row.setting), tex(row.text)]) for row in rows]
+    caption = f"\\caption{{\\textbf{{{tex(title)}: settings that differ.}} {tex(ABOUT)}}}"
+    return [
+        "\n".join([*lines, "\\bottomrule", "\\end{tabular}", caption, f"\\label{{tab:{label}-settings}}", "\\end{table*}"]) + "\n"
+    ]
 
 
 def _tex_row(cells: list[str]) -> str:

@@ -25,6 +25,7 @@ from neuspring.core.markdown import markdown
 from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.tables.cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
+from neuspring.report.tables.differing import differing, differing_markdown
 from neuspring.report.tables.render import (
     PREAMBLE,
     Grid,
@@ -32,6 +33,7 @@ from neuspring.report.tables.render import (
     as_markdown,
     beyond_grid,
     change_grid,
+    differing_latex,
     failures_grid,
     interval_grid,
     main_grid,
@@ -120,9 +122,11 @@ def write_collected(name: str, study: Study, collected: Collected, folder: Path)
     grids = _captioned(study, own, scores, table, means)
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
-    write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
+    footnote = differing(own.records.values(), _labels(study))
+    write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats, *differing_latex(footnote, name, study.title)]))
     warning = mixed_settings(own.runs)
     parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
+    parts.append(differing_markdown(footnote))
     parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
     parts.append(_left_out(runs, study, name, own))
     if len(categories):
