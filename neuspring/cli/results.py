@@ -91,11 +91,12 @@ def study(a: Namespace) -> None:
     if a.study not in studies:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(studies)}")
     definition, left_out = studies[a.study], _read_left_out(a.left_out)
+    beside = studies[definition.beside] if definition.beside else None
     if a.scores:
         collected = replace(read_scores(a.scores), left_out=left_out)
-        print(study.write_collected(a.study, definition, collected, a.output))
+        print(study.write_collected(a.study, definition, collected, a.output, beside))
     elif a.scenarios and a.methods and a.seeds:
-        print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out))
+        print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out, beside))
     else:
         raise InputError("study", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
 

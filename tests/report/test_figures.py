@@ -403,13 +403,13 @@ def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
     plt.close(figure)
 
 
-def test_a_picture_of_ratios_needs_two_scenarios_and_is_not_left_over(tmp_path):
+def test_a_picture_of_ratios_needs_three_scenarios_and_is_not_left_over(tmp_path):
     def written(scenarios: str) -> str:
         values = {(s, m, 0): v for s in scenarios for m, v in (("x", 0.01), ("y", 0.008))}
         tables.write(collected(values), "x", tmp_path)
         return (tmp_path / "summary.md").read_text()
 
-    assert "](ratios.png)" in written("ab")
+    assert "](ratios.png)" in written("abc")
     assert (tmp_path / "ratios.png").stat().st_size > 5000
-    assert "ratios.png" not in written("a")
+    assert "ratios.png" not in written("ab")
     assert not (tmp_path / "ratios.png").exists()

@@ -17,6 +17,7 @@ from neuspring.report.page.words import number, several, signed
 from neuspring.report.tables import cells as tables_cells
 from neuspring.report.tables import differing
 from neuspring.report.tables.cells import BETTER, CONFIRMED, OPPOSITE, WITHIN, WORSE
+from neuspring.report.tables.render import both_trainings
 from neuspring.scores import paper
 from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
 from neuspring.scores.studies import Study
@@ -96,7 +97,12 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     blocks: list[Block] = []
     for name, study in material.studies.items():
         labels = {method: label for label, method in study.rows.items()}
-        inner = [*_tables(study, cells[name]), *_footnote(material, labels), *frozen.of_table(study, material.collected)]
+        inner = [
+            *_tables(study, cells[name]),
+            *_beside(study, material, cells, name),
+            *_footnote(material, labels),
+            *frozen.of_table(study, material.collected),
+        ]
         has_runs = len(cells[name]) > 0 and bool(cells[name]["ours"].notna().any())
         summary = f"{name}: {study.title}" + ("" if has_runs else " (not run)")
         blocks.append(Fold(summary=summary, blocks=inner, open=has_runs, key=f"study-{name}"))
@@ -108,6 +114,19 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     if not blocks:
         return Section(key="studies", title="The paper's tables", blocks=[Text(text="No table of studies was given.", tone="mute")])
     return Section(key="studies", title="The paper's tables", blocks=blocks, about=about)
+
+
+def _beside(study: Study, material: Material, cells: Mapping[str, pd.DataFrame], name: str) -> list[Block]:
+    """The same rows in another training, next to these."""
+    other = study.beside
+    if other is None or other not in cells or not len(cells[name]) or not len(cells[other]):
+        return []
+    grids = both_trainings(study, cells[name], material.studies[other], cells[other])
+    blocks: list[Block] = []
+    for grid in grids:
+        rows = [[Cell(text=text) for text in (*stub, *(cell.text for cell in texts))] for stub, texts in grid.lines]
+        blocks.append(Table(caption=grid.title, header=[*grid.stub, *grid.headings], rows=rows, note=grid.note, stub=2))
+    return [Fold(summary=f"Beside {other}", blocks=blocks)] if blocks else []
 
 
 def _footnote(material: Material, labels: Mapping[str, str]) -> list[Block]:

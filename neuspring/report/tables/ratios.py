@@ -58,8 +58,8 @@ def about_ratios(judged: Judged) -> str:
     what = {"scenario": "scenarios", "category": "categories"}[judged.objects]
     return (
         f"Ratio of the error to that of {judged.baseline}: geometric mean over objects of the paired log ratio, seeds averaged "
-        f"within an object; 95 % t-interval over objects ({what}), none below {LEAST_OBJECTS}; n objects. Every row takes all pairs "
-        "of scenario and seed that both methods finished."
+        f"within an object; 95 % t-interval over objects ({what}), none below {LEAST_OBJECTS}; n objects. Every row takes all "
+        "pairs of scenario and seed that both methods finished."
     )
 
 

@@ -121,6 +121,35 @@ def beyond_grid(study: Study, cells: pd.DataFrame) -> Grid:
     return Grid(title="Without a floor", note=note, stub=("Method", ""), columns=columns, lines=lines)
 
 
+def both_trainings(study: Study, cells: pd.DataFrame, beside: Study, others: pd.DataFrame) -> list[Grid]:
+    """Two studies of the same labels under one heading: values, and changes against the baseline of the same training."""
+    blocks = [(beside, others), (study, cells)]
+    finished = [table[table["ours"].notna()] for _, table in blocks if len(table)]
+    columns = in_order({(task, metric.name) for table in finished for task, metric in _columns(table)})
+    by_label = [dict(_rows(table[~table["oracle"]])) for _, table in blocks]
+    values, changes = list[Line](), list[Line]()
+    for label in (label for label in study.rows if label in by_label[0] and label in by_label[1]):
+        for number, (block, rows) in enumerate(zip(blocks, by_label, strict=True)):
+            here = [(rows[label].get((task, metric.name)), metric) for task, metric in columns]
+            stub = ("" if number else label, block[0].training)
+            values.append((stub, [Text(_value(cell, metric)) for cell, metric in here]))
+            if label != block[0].baseline:
+                changes.append((stub, [Text(our_change(cell, metric) if cell else DASH) for cell, metric in here]))
+    note = "The same rows in two trainings. Each is averaged over the scenarios and seeds that all its rows finished."
+    against = f"{note} Against {study.baseline} of the same training, with the paired 95 % bootstrap interval."
+    grids = [("Both trainings", note, values), ("Both trainings: change", against, changes)]
+    stub = ("Method", "Training")
+    return [
+        Grid(title=title, note=text, stub=stub, columns=columns, lines=lines) for title, text, lines in grids if lines and columns
+    ]
+
+
+def _value(cell: Any, metric: Metric) -> str:
+    if cell is None:
+        return DASH
+    return metric.paper_text(cell.ours) + (f" ± {metric.paper_text(cell.spread)}" if np.isfinite(cell.spread) else "")
+
+
 def interval_grid(cells: pd.DataFrame) -> Grid:
     """The interval of our mean, and its distance from the paper's value, of finished rows."""
     finished = cells[cells["ours"].notna()]

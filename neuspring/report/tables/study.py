@@ -32,6 +32,7 @@ from neuspring.report.tables.render import (
     as_latex,
     as_markdown,
     beyond_grid,
+    both_trainings,
     change_grid,
     differing_latex,
     failures_grid,
@@ -96,17 +97,18 @@ def write_study(
     known_methods: Iterable[str],
     folder: Path,
     left_out: LeftOut = NOTHING,
+    beside: Study | None = None,
 ) -> str:
     """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run".
 
-    `left_out` maps a method to the scenarios to which it does not apply.
+    `left_out` maps a method to the scenarios to which it does not apply. `beside` is the study that is shown next to this one.
     """
-    benchmark = set(known_methods)
-    methods = [method for method in study.rows.values() if method in benchmark]
-    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder)
+    benchmark, shown = set(known_methods), [*study.rows.values(), *(beside.rows.values() if beside else ())]
+    methods = [method for method in dict.fromkeys(shown) if method in benchmark]
+    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder, beside)
 
 
-def write_collected(name: str, study: Study, collected: Collected, folder: Path) -> str:
+def write_collected(name: str, study: Study, collected: Collected, folder: Path, beside: Study | None = None) -> str:
     """As `write_study`, from runs that are read already. Methods of other studies are ignored."""
     own = of_study(study, collected)
     scores, table, runs = counted(own), cells(study, own), accounted(study, own)
@@ -120,6 +122,7 @@ def write_collected(name: str, study: Study, collected: Collected, folder: Path)
     methods = tuple(dict.fromkeys([*names["method"], *absent]))
     Made(name=name, study=study, scenarios=names["scenario"], methods=methods, seeds=names["seed"], left_out=absent).save(folder)
     grids = _captioned(study, own, scores, table, means)
+    grids += both_trainings(study, table, beside, cells(beside, of_study(beside, collected))) if beside else []
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
     footnote = differing(own.records.values(), _labels(study))

@@ -331,8 +331,8 @@ def write(
     """Write the tables of a benchmark, and return the summary.
 
     Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), floors.csv
-    (errors in frame 0), ratios.csv, aims.csv, seeds.csv (spread over seeds), transfers.csv, summary.md. Where a method can be compared on
-    several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md shows them.
+    (errors in frame 0), ratios.csv, aims.csv, seeds.csv (spread over seeds), transfers.csv, summary.md. Where a method can be
+    compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md shows them.
     """
     scores = collected.scores
     usable, differences = compared(collected, baseline)
