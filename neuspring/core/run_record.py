@@ -63,7 +63,7 @@ class RunRecord:
     images: dict[str, Any] | None = None
     """How pictures were scored, or why they were not; None for scenarios without images."""
     floors: dict[str, float] = field(default_factory=dict)
-    """Metric -> its value in frame 0, which is given: what the distance between nodes adds to a score, m."""
+    """Metric -> its value in frame 0, which is given: how far points are from nodes without any motion, m."""
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Stage -> the settings that it read."""
     data_digest: str

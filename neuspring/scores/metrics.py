@@ -2,8 +2,8 @@
 
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
-Both follow the released evaluation of PhysTwin, and both have a floor, their value in frame 0. The bound track error has none: its
-points move with the nodes around them (`bound`). Metrics of pictures are in `images` and `lpips`.
+Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
+its points move with the nodes around them (`bound`). Metrics of pictures are in `images` and `lpips`.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
 
@@ -240,7 +240,7 @@ def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[
 
 
 def floors(observations: Observations) -> dict[str, float]:
-    """Every distance in frame 0, m, where the prediction is given: it measures how far nodes lie apart, and no motion.
+    """Every distance in frame 0, m, where the prediction is given: it measures how far points are from nodes, and no motion.
 
     Metrics without a value there are left out.
     """

@@ -115,8 +115,8 @@ def beyond_grid(study: Study, cells: pd.DataFrame) -> Grid:
             lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
     lines += _oracle_lines(cells, columns)
     note = (
-        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. CD and TE "
-        f"have a floor, their value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
+        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. TE has "
+        f"a floor, its value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
     )
     return Grid(title="Without a floor", note=note, stub=("Method", ""), columns=columns, lines=lines)
 

@@ -171,7 +171,7 @@ def floor_lines(runs: pd.DataFrame) -> list[str]:
         return []
     of = f", mean of {count} scenarios (least to largest)" if (count := found["scenario"].nunique()) > 1 else ""
     text = f"Floor in frame 0{of}: {', '.join(parts)}; TE bound 0 by construction."
-    return ["", f"{text} A floor is the distance between nodes, not motion, and part of every score of its metric."]
+    return ["", f"{text} A floor is no motion: it is how far points are from nodes."]
 
 
 def floors_of(runs: pd.DataFrame) -> pd.DataFrame:
