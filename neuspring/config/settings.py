@@ -94,7 +94,8 @@ class Config(Section):
     """What counts as one object in ratios to another method, whose intervals are over objects: every scenario, or all of a
     category together (the recordings of one cable)."""
     aims: tuple[Aim, ...] = ()
-    """What methods are to reach against others, declared before the run; tables say of each whether it is reached."""
+    """What methods are to reach against others, declared before the run; tables say of each whether it is reached, see
+    [aims](#aims)."""
     seeds: Seeds = (0,)
     """Seeds of the search and of a field's first weights; every method runs with the same seeds. On the command line:
     `--config seeds=0,1,2`."""

@@ -157,9 +157,11 @@ def _tables(study: Study, cells: pd.DataFrame) -> list[Block]:
 
 def _values(study: Study, cells: pd.DataFrame, title: str) -> Table:
     def first(cell: Any) -> Cell:
-        return Cell(text=str(cell.label), small=(cell.method, _runs(cell)))
+        return Cell(text=str(cell.label), small=(cell.method, _runs(cell), *([tables_cells.ORACLE_LINE] if cell.oracle else [])))
 
-    best = {name: _best(part["ours"], IN_STUDIES[str(name)]) for name, part in cells.groupby("metric")}
+    others = cells[~cells["oracle"]]
+    best = {name: _best(part["ours"], IN_STUDIES[str(name)]) for name, part in others.groupby("metric")}
+    cells = pd.concat([others, cells[cells["oracle"]]])
     return _table(cells, title, first, lambda cell, metric: _value(cell, metric, best[metric.name], bool(study.reference)))
 
 
@@ -198,12 +200,12 @@ def _value(cell: Any, metric: Metric, best: float, referenced: bool) -> Cell:
     spread = f" ± {number(cell.spread, digits)}" if np.isfinite(cell.spread) else ""
     interval = [f"[{number(cell.low, digits)}, {number(cell.high, digits)}]"] if np.isfinite(cell.low) else []
     text = f"{number(cell.ours, digits)}{spread}"
-    is_best = bool(round(cell.ours, digits) == best)
+    is_best = bool(round(cell.ours, digits) == best) and not cell.oracle
     return Cell(text=text, small=[*interval, *printed], chips=chips, best=is_best, mark="best of ours")
 
 
 def _changes(study: Study, cells: pd.DataFrame, title: str) -> Table:
-    others = cells[cells["label"] != study.baseline]
+    others = cells[(cells["label"] != study.baseline) & ~cells["oracle"]]
     return _table(others, title, lambda cell: Cell(text=str(cell.label)), _change)
 
 
