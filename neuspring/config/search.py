@@ -185,8 +185,8 @@ class Search(Section):
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
-    """Where the springs of controllers are at rest: in the rest shape, as released, or in frame 0, as grips hold what they hold. It
-    matters where a capture has a rest shape of its own."""
+    """Where springs of controllers have no force, if the rest shape is not frame 0. rest_shape: where the body's have none.
+    first_frame: in frame 0, as a hand takes hold of a body that is bent already."""
     clusters: Clusters = field(default_factory=Clusters)
     ranges: SearchRanges = field(default_factory=SearchRanges)
     scales: SearchScales = field(default_factory=SearchScales)

@@ -288,8 +288,9 @@ class Benchmark:
         return wanted if wanted in self.whole.methods else self.whole.methods[0]  # type: ignore[return-value]
 
     def methods_of(self, study: str) -> tuple[str, ...]:
-        """The chosen methods that stand in a study's rows."""
-        return tuple(dict.fromkeys(name for name in self.studies[study].rows.values() if name in self.methods))
+        """The chosen methods that stand in a study's rows, and in those of the study beside it."""
+        shown = [self.studies[name] for name in (study, self.studies[study].beside) if name]
+        return tuple(dict.fromkeys(name for rows in shown for name in rows.rows.values() if name in self.methods))
 
     def _row(self, name: str) -> ScenarioRow:
         """Of a scenario, whether it is chosen or not."""

@@ -129,6 +129,7 @@ def run(
         **content,
         # Why LPIPS was not computed names places on this machine: beside the content, not in it.
         images=_picture_facts(stages.records),
+        floors=metrics.floors(observations),
         run_key=key_of(content, stages.results | {"scores": digest_file(folder / "scores.parquet")}),
         source=observations.scenario.source,
         category=observations.scenario.category,
