@@ -54,8 +54,6 @@ class Method(Section):
     last frames through the simulator, see [last_frame](#last_frame)."""
     average_seeds: bool = False
     """Predict the mean of the trajectories of all seeds; this costs as many fits as there are seeds."""
-    oracle: bool = False
-    """The method is fitted on all frames, those of the future too. Tables show it on lines of its own, outside every comparison."""
 
     def __post_init__(self) -> None:
         if (self.search is None) == (self.model is None):
