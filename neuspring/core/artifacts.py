@@ -309,7 +309,7 @@ class Topology(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Material(Artifact):
-    """Physical parameters. Nodes have unit mass (1 kg), as in the released simulator, or masses of their own; forces scale with it."""
+    """Physical parameters. Nodes have 1 kg each, as in the released simulator, or masses of their own; forces scale with them."""
 
     kind: ClassVar[str] = "material"
     stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")

@@ -2,8 +2,8 @@
 
 Nodes are neighbors if no third one lies in the ball whose diameter joins them (the Gabriel graph, a part of Delaunay's). A node's
 share of a line, a sheet or a solid is taken as the sum of l^d over its neighbors' distances l, with d = 1, 2 or 3 the dimension
-that the cloud looks like. Nodes at an end, an edge or a surface have fewer neighbors, and so less mass, as their cells are cut there. On
-a chain this is exact: half of both gaps.
+that the cloud looks like. Nodes at an end, an edge or a surface have fewer neighbors, and so less mass, as their cells are cut
+there. On a chain this is exact: half of both gaps.
 """
 
 from __future__ import annotations
