@@ -31,6 +31,8 @@ class Simulation(Section):
     controller_path: Literal["linear", "cubic"] = "linear"
     """Motion of the controllers within a frame. linear: straight, as released. cubic: smooth through the positions in neighboring
     frames, the next one included (Catmull-Rom)."""
+    mass: Literal["unit", "volume"] = "unit"
+    """Mass of the nodes. unit: 1 kg each, as released. volume: by the space around each, with mean 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

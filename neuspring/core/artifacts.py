@@ -313,7 +313,7 @@ class Topology(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Material(Artifact):
-    """Physical parameters. Every node has unit mass (1 kg), as in the released simulator; forces scale with it."""
+    """Physical parameters. Nodes have 1 kg each, as in the released simulator, or masses of their own; forces scale with them."""
 
     kind: ClassVar[str] = "material"
     stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")
@@ -328,8 +328,11 @@ class Material(Artifact):
     """Distance below which approaching nodes collide, m."""
     drag_quadratic: float = 0.0
     """Velocity decay per speed, 1/m: the drag is dv/dt = -(drag + drag_quadratic |v|) v."""
+    mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
 
     def check(self) -> None:
+        if (self.mass <= 0).any():
+            raise InputError("material.mass", "must be positive", float(self.mass.min()))
         for name in ("stiffness", "dashpot"):
             values = getattr(self, name)
             if (values < 0).any():
@@ -408,6 +411,9 @@ class Twin(Artifact):
         springs, values = len(self.topology.springs), len(self.material.stiffness)
         if springs != values:
             raise InputError("twin", f"the material must have one stiffness per spring ({springs})", values)
+        nodes, masses = len(self.topology.nodes), len(self.material.mass)
+        if masses not in (0, nodes):
+            raise InputError("twin", f"the material must have one mass per node ({nodes}), or none", masses)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -60,6 +60,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         contact_e: of_twin
         contact_mu: of_twin
         distance: of_twin
+        inverse_mass: numbers
         springs: vectors
         near: lists
         near_lanes: lists

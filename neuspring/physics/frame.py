@@ -95,13 +95,26 @@ def kernels(real: Any, width: int) -> Kernels:
     @wp.func
     def update(model: Model, state: State, slot: int, i: int, g: int, force: Vector) -> Vector:
         """The velocity of node i after forces and drag."""
-        return updated(state.v[slot, i, g], force, model.gravity, model.substep[g], model.decay[g], model.quadratic[g])
+        return updated(
+            state.v[slot, i, g],
+            force,
+            model.gravity,
+            model.substep[g],
+            model.decay[g],
+            model.quadratic[g],
+            model.inverse_mass[i, g],
+        )
 
     @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """From dL/d(velocity after the forces) to dL/d(v, force, drag's factors)."""
         adj_v, adj_force, adj_decay, adj_quadratic = updated_adjoint(
-            state.after[step, i, g], adjoint.after[i, g], model.substep[g], model.decay[g], model.quadratic[g]
+            state.after[step, i, g],
+            adjoint.after[i, g],
+            model.substep[g],
+            model.decay[g],
+            model.quadratic[g],
+            model.inverse_mass[i, g],
         )
         if step >= model.fewest:
             adj_v = chosen(step, model.counts[g], adj_v, adjoint.v[i, g])
@@ -119,7 +132,7 @@ def kernels(real: Any, width: int) -> Kernels:
                 move_controller(model, state, step, slot, c, g)
             for i in range(model.nodes):  #  (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
                 add_row(model, state, slot, i, g)
-            for i in range(model.nodes):  #    (4)  w = v + dt (F + g),  v' = w delta / (1 + q |w|)
+            for i in range(model.nodes):  #    (4)  w = v + dt (F / m + g),  v' = w delta / (1 + q |w|)
                 after = update(model, state, slot, i, g, state.force[i, g])
                 state.force[i, g] = Vector()
                 state.after[inner, i, g] = after

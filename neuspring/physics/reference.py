@@ -1,6 +1,6 @@
 """The specification: a slow, readable float64 NumPy simulation, in the order of the released one. The Warp solver must agree.
 
-Everything is written one equation a line, unit masses, forward only; gradients are checked against its central differences.
+Everything is written one equation a line, forward only; gradients are checked against its central differences.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ class Scene:
     contact_distance: float
     simulation: Simulation
     drag_quadratic: float = 0.0
+    mass: np.ndarray | float = 1.0
+    """Of each node [N], or of all, kg."""
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:
@@ -47,6 +49,7 @@ class Scene:
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
             drag_quadratic=m.drag_quadratic,
+            mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
         )
 
 
@@ -140,9 +143,10 @@ def substep(
     dt = sim.substep
     force = spread @ spring_forces(scene, np.concatenate([x, hands]), np.concatenate([v, hands_velocity]))
     gravity = np.array([0.0, 0.0, -sim.gravity * sim.up_sign])
-    v = dragged(v + dt * (force + gravity), dt, scene.drag, scene.drag_quadratic)
+    mass = np.broadcast_to(scene.mass, len(v))
+    v = dragged(v + dt * (force / mass[:, None] + gravity), dt, scene.drag, scene.drag_quadratic)
     if pairs is not None:
-        v = collide(x, v, pairs, scene.contact_distance, *scene.contact)
+        v = collide(x, v, mass, pairs, scene.contact_distance, *scene.contact)
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
@@ -181,19 +185,20 @@ def candidates(x: np.ndarray, distance: float) -> np.ndarray:
     return np.argwhere(gap < distance)
 
 
-def collide(x: np.ndarray, v: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
-    """Jacobi impulses: each node takes the mean over its partners that are near and approach; unit masses."""
+def collide(x: np.ndarray, v: np.ndarray, mass: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
+    """Jacobi impulses: each node takes the mean over its partners that are near and approach."""
     i, j = pairs[:, 0], pairs[:, 1]
     dx, u = x[j] - x[i], v[j] - v[i]
     length = np.linalg.norm(dx, axis=1)
     hit = (length < distance) & (np.einsum("pk,pk->p", dx, u) < -APPROACH)
-    i, dx, u, length = i[hit], dx[hit], u[hit], length[hit]
+    i, j, dx, u, length = i[hit], j[hit], dx[hit], u[hit], length[hit]
     n = dx / np.maximum(length, MIN_TANGENT)[:, None]
     speed = np.einsum("pk,pk->p", u, n)
     un = speed[:, None] * n
     ut = u - un
     a = response(speed, np.linalg.norm(ut, axis=1), e, mu)
-    impulse = 0.5 * (-(1.0 + e) * un + (a - 1.0)[:, None] * ut)
+    share = mass[j] / (mass[i] + mass[j])
+    impulse = share[:, None] * (-(1.0 + e) * un + (a - 1.0)[:, None] * ut)
     total = np.zeros_like(v)
     np.add.at(total, i, impulse)
     hits = np.bincount(i, minlength=len(v))

@@ -39,6 +39,8 @@ class Parameters(NamedTuple):
     """[2]: the same between nodes."""
     distance: torch.Tensor
     """[1]: contact distance, m. No gradient: it only selects pairs."""
+    inverse_mass: torch.Tensor
+    """[N], 1/kg, or [1] for all nodes. No gradient: masses are not trained."""
 
 
 def _check(simulations: Sequence[Simulation]) -> None:
@@ -98,6 +100,7 @@ class FrameSolver:
         for kind in ("ground", "contact"):
             contact.fill(b, kind, getattr(values, kind))
         b.set_numbers("distance", values.distance[:, 0])
+        velocity.fill_masses(b, values.inverse_mass)
         if self.simulation.self_collision:
             self._reach = float(values.distance.max())
 
@@ -159,7 +162,7 @@ class FrameSolver:
         return self.forward(x, v, begin, end)
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for the contact distance."""
+        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for contact distance and masses."""
         b = self.buffers
         self.clear_adjoints()
         b.set_vectors("adj_x", self._stacked(adj_x))
@@ -167,7 +170,7 @@ class FrameSolver:
         self._run("backward", self.launch_backward)
         state = (b.get_vectors("adj_x", count=self.nodes), b.get_vectors("adj_v", count=self.nodes))
         own = (springs.gradient(b), velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
-        return *map(self._one, (*state, *own)), None
+        return *map(self._one, (*state, *own)), None, None
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""

@@ -1,6 +1,6 @@
 """Controller motion (path.py), and the velocity update by force, gravity and drag (the paper's equation 4) with its adjoint.
 
-w = v + dt (f + g),   v' = w delta / (1 + q |w|),   unit mass. Positions follow in position.py.
+w = v + dt (f / m + g),   v' = w delta / (1 + q |w|),   mass m, 1 kg if none is given. Positions follow in position.py.
 
 The drag is dv/dt = -(c + b |v|) v with c = drag [1/s] and b = drag_quadratic [1/m], a Bernoulli equation: from speed s it leaves
 1 / ((1/s + b/c) e^(ct) - b/c) after t. So a substep of drag alone is exact, and stable for any b >= 0 and dt, with
@@ -30,9 +30,9 @@ class Functions(NamedTuple):
 
     move_controller: Any
     updated: Any
-    """(v, force, gravity, dt, delta, q) -> v'."""
+    """(v, force, gravity, dt, delta, q, 1 / m) -> v'."""
     updated_adjoint: Any
-    """(v', dL/dv', dt, delta, q) -> dL/d(v), dL/d(force), dL/d(delta), dL/d(q)."""
+    """(v', dL/dv', dt, delta, q, 1 / m) -> dL/d(v), dL/d(force), dL/d(delta), dL/d(q)."""
 
 
 def pack(values: Mapping[str, torch.Tensor], substep: float | torch.Tensor) -> torch.Tensor:
@@ -51,7 +51,8 @@ def _mean_decay(z: torch.Tensor) -> torch.Tensor:
 
 
 def allocate(b: Buffers) -> None:
-    """The drag's factors, and their adjoints per node."""
+    """The masses' inverses, the drag's factors, and the factors' adjoints per node."""
+    b.add_numbers(inverse_mass=b.nodes)
     b.add_numbers(decay=None, quadratic=None, adj_decay=b.nodes, adj_quadratic=b.nodes)
 
 
@@ -59,6 +60,17 @@ def fill(b: Buffers, packed: torch.Tensor) -> None:
     """Take the drags [B, 2]."""
     for column, name in enumerate(("decay", "quadratic")):
         b.set_numbers(name, packed[:, column])
+
+
+def fill_masses(b: Buffers, inverse: torch.Tensor) -> None:
+    """Take the inverse masses [B, N], or [B, 1] for all nodes of a twin."""
+    b.set_numbers("inverse_mass", inverse.expand(-1, b.nodes))
+
+
+def pack_masses(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """The inverse masses [N], 1/kg, or [1] where all are 1 kg."""
+    mass = values.get("mass")
+    return values["drag"].detach().new_ones(1) if mass is None or not len(mass) else 1.0 / mass
 
 
 def gradient(b: Buffers) -> torch.Tensor:
@@ -95,8 +107,8 @@ def functions(real: Any, width: int) -> Functions:
         state.v[slot, model.nodes + c, g] = scaled(travel, model.inverse_time[g])
 
     @wp.func
-    def updated(v: Vector, force: Vector, gravity: Vector, dt: Number, decay: Number, quadratic: Number) -> Vector:
-        w = v + scaled(force + gravity, dt)
+    def updated(v: Vector, force: Vector, gravity: Vector, dt: Number, decay: Number, quadratic: Number, light: Number) -> Vector:
+        w = v + scaled(scaled(force, light) + gravity, dt)
         after = scaled(w, decay)
         if wp.max(quadratic) != zero:
             speed = root(dot(w, w))
@@ -105,7 +117,7 @@ def functions(real: Any, width: int) -> Functions:
         return after
 
     @wp.func
-    def updated_adjoint(after: Vector, adj_after: Vector, dt: Number, decay: Number, quadratic: Number):
+    def updated_adjoint(after: Vector, adj_after: Vector, dt: Number, decay: Number, quadratic: Number, light: Number):
         # In terms of v' alone, for |w| / (1 + q |w|) = |v'| / delta: the substep keeps neither w nor the force.
         along = dot(adj_after, after)
         adj_decay = wp.cw_div(along, decay)
@@ -118,6 +130,6 @@ def functions(real: Any, width: int) -> Functions:
             across = adj_after - scaled(after, wp.cw_mul(lost, wp.cw_div(along, floored(speed))))
             factor = wp.cw_mul(decay, ones - wp.cw_mul(lost, speed))
         h = scaled(across, factor)
-        return h, scaled(h, dt), adj_decay, -wp.cw_mul(adj_decay, speed)
+        return h, scaled(scaled(h, dt), light), adj_decay, -wp.cw_mul(adj_decay, speed)
 
     return Functions(move_controller, updated, updated_adjoint)

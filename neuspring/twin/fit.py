@@ -226,7 +226,8 @@ class TwinFit:
             if grown.load(simulation.substep) < enough:
                 return simulation.substeps
         topology = self.twin.topology
-        spectrum = stability.rest_spectrum(topology.springs, topology.nodes, topology.controllers, stiffness, dashpot)
+        graph = topology.springs, topology.nodes, topology.controllers
+        spectrum = stability.rest_spectrum(*graph, stiffness, dashpot, self.twin.material.mass)
         self._known = (spectrum, stiffness, dashpot)
         if spectrum.load(simulation.substep) < enough:
             return simulation.substeps

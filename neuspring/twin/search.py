@@ -31,6 +31,7 @@ from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.physics.path import waypoints
 from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
+from neuspring.twin.masses import volume_masses
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
 from neuspring.twin.proposals import Proposals
@@ -69,6 +70,8 @@ class SearchProblem:
     """Threads that simulate at the same time, on a CPU."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
+    mass: np.ndarray = field(init=False)
+    """Mass of each node [N], kg; empty: 1 each."""
     velocity: np.ndarray = field(init=False)
     """Velocity of each node in frame 0 [N, 3], m/s."""
     spacing: float = field(init=False)
@@ -80,6 +83,7 @@ class SearchProblem:
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
+        object.__setattr__(self, "mass", volume_masses(nodes) if self.simulation.mass == "volume" else np.zeros(0))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
         object.__setattr__(self, "spacing", node_spacing(nodes))
         object.__setattr__(self, "reach", controller_reach(nodes, hands))
@@ -194,7 +198,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     lonely = isolated(len(topology.nodes), topology.springs)
     if isolated_nodes == "penalise" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
-    material = homogeneous(values, count)
+    material = replace(homogeneous(values, count), mass=problem.mass)
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
 
 

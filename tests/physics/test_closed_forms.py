@@ -63,6 +63,38 @@ def test_free_fall_converges_at_first_order(engine: Engine, drag: float) -> None
     assert HALVING[0] < errors[0] / errors[1] < HALVING[1]
 
 
+# Masses ----------------------------------------------------------------------------------------------------------------
+
+
+def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engine: Engine) -> None:
+    """Of two nodes of 0.5 and 2 kg on a spring: q'' = -(Y / l0) (1/m_1 + 1/m_2) q, and m_1 v_1 + m_2 v_2 stays."""
+    mass, dt, steps = np.array([0.5, 2.0]), 1e-3, 200
+    body = scene(2, [(0, 1)], [0.2], stiffness=50.0, mass=mass, frame_time=dt)
+    x, v = engine(body, np.array([[0.0, 0, 0], [0.22, 0, 0]]), np.array([[0.3, 0.1, 0], [0.3, 0.1, 0]]), no_hands(steps))
+    momentum = np.einsum("n,fnk->fk", mass, v)
+    np.testing.assert_allclose(momentum, np.broadcast_to([0.75, 0.25, 0], momentum.shape), atol=ROUNDING)
+    # Along the axis: q_(k+1) = (2 - dt^2 w^2) q_k - q_(k-1) of symplectic Euler.
+    q = x[:, 1, 0] - x[:, 0, 0] - 0.2
+    np.testing.assert_allclose(q[2:], (2 - dt**2 * 250.0 * 2.5) * q[1:-1] - q[:-2], atol=1e-13)
+    assert q.min() < -0.019
+
+
+def test_masses_fall_alike(engine: Engine) -> None:
+    body = scene(3, mass=np.array([0.1, 1.0, 7.0]), drag=2.0, drag_quadratic=0.5, gravity=G, substeps=20, frame_time=0.1)
+    v = engine(body, np.zeros((3, 3)), np.zeros((3, 3)), no_hands(3))[1]
+    assert v[-1, 0, 2] < -1
+    np.testing.assert_array_equal(v[:, 0], v[:, 2])
+
+
+def test_nodes_of_other_mass_collide_with_their_momentum(engine: Engine) -> None:
+    """Head on: m_1 v_1 + m_2 v_2 stays, and the relative velocity becomes -e times what it was."""
+    mass, start = np.array([0.5, 2.0]), np.array([[1.0, 0, 0], [-0.5, 0, 0]])
+    body = scene(2, mass=mass, contact=(0.6, 0.3), contact_distance=0.02, self_collision=True)
+    v = engine(body, np.array([[0.0, 0, 0], [0.01, 0, 0]]), start, no_hands(1))[1][1]
+    np.testing.assert_allclose(mass @ v, mass @ start, atol=ROUNDING)
+    np.testing.assert_allclose(v[1] - v[0], -0.6 * (start[1] - start[0]), atol=ROUNDING)
+
+
 # Quadratic drag --------------------------------------------------------------------------------------------------------
 
 

@@ -60,6 +60,8 @@ def member(number: int, variant: str) -> Member:
         # Some twins have none, and must not notice those that have.
         body = replace(body, drag_quadratic=body.drag_quadratic * max(rng.uniform(-0.5, 2.0), 0.0))
     shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
+    if np.ndim(body.mass):
+        body = replace(body, mass=body.mass * rng.uniform(0.5, 2.0, body.nodes))
     places = waypoints(torch.tensor(hands + shift[2]), body.simulation).numpy()
     return Member(body, x + shift[0], v + shift[1], places)
 

@@ -26,12 +26,15 @@ WAYS = [
     pytest.param("cuda:0", True, id="cuda:0", marks=CUDA),
 ]
 """(device, threads): the CPU also runs the kernels of a GPU, so that every machine tests them."""
+MASSES = np.array([0.3, 1.7, 0.8, 2.1, 0.5, 0.6])
+"""Of the six nodes of lively scenes, kg."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "free": {"on_ground": False},
     "ground": {},
     "self-collision": {"self_collision": True},
     "thick air": {"drag_quadratic": 2.0},
     "all": {"self_collision": True, "up": "-z", "controller_velocity": True, "drag_quadratic": 0.5},
+    "masses": {"self_collision": True, "mass": MASSES},
     "cubic path": {"controller_path": "cubic", "controller_velocity": True},
 }
 """Options of `random_scene` that together reach every term."""
@@ -52,6 +55,7 @@ def scene(
     contact: tuple[float, float] = (0.7, 0.3),
     contact_distance: float = 0.02,
     drag_quadratic: float = 0.0,
+    mass: Any = 1.0,
     on_ground: bool = False,
     **simulation: Any,
 ) -> Scene:
@@ -70,6 +74,7 @@ def scene(
         contact_distance=contact_distance,
         simulation=Simulation(**options),
         drag_quadratic=drag_quadratic,
+        mass=mass,
     )
 
 
@@ -86,6 +91,7 @@ def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float6
         "contact_friction": scene.contact[1],
         "contact_distance": scene.contact_distance,
         "drag_quadratic": scene.drag_quadratic,
+        "mass": np.atleast_1d(scene.mass),
     }
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
@@ -194,5 +200,8 @@ def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
         nodes=x, controllers=controllers, springs=scene.springs, rest_lengths=scene.rest_lengths, labels=np.zeros(len(x), np.int32)
     )
     scalars = dict(zip(SCALARS, (scene.drag, *scene.ground, *scene.contact, scene.contact_distance), strict=True))
-    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, drag_quadratic=scene.drag_quadratic, **scalars)
+    mass = scene.mass if np.ndim(scene.mass) else ()
+    material = Material(
+        stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), drag_quadratic=scene.drag_quadratic, **scalars
+    )
     return Twin(topology=topology, material=material, simulation=scene.simulation)

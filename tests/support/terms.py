@@ -60,9 +60,18 @@ def kernels(width: int) -> Kernels:
         i, g = wp.tid()
         gathered_adjoint(model, state, adjoint, 0, 0, i, g)
 
-    def speed(v: vectors, force: vectors, gravity: vectors, dt: numbers, decay: numbers, quadratic: numbers, after: vectors):
+    def speed(
+        v: vectors,
+        force: vectors,
+        gravity: vectors,
+        dt: numbers,
+        decay: numbers,
+        quadratic: numbers,
+        light: numbers,
+        after: vectors,
+    ):
         i = wp.tid()
-        after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], quadratic[0])
+        after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], quadratic[0], light[i])
 
     def speed_adjoint(
         after: vectors,
@@ -70,13 +79,14 @@ def kernels(width: int) -> Kernels:
         dt: numbers,
         decay: numbers,
         quadratic: numbers,
+        light: numbers,
         adj_v: vectors,
         adj_force: vectors,
         adj_decay: numbers,
         adj_quadratic: numbers,
     ):
         i = wp.tid()
-        own_v, own_force, own_decay, own_quadratic = updated_adjoint(after[i], weight[i], dt[0], decay[0], quadratic[0])
+        own_v, own_force, own_decay, own_quadratic = updated_adjoint(after[i], weight[i], dt[0], decay[0], quadratic[0], light[i])
         adj_v[i] = own_v
         adj_force[i] = own_force
         adj_decay[i] = own_decay
