@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from neuspring.cli.tracking import add_results
+from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.stages import options as shared
 
@@ -15,23 +16,37 @@ def tables_options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring tables`."""
     add_results(parser)
     for name in ("scenarios", "methods"):
-        parser.add_argument(f"--{name}", nargs="+", required=True)
-    parser.add_argument("--seeds", nargs="+", type=int, required=True)
+        parser.add_argument(f"--{name}", nargs="+", default=())
+    parser.add_argument("--seeds", nargs="+", type=int, default=())
     parser.add_argument("--transfers", nargs="*", default=[], help="scenarios whose twins were rolled out on other recordings")
     parser.add_argument("--baseline", help="method that others are compared with (default: the first)")
+    parser.add_argument("--objects", choices=("scenario", "category"), default="scenario", help="what intervals of ratios are over")
+    parser.add_argument("--aims", metavar="JSON", default="[]", help="JSON: ratios that are aimed at (config/README.md, aims)")
+    parser.add_argument("--scores", type=Path, help="instead of run records: a scores.csv that tables wrote, on any machine")
     _add_left_out(parser)
     shared.add_output(parser, "folder to write to")
 
 
 def tables(a: Namespace) -> None:
     """`neuspring tables`."""
+    from neuspring.config.settings import Aim
     from neuspring.report import gallery
     from neuspring.report.tables import summary
-    from neuspring.scores.runs import collect, collect_transfers
+    from neuspring.report.tables.ratios import Judging
+    from neuspring.scores.runs import collect, collect_transfers, read_scores
 
+    aims = tuple(parse(Aim, row, "--aims") for row in shared.json_rows("--aims", a.aims))
+    judging = Judging(objects=a.objects, aims=aims)
+    if a.scores:
+        scores = read_scores(a.scores)
+        baseline = a.baseline or str(scores.runs["method"].iloc[0])
+        print(summary.write(replace(scores, left_out=_read_left_out(a.left_out)), baseline, a.output, judging=judging))
+        return
+    if not (a.scenarios and a.methods and a.seeds):
+        raise InputError("tables", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
     collected = collect(a.results, a.scenarios, a.methods, a.seeds, _read_left_out(a.left_out))
     transfers = collect_transfers(a.results, a.transfers, a.methods, a.seeds)
-    print(summary.write(collected, a.baseline or a.methods[0], a.output, transfers))
+    print(summary.write(collected, a.baseline or a.methods[0], a.output, transfers, judging))
     print(f"Tables: {a.output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
@@ -76,11 +91,12 @@ def study(a: Namespace) -> None:
     if a.study not in studies:
         raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(studies)}")
     definition, left_out = studies[a.study], _read_left_out(a.left_out)
+    beside = studies[definition.beside] if definition.beside else None
     if a.scores:
         collected = replace(read_scores(a.scores), left_out=left_out)
-        print(study.write_collected(a.study, definition, collected, a.output))
+        print(study.write_collected(a.study, definition, collected, a.output, beside))
     elif a.scenarios and a.methods and a.seeds:
-        print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out))
+        print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out, beside))
     else:
         raise InputError("study", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
 

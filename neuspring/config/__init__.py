@@ -1,7 +1,7 @@
 """Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
 
     settings                       the whole configuration (`Config`)
-    simulation, twin               integration; losses, search, field, fit
+    simulation, search, twin       integration; the zero-order search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
     baselines, spring_gaus, gs_dynamics
     gpus, tuning                   sharing GPUs; sweeps over settings
@@ -14,24 +14,30 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 
 from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
-from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
+from neuspring.config.rows import Carry, Kind, Method, ScenarioRow, SearchRow
+from neuspring.config.search import Clusters, Polish, Search, SearchRanges, SearchScales, SearchStart
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Clusters, Fit, Losses, Search, SearchRanges, SearchStart, SpringField
+from neuspring.config.twin import Fit, LastFrame, Losses, RestShape, SpringField
 
 __all__ = [
+    "Carry",
     "Clusters",
     "Config",
     "Fit",
     "Kind",
+    "LastFrame",
     "Losses",
     "Method",
     "Mocap",
+    "Polish",
     "ReleasedQuirks",
+    "RestShape",
     "ScenarioRow",
     "Search",
     "SearchRanges",
     "SearchRow",
+    "SearchScales",
     "SearchStart",
     "Simulation",
     "SpringField",

@@ -46,6 +46,10 @@ class Mocap(Section):
     """Nodes per ring."""
     rest_shape: Literal["first_frame", "straight"] = "first_frame"
     """Shape without forces. first_frame: frame 0, as in the paper. straight: a straight cable with the arc lengths of frame 0."""
+    grip: Literal["markers", "clamp"] = "markers"
+    """What holds an end. markers: its two markers, which leave its roll free. clamp: and a ring of `ring` points around each, which
+    turns with the direction of the two without spinning, so that direction and roll are held. With a straight rest shape set
+    `search.controller_rest: first_frame` too."""
     train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
     """Fraction of the frames that are for training, the first ones."""
 

@@ -102,7 +102,11 @@ def yaml_text(value: Any) -> str:
     if value == "":
         return '""'
     # Six digits: 1/6 is meant, not its last bit.
-    return repr(float(f"{value:.6g}")) if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    text = repr(float(f"{value:.6g}"))
+    # YAML reads 1e-15 as text.
+    return text if "." in text else text.replace("e", ".0e")
 
 
 def allowed(hint: Any) -> str:

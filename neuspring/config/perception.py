@@ -102,6 +102,11 @@ class Lift(Section):
     """none, as released: controllers are visible throughout. rigid: gaps are filled by the rigid motion of the hand."""
     controller_share: Annotated[float, Field(gt=0, le=1)] = 0.6
     """Part of the frames in which a controller must be seen, with `controller_gaps: rigid`."""
+    grip: Literal["points", "patch"] = "points"
+    """Where controllers are. points, as released: spread over hand and forearm, each where its track is. patch: spread over the
+    part of each hand that is near the object in frame 0, and moving rigidly with the hand: a grip keeps direction and roll."""
+    grip_reach: Positive = 0.03
+    """With `grip: patch`: how much farther from the object than a hand's nearest point its controllers may be in frame 0, m."""
     sequential_motion_filter: bool = False
     """Judge motions in the order of the points, each by the motions that were not dropped before it, as released."""
     coordinate_outliers: bool = False
@@ -141,6 +146,9 @@ class Sampling(Section):
 
     voxel: Positive = 0.005
     """Side of a voxel, m; one structure point is kept in each."""
+    nodes: Count | None = None
+    """Most structure points: the voxel grows from `voxel` until no more are left, so that a rope is sampled finer than a plush
+    animal at the same cost. null: `voxel` as it is."""
     surface: Count = 1024
     """Points drawn on the prior's surface."""
     interior: Count = 10000

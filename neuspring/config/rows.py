@@ -9,6 +9,8 @@ from neuspring.config.types import Count, Name, Section
 
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
+Carry = Literal["residuals", "state"]
+"""How the state at the last training frame is corrected: by interpolated residuals, or by least squares through the simulator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +23,8 @@ class SearchRow(Section):
     """What the row is, for people."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Search settings of this row alone (keys of `search`), on top of the configuration's."""
+    released_quirks: dict[str, Any] = field(default_factory=dict)
+    """Keys of `released_quirks`, on top of the configuration's, for this search and the fits that start from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +45,13 @@ class Method(Section):
     appearance: dict[str, Any] | None = None
     """Makes splats for this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
     methods share."""
-    carry_over: bool = False
-    """Correct the state at the last training frame by what was observed there, where training frames say that it helps."""
+    oracle: bool = False
+    """Fit all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error fitting
+    could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles only."""
+    carry_over: Carry | bool = False
+    """Prediction from the last frame: correct the state at the last training frame by what was observed until then, where training
+    frames say that it helps. residuals (or true): by the interpolated residuals of that frame. state: by least squares over the
+    last frames through the simulator, see [last_frame](#last_frame)."""
     pool: Literal["all", "others"] | None = None
     """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
     its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
@@ -58,9 +67,20 @@ class Method(Section):
         if (self.search is None) == (self.model is None):
             raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
         twins_only = {"fit": self.fit, "pool": self.pool, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
+        if self.carry_over is True:
+            # What older tables say.
+            object.__setattr__(self, "carry_over", "residuals")
+        if self.oracle and (not self.fit or self.carry_over):
+            rule = "an oracle has a fit, and is not carried over from the last training frame"
+            raise ValueError(f"oracle: {rule}; received fit {self.fit}, carry_over {self.carry_over}")
         misplaced = [name for name, value in twins_only.items() if value]
         if self.model and misplaced:
             raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to model {self.model}")
+
+    @property
+    def task(self) -> str:
+        """What a row does: predict from frame 0 on, or from the last training frame on (filtering), two tables that do not mix."""
+        return "prediction from the last frame" if self.carry_over else "future prediction"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,10 @@ from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.gpus import Gpus
 from neuspring.config.images import Images
 from neuspring.config.perception import Perception
+from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
-from neuspring.config.twin import Fit, Losses, Search
+from neuspring.config.twin import Fit, LastFrame, Losses
 from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
@@ -62,6 +63,24 @@ class Tracking(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Aim(Section):
+    """A ratio of errors that is aimed at: it is reached if the mean is at most `ratio` and the interval lies below `below`."""
+
+    method: Name
+    """The method whose error is above the line."""
+    baseline: Name
+    """The method whose error is below the line."""
+    task: Literal["reconstruction", "future", "transfer"] = "future"
+    """Training frames, future frames, or twins on other recordings."""
+    metric: Literal["chamfer", "track_error", "track_error_bound"] = "track_error"
+    """The error."""
+    ratio: Annotated[float, Field(gt=0.0)]
+    """Largest geometric mean."""
+    below: Annotated[float, Field(gt=0.0)] = 1.0
+    """The 95 % interval must lie below this; 1.05 stands for "not worse by 5 %"."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Config(Section):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
@@ -72,6 +91,12 @@ class Config(Section):
     the order of the method table."""
     compare_with: Name | None = None
     """The method that tables compare the others with; the first method where this is null or is not run."""
+    objects: Literal["scenario", "category"] = "scenario"
+    """What counts as one object in ratios to another method, whose intervals are over objects: every scenario, or all of a
+    category together (the recordings of one cable)."""
+    aims: tuple[Aim, ...] = ()
+    """What methods are to reach against others, declared before the run; tables say of each whether it is reached, see
+    [aims](#aims)."""
     seeds: Seeds = (0,)
     """Seeds of the search and of a field's first weights; every method runs with the same seeds. On the command line:
     `--config seeds=0,1,2`."""
@@ -110,6 +135,7 @@ class Config(Section):
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
+    last_frame: LastFrame = field(default_factory=LastFrame)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)

@@ -1,9 +1,10 @@
-"""Settings of the twin's two stages: the zero-order search and the first-order fit, with their losses."""
+"""Settings of the training losses and of the first-order fit."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+import itertools
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -23,123 +24,6 @@ class Losses(Section):
     """Weight of the smooth-L1 error of tracked points."""
     acceleration: NonNegative = 0.01
     """Weight of the acceleration loss, which the search alone uses, as in the released method."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchRanges(Section):
-    """Bounds of the zero-order search."""
-
-    stiffness: Range = (0.0, 1e5)
-    """Stiffness Y of the springs, N."""
-    object_radius: Range = (0.01, 0.05)
-    """Radius within which object nodes are joined, m."""
-    object_neighbours: Range = (10, 50)
-    """Most neighbors of an object node, itself included."""
-    controller_radius: Range = (0.01, 0.08)
-    """Radius within which a controller is joined to object nodes, m."""
-    controller_neighbours: Range = (10, 80)
-    """Most object nodes that a controller is joined to."""
-    ground_elasticity: Range = (0.0, 1.0)
-    """Restitution on the ground."""
-    ground_friction: Range = (0.0, 2.0)
-    """Friction on the ground."""
-    contact_elasticity: Range = (0.0, 1.0)
-    """Restitution between nodes."""
-    contact_friction: Range = (0.0, 2.0)
-    """Friction between nodes."""
-    contact_distance: Range = (0.01, 0.05)
-    """Distance at which nodes collide, m."""
-    drag: Range = (0.0, 20.0)
-    """Velocity decay, 1/s."""
-    dashpot: Range = (0.0, 200.0)
-    """Damping along springs, N s/m."""
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self):
-            low, high = getattr(self, spec.name)
-            if not 0 <= low < high:
-                raise ValueError(f"{spec.name}: 0 <= low < high is required, received [{low}, {high}]")
-        # An object node counts itself among its neighbors.
-        for name, least in (("object_neighbours", 2), ("controller_neighbours", 1)):
-            if getattr(self, name)[0] < least:
-                raise ValueError(f"{name}: at least {least} is required, received {getattr(self, name)[0]}")
-        if self.contact_distance[0] <= 0:
-            raise ValueError(f"contact_distance: must be positive, received {self.contact_distance[0]}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchStart(Section):
-    """Where the search starts; the defaults are those of the released configuration."""
-
-    stiffness: float = 3e4
-    """Stiffness Y of the springs, N."""
-    object_radius: float = 0.02
-    """Radius within which object nodes are joined, m."""
-    object_neighbours: float = 30
-    """Most neighbors of an object node, itself included."""
-    controller_radius: float = 0.04
-    """Radius within which a controller is joined to object nodes, m."""
-    controller_neighbours: float = 50
-    """Most object nodes that a controller is joined to."""
-    ground_elasticity: float = 0.5
-    """Restitution on the ground."""
-    ground_friction: float = 0.3
-    """Friction on the ground."""
-    contact_elasticity: float = 0.7
-    """Restitution between nodes."""
-    contact_friction: float = 0.3
-    """Friction between nodes."""
-    contact_distance: float = 0.02
-    """Distance at which nodes collide, m."""
-    drag: float = 3.0
-    """Velocity decay, 1/s."""
-    dashpot: float = 100.0
-    """Damping along springs, N s/m."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clusters(Section):
-    """Regions of a piecewise topology: agglomerative clustering of the nodes in the rest shape; a search row says how many."""
-
-    linkage: Literal["ward", "complete", "average", "single"] = "ward"
-    """Distance between regions; the two nearest regions merge. ward: the growth of their variance."""
-    connectivity: Annotated[int, Field(ge=0)] = 0
-    """Number of nearest neighbors in a graph of the nodes; only regions that this graph joins may merge. 0: any two may merge."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Search(Section):
-    """Zero-order stage: CMA-ES over homogeneous material and topology."""
-
-    rollouts: Count = 220
-    """Budget in candidate rollouts, the same for every method that is compared. The last generation may be cut short."""
-    sigma: Positive = 1 / 6
-    """Initial step in normalized variables."""
-    tied_rollouts: Annotated[int, Field(ge=0)] = 0
-    """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
-    candidate."""
-    freed_sigma: Positive = 0.06
-    """Step in normalized variables after `tied_rollouts`, when each region becomes free."""
-    stiffness_scale: Literal["linear", "log"] = "linear"
-    """Scale on which stiffness is normalized; log needs a positive lower bound."""
-    isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
-    """Nodes without any spring. repair: join them to their 3 nearest nodes. penalise: refuse the candidate. allow: leave them, as
-    released."""
-    clusters: Clusters = field(default_factory=Clusters)
-    ranges: SearchRanges = field(default_factory=SearchRanges)
-    start: SearchStart = field(default_factory=SearchStart)
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self.start):
-            low, high = getattr(self.ranges, spec.name)
-            value = getattr(self.start, spec.name)
-            if not low <= value <= high:
-                raise ValueError(f"start.{spec.name} = {value} lies outside ranges.{spec.name} = [{low}, {high}]")
-        if self.stiffness_scale == "log" and self.ranges.stiffness[0] <= 0:
-            rule = "stiffness_scale: log needs a positive lower bound of ranges.stiffness"
-            raise ValueError(f"{rule}, received {list(self.ranges.stiffness)}")
-        if self.tied_rollouts >= self.rollouts:
-            raise ValueError(f"tied_rollouts must be below rollouts ({self.rollouts}), received {self.tied_rollouts}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +48,34 @@ class SpringField(Section):
     """log: Y = Y0 exp(F). linear: Y = Y0 (1 + F)."""
     controllers: bool = True
     """The field covers controller springs too; false: they keep S0."""
+    texel_scale: Positive = 0.1
+    """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
     plane_smoothness: NonNegative = 0.0
-    """Weight of the mean squared difference of neighboring texels, m^2."""
+    """Weight of the mean squared difference of neighboring texels, in the loss unit (`fit.loss_unit`)."""
     weight_decay: NonNegative = 0.0
     """Decoupled weight decay of texels and MLP."""
+
+
+Weights = NonNegative | tuple[NonNegative, ...]
+"""A weight, or several of which the held-back tail of the training frames chooses one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestShape(Section):
+    """Unloaded shape X + u(X): a smooth displacement u of the recorded rest shape X, interpolated from a few nodes, the handles."""
+
+    handles: Annotated[int, Field(ge=0)] = 0
+    """Number of handles, farthest-point samples of nodes and controllers; 0: the rest shape is the recorded one."""
+    prior: Weights = 0.1
+    """Weight of the mean squared change of rest lengths (as strain) in the loss unit. A list: the held-back tail chooses."""
+    learning_rate: Positive = 0.01
+    """Learning rate of the handles: displacements in node spacings, and gradients as displacements at the next handle."""
+
+    def __post_init__(self) -> None:
+        if self.handles == 1:
+            raise ValueError("handles: at least 2 are required, or 0 for none, received 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,10 +88,18 @@ class Fit(Section):
     """Adam's learning rate of log stiffness per spring, or of the field's weights."""
     scalar_learning_rate: Positive | None = None
     """Learning rate of contact scalars, drag and common factors; null: `learning_rate`."""
+    factor_learning_rate: Positive | None = None
+    """Learning rate of drag and common factors; null: `scalar_learning_rate`."""
     rest_learning_rate: Positive | None = None
     """Learning rate of rest lengths that are free beside a field; null: `learning_rate`."""
     betas: tuple[Beta, Beta] = (0.9, 0.99)
     """Adam's decay rates of the first and the second moment."""
+    epsilon: Positive = 1e-15
+    """Adam's epsilon, in the loss unit. Gradients far below it are not followed. The released code has 1e-8, with
+    `loss_unit: meter`."""
+    loss_unit: Literal["spacing", "meter"] = "spacing"
+    """Unit of the loss that is differentiated, and of its penalties. spacing: squared node spacings (neuspring/twin/spacing.py), so
+    that a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
     schedule: Literal["constant", "cosine"] = "constant"
     """Learning rates over the epochs; cosine: they fall to a hundredth."""
     warmup_epochs: Annotated[int, Field(ge=0)] = 0
@@ -195,10 +109,14 @@ class Fit(Section):
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
     clip_gradient_norm: NonNegative = 0.0
-    """Largest norm of the gradient; 0 disables clipping."""
+    """Largest norm of the gradient, in the loss unit; 0 disables clipping."""
     output_bound: NonNegative = 0.0
     """Bound b of the change per spring: stiffness (and dashpot) stay within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""
+    global_stiffness: bool = False
+    """Train one common factor of all stiffnesses beside springs or field, without a bound, in every epoch."""
+    controller_factors: bool = False
+    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
@@ -208,6 +126,10 @@ class Fit(Section):
     """Bound of trained rest lengths: within exp(+-bound) of the distances in the rest shape; 0: rest lengths are fixed."""
     rest_lengths_by: Literal["springs", "field"] = "springs"
     """Trained rest lengths are free per spring, or an output of the field (for methods that have one)."""
+    rest_prior: Weights = 0.0
+    """Weight of the mean squared change of the logarithm of trained rest lengths, in the loss unit. A list: the held-back tail
+    chooses."""
+    rest_shape: RestShape = dataclasses.field(default_factory=RestShape)
     selection: Literal["training_loss", "tail"] = "training_loss"
     """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last
     training frames, on which nothing is fitted then; the start of the fit is a candidate too."""
@@ -223,3 +145,41 @@ class Fit(Section):
             raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
         if not self.field.triplane and self.field.fourier not in ("coordinates", "both"):
             raise ValueError(f"field.fourier: coordinates is required without the tri-plane, received {self.field.fourier}")
+        for name, weights in (("rest_prior", self.rest_prior), ("rest_shape.prior", self.rest_shape.prior)):
+            if isinstance(weights, tuple) and not weights:
+                raise ValueError(f"{name}: at least one weight is required")
+        if len(self.priors) > 1 and self.selection != "tail":
+            raise ValueError(f"several weights of a prior need selection: tail, received {self.selection}")
+
+    @property
+    def total_epochs(self) -> int:
+        """Epochs for all weights of the priors together."""
+        return self.epochs * len(self.priors)
+
+    @property
+    def priors(self) -> list[tuple[float, float]]:
+        """Weights (rest_prior, rest_shape.prior) that are tried, one pair after the other, each for `epochs` epochs."""
+        first, second = (
+            weights if isinstance(weights, tuple) else (weights,) for weights in (self.rest_prior, self.rest_shape.prior)
+        )
+        return list(itertools.product(first, second))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastFrame(Section):
+    """Prediction from the last training frame (methods with `carry_over: state`): the state there, from the frames before it."""
+
+    window: Count = 2
+    """Training frames over which the state is estimated, besides their first. Longer ones average noise, and hold on to what is
+    wrong with the model."""
+    modes: Annotated[int, Field(ge=1, le=64)] = 16
+    """Softest modes of the body along which its position and its velocity at the window's first frame may be corrected."""
+    iterations: Count = 2
+    """Levenberg-Marquardt steps with each weight; from the strongest to the weakest, each goes on where the one before it ended."""
+    weights: tuple[Positive, ...] = (1e-3, 1e-2, 1e-1)
+    """Weights of the prior that keeps the correction small, over the mean squared distance from the observed points; training
+    frames choose one."""
+
+    def __post_init__(self) -> None:
+        if not self.weights:
+            raise ValueError("weights: at least one is required")

@@ -23,6 +23,7 @@ from neuspring.core.npz import DamagedFile, read_npz, write_npz
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed"]
+ControllerPath = Literal["linear", "cubic"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 NO_REST_SHAPE = np.zeros((0, 3))
@@ -273,6 +274,8 @@ class Topology(Artifact):
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
+    controller_rest: str = "rest_shape"
+    """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
@@ -286,6 +289,8 @@ class Topology(Artifact):
             raise InputError("topology.springs", "object springs must come before controller springs")
         if (self.springs >= nodes).all(axis=1).any():
             raise InputError("topology.springs", "a spring may not join two controllers")
+        if self.controller_rest not in ("rest_shape", "first_frame"):
+            raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
         short = np.flatnonzero(~(self.rest_lengths > 0))
         if len(short):
             raise InputError(
@@ -308,7 +313,7 @@ class Topology(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Material(Artifact):
-    """Physical parameters. Every node has unit mass (1 kg), as in the released simulator; forces scale with it."""
+    """Physical parameters. Nodes have 1 kg each, as in the released simulator, or masses of their own; forces scale with them."""
 
     kind: ClassVar[str] = "material"
     stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")
@@ -321,8 +326,13 @@ class Material(Artifact):
     contact_friction: float
     contact_distance: float
     """Distance below which approaching nodes collide, m."""
+    drag_quadratic: float = 0.0
+    """Velocity decay per speed, 1/m: the drag is dv/dt = -(drag + drag_quadratic |v|) v."""
+    mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
 
     def check(self) -> None:
+        if (self.mass <= 0).any():
+            raise InputError("material.mass", "must be positive", float(self.mass.min()))
         for name in ("stiffness", "dashpot"):
             values = getattr(self, name)
             if (values < 0).any():
@@ -331,11 +341,20 @@ class Material(Artifact):
             value = getattr(self, name)
             if not np.isfinite(value):
                 raise InputError(f"material.{name}", "must be finite", value)
-        if self.drag < 0 or self.contact_distance <= 0:
-            raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
+        if min(self.drag, self.drag_quadratic) < 0 or self.contact_distance <= 0:
+            rule = "drag >= 0, drag_quadratic >= 0 and contact_distance > 0 are required"
+            raise InputError("material", rule, (self.drag, self.drag_quadratic, self.contact_distance))
 
 
-SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
+SCALARS = (
+    "drag",
+    "ground_elasticity",
+    "ground_friction",
+    "contact_elasticity",
+    "contact_friction",
+    "contact_distance",
+    "drag_quadratic",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -356,6 +375,8 @@ class Simulation:
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
     """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
+    controller_path: ControllerPath = "linear"
+    """How controllers move within a frame: straight, as in the released simulator, or along a cubic through neighboring frames."""
 
     def __post_init__(self) -> None:
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
@@ -363,6 +384,8 @@ class Simulation:
             raise InputError("simulation", rule, self)
         if self.up not in ("+z", "-z"):
             raise InputError("simulation.up", "must be '+z' or '-z'", repr(self.up))
+        if self.controller_path not in ("linear", "cubic"):
+            raise InputError("simulation.controller_path", "must be 'linear' or 'cubic'", repr(self.controller_path))
 
     @property
     def substep(self) -> float:
@@ -388,6 +411,9 @@ class Twin(Artifact):
         springs, values = len(self.topology.springs), len(self.material.stiffness)
         if springs != values:
             raise InputError("twin", f"the material must have one stiffness per spring ({springs})", values)
+        nodes, masses = len(self.topology.nodes), len(self.material.mass)
+        if masses not in (0, nodes):
+            raise InputError("twin", f"the material must have one mass per node ({nodes}), or none", masses)
 
     @property
     def counts(self) -> dict[str, int]:

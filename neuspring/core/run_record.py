@@ -62,6 +62,8 @@ class RunRecord:
     """What a reader of the scores must know although the run did not fail."""
     images: dict[str, Any] | None = None
     """How pictures were scored, or why they were not; None for scenarios without images."""
+    floors: dict[str, float] = field(default_factory=dict)
+    """Metric -> its value in frame 0, which is given: how far points are from nodes without any motion, m."""
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Stage -> the settings that it read."""
     data_digest: str
@@ -105,6 +107,11 @@ class RunRecord:
     def model(self) -> str:
         """The baseline's model; empty for twins."""
         return str(self.variant.get("model") or "")
+
+    @property
+    def oracle(self) -> bool:
+        """Whether the method has seen all frames, so that it takes no part in comparisons."""
+        return bool(self.variant.get("oracle"))
 
     @property
     def content(self) -> dict[str, Any]:

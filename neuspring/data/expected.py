@@ -55,7 +55,9 @@ def _filmed(row: ScenarioRow, config: Config) -> Expected:
 
 def _resampled(body: Expected, config: Config) -> Expected:
     """A body with one node per voxel. Most nodes lie on the surface, so their number goes with 1 / spacing^2."""
-    voxel = config.perception.sample.voxel
+    voxel, most = config.perception.sample.voxel, config.perception.sample.nodes
+    if most is not None:
+        voxel = max(voxel, body.spacing * math.sqrt(body.nodes / most))
     return replace(body, nodes=max(round(body.nodes * (body.spacing / voxel) ** 2), 2), spacing=voxel)
 
 
@@ -79,7 +81,7 @@ def _mocap(row: ScenarioRow, config: Config) -> Expected:
     return Expected(
         nodes=rings * mocap.ring,
         spacing=CABLE / (rings - 1),
-        controllers=GRIPS,
+        controllers=GRIPS * (1 + (mocap.ring if mocap.grip == "clamp" else 0)),
         frames=min(recorded, mocap.frames or recorded),
         frame_rate=RECORD_RATE / mocap.stride,
     )

@@ -1,8 +1,9 @@
 """Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
 
 One pickle is one recording: positions [T, 3, n], float64, meters, 100 Hz, z up; released as nested lists, arrays are accepted
-too. Markers run along the cable. Robots hold the two at either end: they are the controllers. The others are observed. There is no
-surface, so the body is sampled as rings around a smooth centerline through the markers of frame 0.
+too. Markers run along the cable. Robots hold the two at either end: they are the controllers, with `grip: clamp` each with a ring
+of points around it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline
+through the markers of frame 0.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data.departure import Departure, broken, refuse, unusual
+from neuspring.data.grips import circle, clamps
 from neuspring.data.unpickle import load_pickle
 
 RECORD_RATE = 100.0
@@ -56,14 +58,24 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         rule = f"mocap.train_fraction = {settings.train_fraction} must leave a frame after frame 0 for training"
         raise InputError(file, rule, f"{train_end} of {frames} frames", "Choose a larger fraction.")
 
-    controllers = [0, 1, count - 2, count - 1]
+    held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
     body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
     _require_distance(file, markers[0], body)
     rest_shape = NO_REST_SHAPE
     if settings.rest_shape == "straight":
         line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
-        rest_shape = np.concatenate([line[2:-2], rest_body, line[controllers]])
+        rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
+    controllers = markers[:, held]
+    if settings.grip == "clamp":
+        # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
+        recorded = np.asarray(raw)[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
+        normals = _transported_normals(centreline(markers[0], settings.spacing, settings.rings)[1])[[0, -1]]
+        turning = clamps(recorded, normals, settings.radius, settings.ring, MIN_DISTANCE, str(file))
+        controllers = np.concatenate([controllers, turning[:: settings.stride]], axis=1)
+        if len(rest_shape):
+            around = circle(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), settings.radius, settings.ring)
+            rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
     motion_valid = np.ones(observed.shape[:2], dtype=bool)
     motion_valid[-1] = False
     return Observations(
@@ -82,7 +94,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         object_points=observed,
         object_visibility=np.ones(observed.shape[:2], dtype=bool),
         object_motion_valid=motion_valid,
-        controller_points=markers[:, controllers],
+        controller_points=controllers,
         surface_points=body,
         interior_points=np.zeros((0, 3)),
         tracks=observed,

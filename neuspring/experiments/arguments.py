@@ -27,7 +27,10 @@ class Arguments:
 
     def tables(self, output: str = "") -> list[str]:
         """Of `neuspring tables`; into `output` instead of the folder of tables."""
-        return [*self._runs(output or self.folder), *self._transfers(), "--baseline", self._benchmark.compared_with]
+        return [
+            *(*self._runs(output or self.folder), *self._transfers(), "--baseline", self._benchmark.compared_with),
+            *self._judged(),
+        ]
 
     def study(self, name: str) -> list[str]:
         """Of `neuspring study`."""
@@ -64,6 +67,11 @@ class Arguments:
     def _transfers(self) -> list[str]:
         sources = [name for name in self._whole.transfers or {} if name in self._whole.scenarios]
         return ["--transfers", *sources] if sources else []
+
+    def _judged(self) -> list[str]:
+        """What ratios are over, and aims; nothing where there is nothing to say."""
+        objects = [] if self._config.objects == "scenario" else ["--objects", self._config.objects]
+        return [*objects, *(["--aims", json.dumps(plain(self._config)["aims"])] if self._config.aims else [])]
 
     def _left_out(self) -> list[str]:
         """Which methods do not apply to which scenarios, so that nothing is missing there."""

@@ -19,6 +19,7 @@ from neuspring.config import (
     Config,
     Fit,
     Method,
+    ReleasedQuirks,
     ScenarioRow,
     Search,
     SearchRow,
@@ -99,6 +100,11 @@ def fit_of(config: Config, method: Method, name: str) -> Fit:
 def search_of(config: Config, row: SearchRow, name: str) -> Search:
     """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
     return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
+
+
+def quirks_of(config: Config, row: SearchRow, name: str) -> ReleasedQuirks:
+    """The quirks of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
+    return parse(ReleasedQuirks, _overlaid(config.released_quirks, row.released_quirks), f"search {name}, released_quirks")
 
 
 def section_of(config: Config, method: Method, name: str) -> Any:
@@ -247,10 +253,16 @@ class Benchmark:
                     # Named weights that are missing or wrong are an error before the first job.
                     BASELINES[method.model].features(section)
             appearance_of(self.config, method, name)
+        if method.search:
+            quirks_of(self.config, self.searches[method.searched], method.search)
         if not (method.search and method.fit):
             return
         wanted_low, wanted_high = search_of(self.config, self.searches[method.searched], method.search).ranges.stiffness
-        low, high = fit_of(self.config, method, name).stiffness_range
+        fit = fit_of(self.config, method, name)
+        if method.oracle and fit.selection == "tail":
+            rule = "an oracle is fitted on all frames and holds none back"
+            raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")
+        low, high = fit.stiffness_range
         if not low <= wanted_low < wanted_high <= high:
             rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
@@ -263,7 +275,7 @@ class Benchmark:
         return next((row.pool for row in rows.values() if row.search and row.searched == job.search), None)
 
     def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
-        """The fits (method, seed) of a scenario that share launches: those of equal horizon, where they are not too few.
+        """The fits (method, seed) of a scenario that share launches: those in step (horizon, frames), if not too few.
 
         None where `twins_per_launch` is 1, or auto on a GPU.
         """
@@ -273,13 +285,13 @@ class Benchmark:
         # A fit on several recordings takes turns between them, and shares launches with nobody.
         rows = [name for name, method in self.fits.items() if self.applies(name, scenario) and not method.pool]
         seeds = self.config.seeds
-        alike = Counter(self._horizons[name] for name in rows)
-        return tuple((name, seed) for name in rows if alike[self._horizons[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
+        alike = Counter(self._steps[name] for name in rows)
+        return tuple((name, seed) for name in rows if alike[self._steps[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
 
     @cached_property
-    def _horizons(self) -> dict[str, int]:
-        """Frames per step of each fit."""
-        return {name: fit_of(self.config, method, name).horizon for name, method in self.fits.items()}
+    def _steps(self) -> dict[str, tuple[int, bool]]:
+        """Of each fit: frames per step, and whether it goes over all frames (an oracle) or over those before the split."""
+        return {name: (fit_of(self.config, method, name).horizon, method.oracle) for name, method in self.fits.items()}
 
     @property
     def tuned(self) -> tuple[str, ...]:
@@ -293,8 +305,9 @@ class Benchmark:
         return wanted if wanted in self.whole.methods else self.whole.methods[0]  # type: ignore[return-value]
 
     def methods_of(self, study: str) -> tuple[str, ...]:
-        """The chosen methods that stand in a study's rows."""
-        return tuple(dict.fromkeys(name for name in self.studies[study].rows.values() if name in self.methods))
+        """The chosen methods that stand in a study's rows, and in those of the study beside it."""
+        shown = [self.studies[name] for name in (study, self.studies[study].beside) if name]
+        return tuple(dict.fromkeys(name for rows in shown for name in rows.rows.values() if name in self.methods))
 
     def _row(self, name: str) -> ScenarioRow:
         """Of a scenario, whether it is chosen or not."""
@@ -376,10 +389,12 @@ def _tuned(whole: Config) -> tuple[str, ...]:
 
 
 def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
-    """Method with a fit -> the first row of the table with the same search, stage and settings."""
+    """Method with a fit -> the first row of the table with the same search, stage, frames (all for an oracle) and settings."""
     first: dict[tuple[Any, ...], str] = {}
     fitted = {name: method for name, method in methods.items() if method.fit}
-    return {name: first.setdefault((m.search, m.pool, m.fit, fit_of(config, m, name)), name) for name, m in fitted.items()}
+    return {
+        name: first.setdefault((m.search, m.pool, m.fit, m.oracle, fit_of(config, m, name)), name) for name, m in fitted.items()
+    }
 
 
 def _pools(

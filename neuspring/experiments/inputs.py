@@ -92,13 +92,13 @@ class Inputs:
     def transfers(self) -> list[str]:
         """Records of transfers: per source, method and seed.
 
-        Carrying over and averaging concern the future of the same recording, so such methods are not transferred.
+        Carrying over, averaging and oracles concern the future of the same recording, so such methods are not transferred.
         """
         methods = [
             name
             for name, method in self.benchmark.methods.items()
             if (method.search or (method.model and BASELINES[method.model].transfers))
-            and not (method.carry_over or method.average_seeds)
+            and not (method.carry_over or method.average_seeds or method.oracle)
         ]
         return [
             f"{self.results}/{scenario}/{method}/{seed}/transfer.json"
@@ -211,7 +211,7 @@ class Inputs:
                 "kind": self.benchmark.fits[name].fit,
                 "settings": self._settings("fit", source, name),
                 "fits": {},
-            }
+            } | ({"oracle": True} if self.benchmark.fits[name].oracle else {})
             rows.setdefault(name, row)["fits"][self._record(member, name, "fit")] = self.search_of_fit(member)
         return _json(list(rows.values()))
 
@@ -277,8 +277,17 @@ class Inputs:
             "fit": method.fit or "none",
             "carry_over": method.carry_over,
             "average_seeds": method.average_seeds,
-        } | ({"pool": method.pool} if method.pool else {})
-        return _json(switches | settings)
+        }
+        if method.pool:
+            switches["pool"] = method.pool
+        if method.oracle:
+            # Named only where it is one, so that other runs' records stay as they were.
+            switches["oracle"] = True
+        if method.carry_over:
+            switches["task"] = method.task
+        quirks = self.benchmark.searches[method.searched].released_quirks
+        on = {"released_quirks": sorted(key for key, value in quirks.items() if value)} if quirks else {}
+        return _json(switches | on | settings)
 
     # --- settings and code
 
@@ -286,7 +295,7 @@ class Inputs:
         """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
         # Thousands of jobs share a few texts: those of one source and one row.
         source = self.benchmark.scenarios[job.scenario].source
-        own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage)
+        own = {"search": "search", "fit": "method", "train": "method", "rollout": "method", "appearance": "looks"}.get(stage)
         return self._settings(stage, source, getattr(job, own) if own else "")
 
     @functools.cache  # noqa: B019 - one benchmark a process
@@ -302,18 +311,23 @@ class Inputs:
             return _json(select(config, declared.reads))
         if stage == "observe":
             return _json(select(config, ("perception.sample", "perception.seed") if declared.films else declared.reads))
+        if stage == "rollout" and self.benchmark.methods[name].carry_over != "state":
+            return "{}"
         if stage == "train":
             return self._training_settings(name)
         values = select(config, STAGES[stage].reads)
         if stage == "search":
             row = self.benchmark.searches[name]
             values["search"] = plain(benchmarks.search_of(config, row, name))
+            values["released_quirks"] = plain(benchmarks.quirks_of(config, row, name))
             if row.clusters == 1:
                 # What concerns regions alone changes nothing here, so it must not start the search again.
                 values["search"] = {key: value for key, value in values["search"].items() if key not in REGIONS_ONLY}
         if stage == "fit":
             method = self.benchmark.fits[name]
             values["fit"] = plain(benchmarks.fit_of(config, method, name))
+            search = method.searched
+            values["released_quirks"] = plain(benchmarks.quirks_of(config, self.benchmark.searches[search], search))
             if method.fit == "springs":
                 del values["fit"]["field"]
         if stage == "appearance":

@@ -18,7 +18,7 @@ from neuspring.experiments import benchmark as benchmarks
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.plan import History, Kind, Planned
-from neuspring.experiments.size import TRAIN, Size, Sizes
+from neuspring.experiments.size import TRAIN, Body, Size, Sizes
 from neuspring.stages import STAGES
 
 CARRY_OVER = 4
@@ -129,7 +129,7 @@ class Needs:
         # Thousands of jobs share a few rows.
         config = benchmark.config
         self._rollouts = cache(lambda name: benchmarks.search_of(config, benchmark.searches[name], name).rollouts)
-        self._epochs = cache(lambda name: benchmarks.fit_of(config, benchmark.fits[name], name).epochs)
+        self._epochs = cache(lambda name: benchmarks.fit_of(config, benchmark.fits[name], name).total_epochs)
 
     @cached_property
     def history(self) -> History:
@@ -172,7 +172,7 @@ class Needs:
             return int(self._rollouts(wildcards.search) * self._training_frames(wildcards))
         together = benchmark.fits_together(wildcards.scenario) if rule in ("fits", "fit") else ()
         if rule == "fits":
-            return int(sum(self._epochs(method) for method, _ in together) * (body.train_end - 1))
+            return int(sum(self._epochs(method) * self._fitted(method, body) for method, _ in together))
         if rule == "fit":
             if (wildcards.method, int(wildcards.seed)) in together:
                 return 1  # what runs together is the work of `fits`
@@ -187,7 +187,12 @@ class Needs:
         """Frames after frame 0 that a search or a fit is judged on, on all recordings that count."""
         kind = self._benchmark.pool_kind(job)
         counted = [*([] if kind == "others" else [job.scenario]), *(self._benchmark.pools[job.scenario] if kind else ())]
-        return sum(self.sizes.body(name).train_end - 1 for name in counted)
+        bodies = [self.sizes.body(name) for name in counted]
+        return sum(self._fitted(job.method, body) if hasattr(job, "method") else body.train_end - 1 for body in bodies)
+
+    def _fitted(self, method: str, body: Body) -> int:
+        """Frames that an epoch of a fit simulates on one recording."""
+        return (body.frames if self._benchmark.fits[method].oracle else body.train_end) - 1
 
     def amount(self, rule: str, wildcards: Any) -> tuple[float | None, Size | None]:
         """A job's work in the unit of its times, and, if it simulates, the size of its twins.

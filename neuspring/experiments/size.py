@@ -14,7 +14,8 @@ forward and backward), frames (rollout, transfer). Sources, best first:
 | others | | median of the same search on other scenarios of this folder |
 | settings | N and C of observations.npz, else as the source expects them, with the search's start | the search's start |
 
-The search's start has Y [N], dashpot [N s/m], radii r, r_c [m] and neighbor counts n, n_c. On a surface with a node every h meters,
+The search's start has Y [N], dashpot [N s/m], radii r, r_c [m; without the reach of controllers where `search.lengths` is spacing]
+and neighbor counts n, n_c. On a surface with a node every h meters,
 
     springs = N d / 2 + C min(n_c, pi (r_c / h)^2),        d = min(n - 1, pi (r / h)^2) neighbors of a node,
     substeps = frame time / dt,                            dt^2 K + 2 dt D = 4 safety,  K = d Y / l0,  D = d dashpot,
@@ -85,7 +86,8 @@ class Sizes:
 
     def _size(self, scenario: str, search: str, candidates: bool) -> Size:
         config, body = self._benchmark.config, self.body(scenario)
-        settings = benchmarks.search_of(config, self._benchmark.searches[search], search)
+        row = self._benchmark.searches[search]
+        settings, quirks = benchmarks.search_of(config, row, search), benchmarks.quirks_of(config, row, search)
         springs, substeps = expected_size(body, settings, config.simulation)
         springs_from, substeps_from = body.source, SETTINGS
         facts = self._recorded(scenario, search)
@@ -96,7 +98,7 @@ class Sizes:
             springs_from = substeps_from = RECORD
         elif others := self._substeps_of_others(search):
             substeps, substeps_from = others, OTHERS
-        fixed = RELEASED_SUBSTEPS if config.released_quirks.frame_time_667 else config.simulation.substeps
+        fixed = RELEASED_SUBSTEPS if quirks.frame_time_667 else config.simulation.substeps
         if fixed != "auto":
             substeps, substeps_from = float(fixed), FIXED
         return Size(springs=springs, substeps=substeps, springs_from=springs_from, substeps_from=substeps_from)
@@ -146,8 +148,10 @@ class Sizes:
 def expected_size(body: Expected, search: Search, simulation: Simulation) -> tuple[float, float]:
     """(springs, substeps) of a body at the start of a search, by the equations above; at most `simulation.max_substeps`."""
     start, spacing = search.start, body.spacing
-    neighbours = min(start.object_neighbours - 1, math.pi * (start.object_radius / spacing) ** 2)
-    held = min(start.controller_neighbours, math.pi * (start.controller_radius / spacing) ** 2, body.nodes)
+    # How far controllers are from the nodes is not known before there are observations.
+    unit = spacing if search.lengths == "meter" else 1.0
+    neighbours = min(start.object_neighbours - 1, math.pi * (start.object_radius / unit) ** 2)
+    held = min(start.controller_neighbours, math.pi * (start.controller_radius / unit) ** 2, body.nodes)
     neighbours = min(neighbours, body.nodes - 1)
     length = 2 / 3 * spacing * math.sqrt(neighbours / math.pi)
     stiffness, damping = neighbours * start.stiffness / length, neighbours * start.dashpot

@@ -16,7 +16,7 @@ from neuspring.perception.sample import on_table, structure
 def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: ShapePrior, settings: Perception) -> Observations:
     """What every method reads. Points that are invisible are zero."""
     up = 1.0 if capture.description.up == "+z" else -1.0
-    indices, surface, interior = structure(lifted, prior, settings.sample, up, settings.seed)
+    indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed)
     visible = lifted.object_visibility[:, indices]
     points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
     origin = {
@@ -24,6 +24,8 @@ def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: Sh
         "lift": lifted.backend,
         "shape prior": prior.backend,
     }
+    if settings.sample.nodes is not None:
+        origin["node spacing"] = f"{voxel:.6g} m"
     return Observations(
         scenario=Scenario(
             name=row.scenario,

@@ -1,4 +1,4 @@
-"""Which points of the hands move the object: seen throughout, moving with their neighbors, spread over the hands."""
+"""Which points of the hands move the object: seen throughout and spread over the hands, or where hands grip, moving rigidly."""
 
 from __future__ import annotations
 
@@ -19,38 +19,65 @@ LEAST_FOR_POSE = 3
 
 
 def choose_controllers(
-    points: np.ndarray, visible: np.ndarray, valid: np.ndarray, settings: Lift, where: str
+    points: np.ndarray, visible: np.ndarray, valid: np.ndarray, cloud: np.ndarray, settings: Lift, where: str
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Controllers [T, C, 3], m, and facts about them, of hand tracks [T, n, 3].
+    """Controllers [T, C, 3], m, and facts about them, of hand tracks [T, n, 3] and the object's points of frame 0 `cloud` [P, 3].
 
     `controller_gaps: none`, as released: points visible in all frames whose motion never disagrees. `rigid`: points seen in at
     least `controller_share` of the frames; where one is not seen it goes where the rigid motion of its hand takes it. At most
-    `controllers` points, each the farthest from those before. Raises InputError if fewer than `least_controllers` remain.
+    `controllers` points, each the farthest from those before. `grip: patch` takes them from `patches` instead. Raises InputError if
+    fewer than `least_controllers` remain.
     """
     eligible, filled = visible.all(axis=0) & valid[:-1].all(axis=0), 0.0
+    trusted = visible & np.concatenate([visible[:1], valid[:-1]])
+    facts = {}
     if settings.controller_gaps == "rigid":
-        trusted = visible & np.concatenate([visible[:1], valid[:-1]])
         eligible = trusted.mean(axis=0) >= settings.controller_share
         filled = float(1.0 - trusted[:, eligible].mean()) if eligible.any() else 0.0
+    count = int(eligible.sum())
+    if settings.grip == "patch" and points.shape[1]:
+        candidates, misfit = patches(points, trusted, cloud, settings.grip_reach)
+        facts = {"patch_points": float(candidates.shape[1]), "patch_misfit_mm": 1e3 * misfit}
+        filled = 0.0
+    elif settings.controller_gaps == "rigid":
         candidates = fill_rigidly(points[:, eligible], trusted[:, eligible])
     else:
         candidates = points[:, eligible]
-    count = candidates.shape[1]
-    if count < settings.least_controllers:
-        rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
-        remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
-        raise InputError(where, rule, f"{count} of {visible.shape[1]}", remedy)
+    if candidates.shape[1] < settings.least_controllers:
+        if settings.grip == "patch":
+            rule = f"at least {settings.least_controllers} points of the hands must lie near the object in frame 0"
+            remedy = "perception.lift has grip_reach and least_controllers."
+        else:
+            rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
+            remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
+        raise InputError(where, rule, f"{candidates.shape[1]} of {visible.shape[1]}", remedy)
     controllers = candidates[:, farthest(candidates[0], settings.controllers)]
-    facts = {"controllers": float(controllers.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
+    facts |= {"controllers": float(controllers.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
     return controllers, facts
 
 
-def fill_rigidly(points: np.ndarray, trusted: np.ndarray) -> np.ndarray:
-    """Points [T, n, 3] with untrusted entries replaced by the rigid motion of their hand from frame 0.
+def patches(points: np.ndarray, trusted: np.ndarray, cloud: np.ndarray, reach: float) -> tuple[np.ndarray, float]:
+    """The points of each hand that are near the object in frame 0, moving rigidly with their hand: [T, n', 3], m; and how far
+    trusted points are from that motion, m (root mean square).
 
-    The motion of a frame is the least-squares one of the hand's trusted points; with fewer than three it is that of the last
-    frame that had them.
+    A point at distance d from `cloud` is near if d <= reach + the least such distance of its hand: a hand that has yet to come
+    grips with what is foremost. A hand's motion is that of its trusted points, as in `fill_rigidly`; all others follow it too, so
+    the fingertips that are hidden later still grip.
     """
+    rigid = fill_rigidly(points, np.zeros_like(trusted), trusted)
+    distance = cKDTree(cloud).query(points[0])[0]
+    near = [hand[distance[hand] <= distance[hand].min() + reach] for hand in hands_of(points[0])]
+    misfit = float(np.sqrt(np.mean(np.sum((rigid - points)[trusted] ** 2, axis=1))))
+    return rigid[:, np.concatenate(near)], misfit
+
+
+def fill_rigidly(points: np.ndarray, kept: np.ndarray, trusted: np.ndarray | None = None) -> np.ndarray:
+    """Points [T, n, 3] with the entries that are not `kept` [T, n] replaced by the rigid motion of their hand from frame 0.
+
+    The motion of a frame is the least-squares one of the hand's points that are `trusted` [T, n] (those that are kept); with fewer
+    than three it is that of the last frame that had them.
+    """
+    trusted = kept if trusted is None else trusted
     result = points.copy()
     for hand in hands_of(points[0]):
         start = points[0, hand]
@@ -59,7 +86,7 @@ def fill_rigidly(points: np.ndarray, trusted: np.ndarray) -> np.ndarray:
             anchors = trusted[frame, hand]
             if anchors.sum() >= LEAST_FOR_POSE:
                 rotation, shift = rigid_motion(start[anchors], points[frame, hand][anchors])
-            missing = hand[~anchors]
+            missing = hand[~kept[frame, hand]]
             if len(missing):
                 result[frame, missing] = rotation.apply(points[0, missing]) + shift
     return result

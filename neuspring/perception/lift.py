@@ -60,7 +60,8 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         remedy = "Look at masks and tracks; perception.lift has depth_range, neighbourhood and outlier_neighbours."
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
     valid = agreeing_motion(objects, settings)
-    controllers, facts = choose_controllers(hands.points, hands.visible, agreeing_motion(hands, settings), settings, where)
+    moving = agreeing_motion(hands, settings)
+    controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),

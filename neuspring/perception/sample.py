@@ -6,6 +6,8 @@ with a seed).
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 import warp as wp
 
@@ -13,24 +15,48 @@ from neuspring.config.perception import Sampling
 from neuspring.perception.results import LiftedTracks, ShapePrior
 from neuspring.perception.sample_kernels import winding
 
+GROWTH = 1.01
+"""Ratio of the voxel sizes that are tried one after the other."""
+
 
 def structure(
     lifted: LiftedTracks, prior: ShapePrior, settings: Sampling, up: float, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices of the object tracks to keep [No], surface points [Ns, 3] and interior points [Ni, 3], m.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Indices of the object tracks to keep [No], surface points [Ns, 3] and interior points [Ni, 3], m, and the voxel's side, m.
 
-    Tracks with the same place in frame 0 count once, in lexicographic order of their places. Every voxel of side `settings.voxel`
-    holds one point; object before surface before interior. Points below the table are lifted to it.
+    Tracks with the same place in frame 0 count once, in lexicographic order of their places. Every voxel holds one point; object
+    before surface before interior. Its side is `settings.voxel`, or what `settings.nodes` needs. Points below the table are lifted
+    to it.
     """
     start = on_table(lifted.object_points[0], up)
     _, unique = np.unique(start, axis=0, return_index=True)
     surface, interior = (on_table(points, up) for points in _samples(prior, settings, seed))
     everything = np.concatenate([start[unique], surface, interior])
-    cells = np.floor((everything - everything.min(axis=0)) / settings.voxel).astype(int)
+    voxel = settings.voxel if settings.nodes is None else voxel_for(everything, settings.nodes, settings.voxel)
     first_of_cell = np.zeros(len(everything), dtype=bool)
-    first_of_cell[np.unique(cells, axis=0, return_index=True)[1]] = True
+    first_of_cell[np.unique(cells_of(everything, voxel), axis=0, return_index=True)[1]] = True
     own, outer, inner = np.split(first_of_cell, np.cumsum([len(unique), len(surface)]))
-    return unique[own], surface[outer], interior[inner]
+    return unique[own], surface[outer], interior[inner], voxel
+
+
+def cells_of(points: np.ndarray, voxel: float) -> np.ndarray:
+    """The voxel of each point, [n, 3] whole numbers from the lowest corner on."""
+    cells: np.ndarray = np.floor((points - points.min(axis=0)) / voxel).astype(int)
+    return cells
+
+
+def voxel_for(points: np.ndarray, most: int, least: float) -> float:
+    """The smallest of the sides `least` GROWTH^k, k = 0, 1, 2, ..., m, at which points [n, 3] lie in at most `most` voxels.
+
+    The number of voxels does not quite fall with their side. Trying one after the other, more voxels never make a larger side.
+    """
+    for step in count():
+        voxel = least * GROWTH**step
+        cells = cells_of(points, voxel)
+        size = cells.max(axis=0) + 1
+        if len(np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)))) <= most:
+            break
+    return voxel
 
 
 def on_table(points: np.ndarray, up: float) -> np.ndarray:

@@ -51,7 +51,8 @@ def simulate_frame(
 def pack(*, substep: float, **values: torch.Tensor) -> Parameters:
     """Pack physical parameters, differentiably, for a substep in s.
 
-    `values` are the fields of `Material` and rest_lengths [S], m; dashpot may be one number for all springs.
+    `values` are the fields of `Material`, of which those with a default may be left out, and rest_lengths [S], m; dashpot may be
+    one number for all springs.
     """
     return Parameters(
         springs=springs.pack(values),
@@ -59,6 +60,7 @@ def pack(*, substep: float, **values: torch.Tensor) -> Parameters:
         ground=contact.pack(values, "ground"),
         contact=contact.pack(values, "contact"),
         distance=values["contact_distance"].reshape(1),
+        inverse_mass=velocity.pack_masses(values),
     )
 
 

@@ -1,8 +1,10 @@
 """Self-collision by impulses between near nodes (Jacobi), and its adjoint.
 
-Node i takes the mean impulse over its listed partners that are closer than the contact distance and approach, by the response of
-contact.py. Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost
-grows with the nodes. A list is in node order; where a twin has more than `collision_capacity`, those with the lowest indices stay.
+Node i takes the mean impulse over its listed partners j that are closer than the contact distance and approach, by the response of
+contact.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody else keeps its momentum.
+
+Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost grows with the
+nodes. A list is in node order; where a twin has more than `collision_capacity`, those with the lowest indices stay.
 The twins of a group share a list: a bit per lane says whose partner a node is.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
@@ -159,7 +161,7 @@ def functions(real: Any, width: int) -> Functions:
     Model, State, Adjoint = structs(real, width)
     dot, root, column, put = lane.dot, lane.root, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
-    zero, half, one = wp.constant(real(0.0)), wp.constant(real(0.5)), wp.constant(real(1.0))
+    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
 
     @wp.func
@@ -167,12 +169,18 @@ def functions(real: Any, width: int) -> Functions:
         return (mask >> q) & 1 == 1 and length < distance and closing < -approach
 
     @wp.func
-    def impulse(dx: vec3, u: vec3, length: real, e: real, mu: real) -> vec3:
+    def part(model: Model, i: int, j: int, g: int, q: int) -> real:
+        """m_j / (m_i + m_j)."""
+        own = model.inverse_mass[i, g][q]
+        return own / (own + model.inverse_mass[j, g][q])
+
+    @wp.func
+    def impulse(dx: vec3, u: vec3, length: real, e: real, mu: real, share: real) -> vec3:
         n = dx / wp.max(length, floor)
         s = wp.dot(u, n)
         ut = u - n * s
         a = wp.max(zero, one - mu * (one + e) * wp.abs(s) / wp.max(wp.length(ut), floor))
-        return (ut * (a - one) - n * ((one + e) * s)) * half
+        return (ut * (a - one) - n * ((one + e) * s)) * share
 
     @wp.func
     def meeting(state: State, slot: int, inner: int, j: int, g: int, x: Vector, v: Vector):
@@ -193,7 +201,14 @@ def functions(real: Any, width: int) -> Functions:
             offset, relative, length, closing = meeting(state, slot, inner, j, g, x, v)
             for q in range(width):
                 if hits(mask, q, length[q], closing[q], model.distance[g][q]):
-                    push = impulse(column(offset, q), column(relative, q), length[q], model.contact_e[g][q], model.contact_mu[g][q])
+                    push = impulse(
+                        column(offset, q),
+                        column(relative, q),
+                        length[q],
+                        model.contact_e[g][q],
+                        model.contact_mu[g][q],
+                        part(model, i, j, g, q),
+                    )
                     total = put(total, q, column(total, q) + push)
                     count[q] = count[q] + one
         for q in range(width):
@@ -203,7 +218,7 @@ def functions(real: Any, width: int) -> Functions:
 
     @wp.func
     def pair_adjoint(dx: vec3, u: vec3, length: real, e: real, mu: real, h: vec3):
-        """Adjoints of dx, u, e and mu for h, that of the impulse; `half` is in h."""
+        """Adjoints of dx, u, e and mu for h, that of the impulse; the node's share is in h."""
         inverse = one / wp.max(length, floor)
         n = dx * inverse
         s = wp.dot(u, n)
@@ -252,7 +267,7 @@ def functions(real: Any, width: int) -> Functions:
             offset, relative, length, closing = meeting(state, step, step, j, g, x, v)
             for q in range(width):
                 if hits(mask, q, length[q], closing[q], model.distance[g][q]):
-                    share = column(h, q) * (-half / count[q])
+                    share = column(h, q) * (-part(model, i, j, g, q) / count[q])
                     hx, hu, he, hmu = pair_adjoint(
                         column(offset, q), column(relative, q), length[q], model.contact_e[g][q], model.contact_mu[g][q], share
                     )

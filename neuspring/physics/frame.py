@@ -93,16 +93,35 @@ def kernels(real: Any, width: int) -> Kernels:
         adjoint.ground_mu[i, g] = adjoint.ground_mu[i, g] + adj_mu
 
     @wp.func
+    def update(model: Model, state: State, slot: int, i: int, g: int, force: Vector) -> Vector:
+        """The velocity of node i after forces and drag."""
+        return updated(
+            state.v[slot, i, g],
+            force,
+            model.gravity,
+            model.substep[g],
+            model.decay[g],
+            model.quadratic[g],
+            model.inverse_mass[i, g],
+        )
+
+    @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factor)."""
-        adj_v, adj_force, adj_decay = updated_adjoint(
-            state.after[step, i, g], adjoint.after[i, g], model.substep[g], model.decay[g]
+        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factors)."""
+        adj_v, adj_force, adj_decay, adj_quadratic = updated_adjoint(
+            state.after[step, i, g],
+            adjoint.after[i, g],
+            model.substep[g],
+            model.decay[g],
+            model.quadratic[g],
+            model.inverse_mass[i, g],
         )
         if step >= model.fewest:
             adj_v = chosen(step, model.counts[g], adj_v, adjoint.v[i, g])
         adjoint.v[i, g] = adj_v
         adjoint.force[step % 2, i, g] = adj_force
         adjoint.decay[i, g] = adjoint.decay[i, g] + adj_decay
+        adjoint.quadratic[i, g] = adjoint.quadratic[i, g] + adj_quadratic
 
     def forward(model: Model, state: State):
         g = wp.tid()
@@ -113,8 +132,8 @@ def kernels(real: Any, width: int) -> Kernels:
                 move_controller(model, state, step, slot, c, g)
             for i in range(model.nodes):  #  (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
                 add_row(model, state, slot, i, g)
-            for i in range(model.nodes):  #    (4)  v' = delta (v + dt (F + g))
-                after = updated(state.v[slot, i, g], state.force[i, g], model.gravity, model.substep[g], model.decay[g])
+            for i in range(model.nodes):  #    (4)  w = v + dt (F / m + g),  v' = w delta / (1 + q |w|)
+                after = update(model, state, slot, i, g, state.force[i, g])
                 state.force[i, g] = Vector()
                 state.after[inner, i, g] = after
                 if model.collide == 0:  #      (4)  x' = x + dt v', reflected at the ground
@@ -155,7 +174,7 @@ def kernels(real: Any, width: int) -> Kernels:
             return
         inner = step % model.history
         force = gathered(model, state, slot, i, g)
-        after = updated(state.v[slot, i, g], force, model.gravity, model.substep[g], model.decay[g])
+        after = update(model, state, slot, i, g, force)
         state.after[inner, i, g] = after
         if model.collide == 0:
             advance(model, state, step, i, g, after)

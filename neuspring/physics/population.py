@@ -43,5 +43,6 @@ def stacked(each: Sequence[Parameters], places: Sequence[np.ndarray], springs: i
     own = [one.springs.new_zeros((springs, 3)) for one in each]
     for target, one, place in zip(own, each, places, strict=True):
         target[torch.as_tensor(place, device=target.device)] = one.springs
-    rest = (torch.stack(values) for values in list(zip(*each, strict=True))[1:])
+    # Masses of all nodes at once and of each node may meet.
+    rest = (torch.stack(torch.broadcast_tensors(*values)) for values in list(zip(*each, strict=True))[1:])
     return Parameters(torch.stack(own), *rest)

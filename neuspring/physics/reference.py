@@ -1,6 +1,6 @@
 """The specification: a slow, readable float64 NumPy simulation, in the order of the released one. The Warp solver must agree.
 
-Everything is written one equation a line, unit masses, forward only; gradients are checked against its central differences.
+Everything is written one equation a line, forward only; gradients are checked against its central differences.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ class Scene:
     contact: tuple[float, float]
     contact_distance: float
     simulation: Simulation
+    drag_quadratic: float = 0.0
+    mass: np.ndarray | float = 1.0
+    """Of each node [N], or of all, kg."""
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:
@@ -45,29 +48,76 @@ class Scene:
             contact=(m.contact_elasticity, m.contact_friction),
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
+            drag_quadratic=m.drag_quadratic,
+            mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
         )
 
 
 def rollout(scene: Scene, x: np.ndarray, v: np.ndarray, controllers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3]."""
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
-    for begin, end in zip(controllers[:-1].astype(np.float64), controllers[1:].astype(np.float64), strict=True):
-        x, v = frame(scene, xs[-1], vs[-1], begin, end)
+    hands = controllers.astype(np.float64)
+    for k in range(len(hands) - 1):
+        slopes = (tangent(hands, k), tangent(hands, k + 1)) if scene.simulation.controller_path == "cubic" else None
+        x, v = frame(scene, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
         xs.append(x)
         vs.append(v)
     return np.stack(xs), np.stack(vs)
 
 
-def frame(scene: Scene, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One frame: `substeps` substeps with controllers moving linearly from begin to end [C, 3]."""
+def tangent(hands: np.ndarray, k: int) -> np.ndarray:
+    """Derivative by the frame, at frame k, of the parabola through the positions in frames k - 1, k and k + 1 of [F, C, 3].
+
+    At the first and the last frame it is that of the three first and last; of two frames that of a line.
+    """
+    if len(hands) < 3:
+        slope: np.ndarray = hands[-1] - hands[0]
+        return slope
+    middle = min(max(k, 1), len(hands) - 2)
+    before, here, after = hands[middle - 1 : middle + 2]
+    parabola: np.ndarray = (after - before) / 2 + (k - middle) * (after - 2 * here + before)
+    return parabola
+
+
+def frame(
+    scene: Scene,
+    x: np.ndarray,
+    v: np.ndarray,
+    begin: np.ndarray,
+    end: np.ndarray,
+    slopes: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """One frame: `substeps` substeps with controllers moving from begin to end [C, 3].
+
+    They move linearly, or along the cubic that has these slopes [C, 3], m per frame, at both ends (Hermite).
+    """
     sim = scene.simulation
     spread = incidence(scene)
     hands_velocity = (end - begin) / sim.frame_time if sim.controller_velocity else np.zeros_like(begin)
     pairs = candidates(x, scene.contact_distance) if sim.self_collision else None
     for step in range(sim.substeps):
-        hands = begin + (end - begin) * ((step + 1) / sim.substeps)
+        u = (step + 1) / sim.substeps
+        hands = begin + (end - begin) * u
+        if slopes is not None:
+            hands = hermite(u, begin, end, *slopes)
+            if sim.controller_velocity:
+                hands_velocity = hermite_slope(u, begin, end, *slopes) / sim.frame_time
         x, v = substep(scene, x, v, hands, hands_velocity, spread, pairs)
     return x, v
+
+
+def hermite(u: float, p0: np.ndarray, p1: np.ndarray, m0: np.ndarray, m1: np.ndarray) -> np.ndarray:
+    """The cubic with positions p0, p1 and slopes m0, m1 at u = 0 and 1."""
+    place: np.ndarray = (
+        (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * m0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * m1
+    )
+    return place
+
+
+def hermite_slope(u: float, p0: np.ndarray, p1: np.ndarray, m0: np.ndarray, m1: np.ndarray) -> np.ndarray:
+    """Its derivative by u."""
+    slope: np.ndarray = (6 * u**2 - 6 * u) * (p0 - p1) + (3 * u**2 - 4 * u + 1) * m0 + (3 * u**2 - 2 * u) * m1
+    return slope
 
 
 def incidence(scene: Scene) -> csr_matrix:
@@ -93,12 +143,21 @@ def substep(
     dt = sim.substep
     force = spread @ spring_forces(scene, np.concatenate([x, hands]), np.concatenate([v, hands_velocity]))
     gravity = np.array([0.0, 0.0, -sim.gravity * sim.up_sign])
-    v = (v + dt * (force + gravity)) * np.exp(-dt * scene.drag)
+    mass = np.broadcast_to(scene.mass, len(v))
+    v = dragged(v + dt * (force / mass[:, None] + gravity), dt, scene.drag, scene.drag_quadratic)
     if pairs is not None:
-        v = collide(x, v, pairs, scene.contact_distance, *scene.contact)
+        v = collide(x, v, mass, pairs, scene.contact_distance, *scene.contact)
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
+
+
+def dragged(v: np.ndarray, dt: float, linear: float, quadratic: float) -> np.ndarray:
+    """The exact solution of dv/dt = -(linear + quadratic |v|) v after dt."""
+    decay = np.exp(-dt * linear)
+    mean = -np.expm1(-dt * linear) / linear if linear else dt
+    slower: np.ndarray = v * decay / (1 + quadratic * mean * np.linalg.norm(v, axis=1, keepdims=True))
+    return slower
 
 
 def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -126,19 +185,20 @@ def candidates(x: np.ndarray, distance: float) -> np.ndarray:
     return np.argwhere(gap < distance)
 
 
-def collide(x: np.ndarray, v: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
-    """Jacobi impulses: each node takes the mean over its partners that are near and approach; unit masses."""
+def collide(x: np.ndarray, v: np.ndarray, mass: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
+    """Jacobi impulses: each node takes the mean over its partners that are near and approach."""
     i, j = pairs[:, 0], pairs[:, 1]
     dx, u = x[j] - x[i], v[j] - v[i]
     length = np.linalg.norm(dx, axis=1)
     hit = (length < distance) & (np.einsum("pk,pk->p", dx, u) < -APPROACH)
-    i, dx, u, length = i[hit], dx[hit], u[hit], length[hit]
+    i, j, dx, u, length = i[hit], j[hit], dx[hit], u[hit], length[hit]
     n = dx / np.maximum(length, MIN_TANGENT)[:, None]
     speed = np.einsum("pk,pk->p", u, n)
     un = speed[:, None] * n
     ut = u - un
     a = response(speed, np.linalg.norm(ut, axis=1), e, mu)
-    impulse = 0.5 * (-(1.0 + e) * un + (a - 1.0)[:, None] * ut)
+    share = mass[j] / (mass[i] + mass[j])
+    impulse = share[:, None] * (-(1.0 + e) * un + (a - 1.0)[:, None] * ut)
     total = np.zeros_like(v)
     np.add.at(total, i, impulse)
     hits = np.bincount(i, minlength=len(v))

@@ -32,13 +32,15 @@ class Parameters(NamedTuple):
     springs: torch.Tensor
     """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent."""
     decay: torch.Tensor
-    """[1]: exp(-substep * drag)."""
+    """[2]: exp(-substep * drag), and how much less a substep leaves of fast velocities, s/m (velocity.py)."""
     ground: torch.Tensor
     """[2]: elasticity in [0, 1], friction in [0, 2]."""
     contact: torch.Tensor
     """[2]: the same between nodes."""
     distance: torch.Tensor
     """[1]: contact distance, m. No gradient: it only selects pairs."""
+    inverse_mass: torch.Tensor
+    """[N], 1/kg, or [1] for all nodes. No gradient: masses are not trained."""
 
 
 def _check(simulations: Sequence[Simulation]) -> None:
@@ -94,17 +96,18 @@ class FrameSolver:
         """Copy packed parameters into the solver's buffers."""
         b, values = self.buffers, Parameters(*map(self._stacked, parameters))
         springs.fill(b, values.springs)
-        b.set_numbers("decay", values.decay[:, 0])
+        velocity.fill(b, values.decay)
         for kind in ("ground", "contact"):
             contact.fill(b, kind, getattr(values, kind))
         b.set_numbers("distance", values.distance[:, 0])
+        velocity.fill_masses(b, values.inverse_mass)
         if self.simulation.self_collision:
             self._reach = float(values.distance.max())
 
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move linearly from begin to end [C, 3]."""
+        """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (path.py)."""
         self.start(x, v)
         self.advance(begin, end)
         return self._one(self.buffers.get_vectors("x", self.last, self.nodes)), self._one(
@@ -119,12 +122,26 @@ class FrameSolver:
     def advance(self, begin: torch.Tensor, end: torch.Tensor) -> None:
         """Simulate a frame from the state in slot 0; it ends in slot `last`."""
         b = self.buffers
-        for name, values in (("begin", begin), ("end", end)):
-            b.set_vectors(name, self._stacked(values))
+        self._lead(self._stacked(begin), self._stacked(end))
         if self.simulation.self_collision:
             collision.find_candidates(b, self._reach)
         self._run("forward", self.launch_forward)
         self.frame_token += 1
+
+    def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
+        """Take the controllers' path from begin to end: positions [B, C, 3], or with tangents [B, C, 6]."""
+        b, path = self.buffers, self.simulation.controller_path
+        columns = 3 if path == "linear" else 6
+        if {begin.shape[-1], end.shape[-1]} != {columns}:
+            rule = f"{columns} numbers per controller are required with simulation.controller_path: {path}"
+            raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Make them with neuspring.physics.path.")
+        places = {"begin": begin[..., :3], "end": end[..., :3]}
+        for name, values in places.items():
+            b.set_vectors(name, values)
+        if path == "cubic":
+            travel = places["end"] - places["begin"]
+            for name, values in (("bend_begin", begin), ("bend_end", end)):
+                b.set_vectors(name, values[..., 3:] - travel)
 
     def go_on(self) -> None:
         """Take the end of the last frame for the start of the next."""
@@ -145,7 +162,7 @@ class FrameSolver:
         return self.forward(x, v, begin, end)
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for the contact distance."""
+        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for contact distance and masses."""
         b = self.buffers
         self.clear_adjoints()
         b.set_vectors("adj_x", self._stacked(adj_x))
@@ -153,7 +170,7 @@ class FrameSolver:
         self._run("backward", self.launch_backward)
         state = (b.get_vectors("adj_x", count=self.nodes), b.get_vectors("adj_v", count=self.nodes))
         own = (springs.gradient(b), velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
-        return *map(self._one, (*state, *own)), None
+        return *map(self._one, (*state, *own)), None, None
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""

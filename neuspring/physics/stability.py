@@ -4,6 +4,7 @@ For unit masses and a mode with stiffness eigenvalue lambda and damping eigenval
 dt^2 lambda + 2 dt c < 4 (Jury's criterion on z^2 - (2 - c dt - lambda dt^2) z + 1 - c dt). Since lambda and c are Rayleigh
 quotients of the same vector, it suffices that the largest eigenvalue of M(dt) = dt^2 K + 2 dt C is below 4, with
 K = sum_e (Y / l0) d d^T and C = sum_e gamma d d^T over the springs' direction blocks. Drag only helps and is ignored.
+With other masses M, M^-1/2 K M^-1/2 and M^-1/2 C M^-1/2 stand for K and C: a spring's row over the root of each end's mass.
 
 Two estimates, cheap first: Gershgorin's bound per node, valid for any directions; then the eigenvalue itself in the rest
 configuration (Lanczos). Deformation turns directions but hardly raises the eigenvalue; `safety` covers that.
@@ -21,6 +22,8 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 
 LIMIT = 4.0
+UNIT = np.zeros(0)
+"""The masses that stand for: 1 kg each."""
 
 
 class Unstable(InputError):
@@ -47,15 +50,19 @@ class Spectrum:
         return float((-b + np.sqrt(b * b + 4 * a * LIMIT * safety)) / (2 * a))
 
 
-def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray) -> Spectrum:
-    """Per-node bound: twice the sum over springs to nodes, once over springs to controllers. stiffness is Y / l0 [S]."""
+def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray = UNIT) -> Spectrum:
+    """Per-node bound: twice the sum over springs to nodes, once over springs to controllers, over the mass [N].
+
+    stiffness is Y / l0 [S]. These are the rows of M^-1 K, which has the eigenvalues of M^-1/2 K M^-1/2.
+    """
     inner = (springs < nodes).all(axis=1)
     weight = np.where(inner, 2.0, 1.0)
     total = int(max(nodes, springs.max(initial=0) + 1))
 
     def rows(values: np.ndarray) -> np.ndarray:
         ends = np.concatenate([springs[:, 0], springs[:, 1]])
-        return np.bincount(ends, np.tile(weight * values, 2), total)[:nodes]
+        sums = np.bincount(ends, np.tile(weight * values, 2), total)[:nodes]
+        return sums / mass.astype(np.float64) if len(mass) else sums
 
     k, c = rows(stiffness), rows(damping)
     node = int(np.argmax(k / max(k.max(initial=0), 1e-30) + c / max(c.max(initial=0), 1e-30)))
@@ -63,9 +70,14 @@ def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: 
 
 
 def rest_spectrum(
-    springs: np.ndarray, nodes: np.ndarray, controllers: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
+    springs: np.ndarray,
+    nodes: np.ndarray,
+    controllers: np.ndarray,
+    stiffness: np.ndarray,
+    damping: np.ndarray,
+    mass: np.ndarray = UNIT,
 ) -> Spectrum:
-    """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S]."""
+    """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
     ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
     offset = ends[:, 1] - ends[:, 0]
     direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
@@ -77,7 +89,8 @@ def rest_spectrum(
         e = np.flatnonzero(inside)
         rows.append(np.repeat(e, 3))
         columns.append((springs[e, end, None] * 3 + np.arange(3)).ravel())
-        values.append(sign * direction[e].ravel())
+        scale = 1 / np.sqrt(mass.astype(np.float64)[springs[e, end], None]) if len(mass) else 1.0
+        values.append(sign * (direction[e] * scale).ravel())
     shape = (len(springs), 3 * count)
     incidence = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
     transpose = incidence.T.tocsr()
@@ -90,7 +103,7 @@ def rest_spectrum(
         try:
             value, vector = eigsh(operator, k=1, which="LA", tol=1e-3, v0=start, maxiter=2000, rng=np.random.default_rng(0))
         except ArpackNoConvergence:
-            bound = gershgorin(springs, count, weights, weights)
+            bound = gershgorin(springs, count, weights, weights, mass)
             return bound.stiffness, bound.node
         return float(value[0]), int(np.argmax(np.linalg.norm(vector[:, 0].reshape(-1, 3), axis=1)))
 
@@ -102,7 +115,8 @@ def twin_spectrum(twin: Twin) -> Spectrum:
     """The spectrum of a twin at rest."""
     topology, material = twin.topology, twin.material
     k = material.stiffness.astype(np.float64) / topology.rest_lengths
-    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, k, material.dashpot.astype(np.float64))
+    c = material.dashpot.astype(np.float64)
+    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, k, c, material.mass)
 
 
 def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
@@ -115,7 +129,7 @@ def check(twin: Twin) -> None:
     topology, material, simulation = twin.topology, twin.material, twin.simulation
     k = material.stiffness.astype(np.float64) / topology.rest_lengths
     c = material.dashpot.astype(np.float64)
-    if gershgorin(topology.springs, len(topology.nodes), k, c).load(simulation.substep) < LIMIT:
+    if gershgorin(topology.springs, len(topology.nodes), k, c, material.mass).load(simulation.substep) < LIMIT:
         return
     spectrum = twin_spectrum(twin)
     if spectrum.load(simulation.substep) >= LIMIT:

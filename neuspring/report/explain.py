@@ -25,7 +25,7 @@ from neuspring.core.run_record import RESULT_ROLES, RUN_RECORD, RunRecord, key_o
 from neuspring.report.tables.cells import accounted, cells, counted, of_study
 from neuspring.report.tables.study import Made
 from neuspring.scores import paper
-from neuspring.scores.metrics import IN_PAPER
+from neuspring.scores.metrics import IN_STUDIES
 from neuspring.scores.runs import Collected, collect, one_line
 
 FACTS = ("run_key", "source", "commit", "device", "machine", "started", "ended", "data_digest")
@@ -167,7 +167,7 @@ def _find_cell(cell: str, files: Made, table: pd.DataFrame) -> tuple[str, str, s
     metrics = {
         name: metric
         for metric in table["metric"].unique()
-        for name in (IN_PAPER[metric].paper_heading.lower(), IN_PAPER[metric].paper_name, metric)
+        for name in (IN_STUDIES[metric].paper_heading.lower(), IN_STUDIES[metric].paper_name or metric, metric)
     }
     return label, _choose(parts[-2], tasks, "task", cell), _choose(parts[-1], metrics, "metric", cell)
 

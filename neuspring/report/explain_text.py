@@ -15,7 +15,7 @@ from neuspring.core.records import canonical
 from neuspring.report.explain import Behind, Explanation
 from neuspring.report.tables.render import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
-from neuspring.scores.metrics import DASH, IN_PAPER, Metric
+from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
 
 SHORT = 12
 """Characters of a digest; --json has all."""
@@ -27,7 +27,7 @@ benchmark; give --configfile to this command too. The same seed on the same type
 
 def text(explanation: Explanation) -> str:
     """The value, the runs behind it, the runs left out, and what is not as recorded."""
-    metric = IN_PAPER[explanation.row["metric"]]
+    metric = IN_STUDIES[explanation.row["metric"]]
     lines = [f"{explanation.cell} (method {explanation.row['method']})", "", *_value(explanation, metric), ""]
     lines += _runs(explanation.runs)
     if explanation.not_applying:

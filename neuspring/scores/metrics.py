@@ -2,7 +2,8 @@
 
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
-Both follow the released evaluation of PhysTwin. Metrics of pictures are in `images` and `lpips`.
+Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
+its points move with the nodes around them (`bound`). Metrics of pictures are in `images` and `lpips`.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
 
@@ -11,13 +12,14 @@ To add a metric, write its function, add its values in `score_tasks` or `picture
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
+from neuspring.scores.bound import NEIGHBORS, bound_positions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -104,6 +106,11 @@ _ALL = (
         paper_name="track_error", paper_heading="TE", paper_unit="m", paper_digits=5,
     ),
     Metric(
+        name="track_error_bound", title="bound track error", heading="TE bound", unit="m", factor=1e3, digits=2, tolerance=1e-6,
+        explained="track error of points bound to the nodes around them, 0 for any rigid motion",
+        paper_heading="TE bound", paper_unit="m", paper_digits=5,
+    ),
+    Metric(
         name="psnr", title="PSNR", heading="PSNR", unit="dB", digits=2, tolerance=0.02, relative=False,
         higher_is_better=True, of_pictures=True, average="frames",
         paper_name="psnr", paper_heading="PSNR", paper_unit="dB", paper_digits=3,
@@ -129,7 +136,10 @@ agree within 1e-6 dB with a drawing in double precision, while half a pixel move
 lie between."""
 IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
 """The metrics of the paper's tables, in its order."""
+IN_STUDIES = IN_PAPER | {"track_error_bound": METRICS["track_error_bound"]}
+"""The metrics of studies, in the order of their columns: the paper's, then ours."""
 DISTANCES = tuple(metric for metric in _ALL if not metric.of_pictures)
+PUBLISHED = tuple(metric for metric in DISTANCES if metric.paper_name)
 PICTURES = tuple(metric for metric in _ALL if metric.of_pictures)
 UNITS = {metric.name: metric.unit for metric in _ALL}
 Headings = Mapping[tuple[str, str], str]
@@ -144,10 +154,15 @@ def present(table: pd.DataFrame) -> set[tuple[str, str]]:
     return set(zip(table["task"], table["metric"], strict=True))
 
 
+def published(headings: Headings, table: pd.DataFrame) -> Headings:
+    """Those of `headings` that are of the published distances, or of which a table has rows: older tables lack our metrics."""
+    columns = present(table) if len(table) else set()
+    return {key: text for key, text in headings.items() if METRICS[key[1]] in PUBLISHED or key in columns}
+
+
 def headings_of(table: pd.DataFrame) -> Headings:
-    """Headings of all distances, and of the metrics of pictures that a table has rows of."""
-    columns = present(table)
-    return HEADINGS | {key: text for key, text in IMAGE_HEADINGS.items() if key in columns}
+    """Headings of the published distances, and of the other metrics that a table has rows of."""
+    return published(HEADINGS | IMAGE_HEADINGS, table)
 
 
 def _tree(points: np.ndarray) -> cKDTree:
@@ -182,13 +197,23 @@ def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
     Tracks annotated at frame 0 are matched once, to the nearest of all nodes. A frame without any of them scores 0, as
     published. NaN everywhere when no track is annotated at frame 0.
     """
+    tracks = tracks.astype(np.float64)
+    return _mean_errors(positions, tracks, lambda points: positions[:, _tree(positions[0]).query(points)[1]].astype(np.float64))
+
+
+def bound_track_errors(positions: np.ndarray, tracks: np.ndarray, neighbors: int = NEIGHBORS) -> np.ndarray:
+    """As `track_errors`, of points that move with the nodes around them (`bound.bound_positions`): 0 for every rigid motion."""
+    tracks = tracks.astype(np.float64)
+    return _mean_errors(positions, tracks, lambda points: bound_positions(positions, points, neighbors))
+
+
+def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Mean distance per frame [F] of the tracks that frame 0 has from where the prediction carries their points [F, P, 3]."""
     annotated = ~np.isnan(tracks).any(axis=2)
     matched = annotated[0]
     if not matched.any():
         return np.full(len(positions), np.nan)
-    tracks = tracks.astype(np.float64)
-    index = _tree(positions[0]).query(tracks[0][matched])[1]
-    error = np.linalg.norm(positions[:, index].astype(np.float64) - tracks[:, matched], axis=2)
+    error = np.linalg.norm(carried(tracks[0][matched]) - tracks[:, matched], axis=2)
     valid = annotated[:, matched]
     count = valid.sum(axis=1)
     total = np.where(valid, error, 0.0).sum(axis=1)
@@ -202,6 +227,25 @@ def track_error_per_frame(positions: np.ndarray, observations: Observations) -> 
     NaN everywhere when no track is annotated at frame 0 (nothing can be matched).
     """
     return track_errors(positions, observations.tracks[: len(positions)])
+
+
+def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
+    """Every distance per frame [T], m, by the name of its metric; positions [T, N, 3]."""
+    tracks = observations.tracks[: len(positions)]
+    return {
+        "chamfer": chamfer_per_frame(positions, observations),
+        "track_error": track_errors(positions, tracks),
+        "track_error_bound": bound_track_errors(positions, tracks),
+    }
+
+
+def floors(observations: Observations) -> dict[str, float]:
+    """Every distance in frame 0, m, where the prediction is given: it measures how far points are from nodes, and no motion.
+
+    Metrics without a value there are left out.
+    """
+    first = errors_per_frame(observations.nodes[None], observations)
+    return {name: float(values[0]) for name, values in first.items() if np.isfinite(values[0])}
 
 
 def task_frames(scenario: Scenario, task: str) -> range:
@@ -233,10 +277,7 @@ def score_tasks(
     """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
-    per_frame = {
-        "chamfer": chamfer_per_frame(trajectory.positions, observations),
-        "track_error": track_error_per_frame(trajectory.positions, observations),
-    }
+    per_frame = errors_per_frame(trajectory.positions, observations)
     for task, frames in tasks.items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue

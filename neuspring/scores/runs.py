@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -22,7 +22,7 @@ from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.scores.failures import NOTHING, LeftOut, applying
 from neuspring.scores.metrics import COLUMNS
 
-RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key")
+RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key", "oracle", "floors")
 DAMAGED = "damaged record: "
 """How the reason of a run begins whose files cannot be read."""
 Key = tuple[str, str, int]
@@ -47,6 +47,30 @@ class Collected:
     """Method to the scenarios to which it does not apply, so that it has no runs there."""
     records: Mapping[Key, RunRecord] = field(default_factory=dict)
     """The records that could be read."""
+
+    @property
+    def parts(self) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+        """Scores, runs, and scores with the last frame frozen, as `failures.both_averages` takes them."""
+        return self.scores, self.runs, self.frozen
+
+    @property
+    def oracles(self) -> tuple[str, ...]:
+        """Methods that have seen all frames, as far as their records tell."""
+        if "oracle" not in self.runs:
+            return ()
+        return tuple(dict.fromkeys(self.runs.loc[self.runs["oracle"].astype(bool), "method"]))
+
+    @property
+    def comparison(self) -> Collected:
+        """The runs without oracles: what averages, ratios and marks of the best are about."""
+        oracles = self.oracles
+        return self.of([method for method in dict.fromkeys(self.runs["method"]) if method not in oracles]) if oracles else self
+
+    def of(self, methods: Collection[str]) -> Collected:
+        """The runs of these methods."""
+        runs, scores, frozen = (table[table["method"].isin(list(methods))] for table in (self.runs, self.scores, self.frozen))
+        left_out = {name: where for name, where in self.left_out.items() if name in methods}
+        return Collected(scores, runs, frozen, left_out, {key: record for key, record in self.records.items() if key[1] in methods})
 
 
 def collect(
@@ -78,8 +102,14 @@ def collect(
         rows.append(identity | _facts(record))
     columns = dict.fromkeys([*RUN_COLUMNS, *(name for row in rows for name in row)])
     runs = pd.DataFrame(rows, columns=list(columns))
-    runs = runs.fillna(dict.fromkeys(("notes", "source", "run_key"), ""))
+    runs = _filled(runs.fillna(dict.fromkeys(("notes", "source", "run_key"), "")))
     return Collected(stacked(scores), runs, stacked(frozen), absent, records)
+
+
+def _filled(runs: pd.DataFrame) -> pd.DataFrame:
+    """`oracle` of every run; one without a record is as the others of its method."""
+    known = runs["oracle"].astype(str).eq("True")
+    return runs.assign(oracle=runs["method"].isin(runs.loc[known, "method"]))
 
 
 def _paths(
@@ -108,6 +138,7 @@ def _facts(record: RunRecord) -> dict[str, Any]:
     """What tables need of a record."""
     facts = {name: getattr(record, name) for name in ("status", "reason", "source", "run_key")}
     facts["notes"] = "; ".join(record.notes)
+    facts |= {"oracle": record.oracle, "floors": json.dumps(record.floors)}
     facts |= {f"seconds_{name}": value for name, value in record.timings.items()}
     facts |= {f"memory_mb_{name}": value for name, value in record.peak_memory_mb.items()}
     facts |= {"averaged": record.params.get("rollout.result.averaged", 1), "images": json.dumps(record.images)}
@@ -136,13 +167,14 @@ def read_scores(path: Path) -> Collected:
     beside = path.with_name("runs.csv")
     if beside.is_file():
         table = pd.read_csv(beside).reindex(columns=[*RUN_COLUMNS, "averaged"])
-        return Collected(scores, table.fillna(dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"averaged": 1}))
+        texts = dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"averaged": 1, "floors": "{}"}
+        return Collected(scores, _filled(table.fillna(texts)))
     errors = scores[scores["metric"] == "chamfer"]
     tasks = runs.merge(errors.groupby(["scenario", "method", "seed"])["task"].nunique().reset_index(), how="left")["task"]
     finished = tasks == errors["task"].nunique()
     runs["status"] = np.where(finished, "ok", "failed")
     runs["reason"] = np.where(finished, "", "its scores are not complete")
-    nothing = {"notes": "", "images": "null", "run_key": ""}
+    nothing: dict[str, Any] = {"notes": "", "images": "null", "run_key": "", "oracle": False, "floors": "{}"}
     return Collected(scores, runs.assign(source=path.name, averaged=1, **nothing))
 
 

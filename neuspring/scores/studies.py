@@ -15,7 +15,21 @@ from neuspring.core.errors import InputError
 from neuspring.scores import paper
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
-TAKEN = ("summary", "scores", "runs", "averages", "differences", "held", "transfers", "perception", "pictures")
+TAKEN = (
+    "summary",
+    "scores",
+    "runs",
+    "averages",
+    "differences",
+    "held",
+    "floors",
+    "ratios",
+    "seeds",
+    "aims",
+    "transfers",
+    "perception",
+    "pictures",
+)
 """Names of files that other commands write into the folder of tables."""
 
 
@@ -31,6 +45,11 @@ class Study:
     """Label of the row that the others are compared with, on the same scenarios and seeds."""
     rows: dict[Text, Name]
     """The paper's label to a method of methods.yaml. A label that the paper does not have is shown without its values."""
+
+    training: Text = "equal"
+    """How the rows are trained, in words."""
+    beside: Name | None = None
+    """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
@@ -58,4 +77,10 @@ def read_studies(path: Path) -> dict[str, Study]:
         if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:
             rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
             raise InputError(f"{path}, study {name}", rule, repr(name), "Rename it.")
+        beside = studies[name].beside
+        if beside is not None and (
+            beside == name or beside not in studies or not set(studies[beside].rows) & set(studies[name].rows)
+        ):
+            rule = "beside: must be another study of this table, with labels of this one"
+            raise InputError(f"{path}, study {name}", rule, repr(beside), f"Known: {', '.join(studies)}")
     return studies

@@ -19,6 +19,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
 from neuspring.twin.fit import FitProblem, fit
+from neuspring.twin.losses import frames_seen
 from neuspring.twin.pooled import PooledFit
 
 
@@ -30,13 +31,25 @@ def options(parser: ArgumentParser) -> None:
     shared.add_settings(parser)
     about = "train each spring, or the neural spring field"
     parser.add_argument("--kind", choices=("springs", "field"), default="springs", help=about)
+    oracle = "fit all frames, the future included: no prediction, but what fitting could reach at best; the record says oracle"
+    parser.add_argument("--oracle", action="store_true", help=oracle)
     shared.add_device(parser)
     shared.add_output(parser)
 
 
 def command(a: Namespace) -> None:
     """`neuspring fit`."""
-    run(a.observations, a.search, shared.read_settings(a.settings), a.kind, a.device, a.output, a.pool, a.leave_out)
+    run(
+        a.observations,
+        a.search,
+        shared.read_settings(a.settings),
+        a.kind,
+        a.device,
+        a.output,
+        a.pool,
+        a.leave_out,
+        oracle=a.oracle,
+    )
 
 
 @dataclass(frozen=True)
@@ -59,9 +72,12 @@ def recorder(
     output: Path,
     pool: Sequence[Path] = (),
     leave_out: bool = False,
+    *,
+    oracle: bool = False,
 ) -> Recorder:
-    """The recorder of a fit, which digests its inputs."""
-    own = {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]} | ({"leave_out": True} if leave_out else {})
+    """The recorder of a fit, which digests its inputs. What is off is not named: other digests stay."""
+    own = {"kind": kind, "seed": StageRecord.load(search_record).settings["seed"]}
+    own |= {name: True for name, on in (("leave_out", leave_out), ("oracle", oracle)) if on}
     return Recorder(
         "fit",
         output,
@@ -84,6 +100,7 @@ def prepared(record: Recorder, observations_path: Path, search_record: Path, set
         record.device,
         record.settings["kind"],
         int(record.settings["seed"]),
+        record.settings.get("oracle", False),
     )
     # What was read, the search by its twin alone.
     inputs = {"observations": record.inputs["observations"], "twin": before.files["twin"][1]}
@@ -101,14 +118,18 @@ def run(
     output: Path,
     pool: Sequence[Path] = (),
     leave_out: bool = False,
+    *,
+    oracle: bool = False,
 ) -> None:
     """Write twin.npz, history.parquet (losses per epoch), and the record `output`.
 
     `kind` says what is trained: each spring by itself, or the neural spring field, whose first weights follow the search's seed.
-    A checkpoint that a killed fit left, or one that ran together with others (`fits`), is continued. With a `pool` of other
-    recordings' observations the twin is fitted on all; with `leave_out`, on those alone.
+    `oracle`: all frames are fitted, the future included, and the record says so. With a `pool` of other recordings' observations
+    the twin is fitted on all; with `leave_out`, on those alone. A checkpoint that a killed fit left, or one that ran together with
+    others (`fits`), is continued.
     """
-    record = recorder(observations_path, search_record, settings, kind, resolve_device(device), output, pool, leave_out)
+    device = resolve_device(device)
+    record = recorder(observations_path, search_record, settings, kind, device, output, pool, leave_out, oracle=oracle)
     before = StageRecord.load(search_record)
     if before.status == "failed":
         record.save(failure=f"search: {before.reason}")
@@ -129,15 +150,17 @@ def run(
     counts = result.twin.counts
     # Those that ran together count in the record of `fits`.
     counted = [*([] if leave_out else [problem.observations]), *fitted]
-    per_epoch = sum(observations.scenario.train_end - 1 for observations in counted)
+    per_epoch = sum(frames_seen(observations, oracle=oracle) - 1 for observations in counted)
     frames = (len(result.history) - result.epochs_together) * per_epoch
     facts = {
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
         "epochs": len(result.history),
+        "epochs_asked": problem.fit.total_epochs,
         "epochs_together": result.epochs_together,
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
+        **result.figures,
         "spring_updates": frames * counts["springs"] * counts["substeps"],
         **counts,
     }

@@ -33,6 +33,7 @@ class Row:
     """Record to write -> search.json to start from."""
     kind: Kind = "springs"
     settings: str = "{}"
+    oracle: bool = False
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,10 @@ class Member:
 def options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring fits`."""
     shared.add_observations(parser)
-    about = 'JSON list of rows: [{"kind": springs or field, "settings": as of `fit`, "fits": {fit.json: search.json, ...}}, ...]'
+    about = (
+        'JSON list of rows: [{"kind": springs or field, "settings": as of `fit`, "fits": {fit.json: search.json, ...}}, ...];'
+        ' "oracle": true fits all frames'
+    )
     parser.add_argument("--rows", required=True, help=about)
     shared.add_device(parser)
     shared.add_twins_per_launch(parser)
@@ -86,7 +90,7 @@ def run(observations_path: Path, rows: list[Row], device: str, output: Path, mos
         results = together([member.ready.problem.twin for member in group], device, [_work(member.ready) for member in group])
         for member, result in zip(group, results, strict=True):
             if isinstance(result, FitResult):
-                counts, frames = result.twin.counts, member.ready.problem.observations.scenario.train_end - 1
+                counts, frames = result.twin.counts, member.ready.problem.frame_end - 1
                 facts["spring_updates"] += result.epochs_together * frames * counts["springs"] * counts["substeps"]
             else:
                 facts["errors"][member.output] = f"{type(result).__name__}: {result}"
@@ -97,17 +101,19 @@ def run(observations_path: Path, rows: list[Row], device: str, output: Path, mos
 def _members(observations_path: Path, row: Row, device: str) -> Iterator[Member]:
     settings = shared.read_settings(row.settings)
     for output, search in row.fits.items():
-        own = alone.recorder(observations_path, Path(search), settings, row.kind, device, Path(output))
+        own = alone.recorder(observations_path, Path(search), settings, row.kind, device, Path(output), oracle=row.oracle)
         if StageRecord.load(Path(search)).status != "failed" and not _is_done(own):
             yield Member(output, alone.prepared(own, observations_path, Path(search), settings))
 
 
 def companies(members: Sequence[Member], most: int) -> list[list[Member]]:
-    """Which fits share launches, at most so many: those of equal horizon, which are in step. One alone shares with nobody."""
-    by_horizon: dict[int, list[Member]] = {}
+    """Which fits share launches, at most so many: those of equal horizon and as many frames, which are in step. One alone
+    shares with nobody."""
+    in_step: dict[tuple[int, int], list[Member]] = {}
     for member in members:
-        by_horizon.setdefault(member.ready.problem.fit.horizon, []).append(member)
-    groups = [alike[first : first + most] for alike in by_horizon.values() for first in range(0, len(alike), most)]
+        problem = member.ready.problem
+        in_step.setdefault((problem.fit.horizon, problem.frame_end), []).append(member)
+    groups = [alike[first : first + most] for alike in in_step.values() for first in range(0, len(alike), most)]
     return [group for group in groups if len(group) > 1]
 
 

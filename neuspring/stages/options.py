@@ -7,7 +7,7 @@ import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neuspring.core.errors import InputError
 
@@ -122,6 +122,14 @@ def read_settings(text: str) -> Config:
     for name in text.split(","):
         config.merge(values, config.read_yaml(Path(name)))
     return config.parse(config.Config, values, f"--settings {text}")
+
+
+def json_rows(option: str, text: str) -> list[dict[str, Any]]:
+    """The JSON list of objects given with an option. Raises InputError."""
+    values = json_mapping(option, f'{{"rows": {text}}}')["rows"]
+    if not isinstance(values, list) or not all(isinstance(row, dict) for row in values):
+        raise InputError(option, "must be a JSON list of objects", text)
+    return values
 
 
 def json_mapping(option: str, text: str) -> dict[str, object]:

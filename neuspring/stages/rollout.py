@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from neuspring.config import Carry, Config
+from neuspring.config.select import select
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.device import resolve_device
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.stages import STAGES
 from neuspring.stages import options as shared
 from neuspring.twin.carry import carry_over
 from neuspring.twin.motion import initial_velocity
@@ -23,31 +26,46 @@ def options(parser: ArgumentParser) -> None:
     shared.add_observations(parser)
     twins = "search.json or fit.json that names the twin; of several, the mean of the trajectories"
     parser.add_argument("--twin", type=Path, nargs="+", required=True, help=twins)
-    carry = "correct the state at the last training frame by what was observed there, where training frames say that it helps"
-    parser.add_argument("--carry-over", action="store_true", help=carry)
+    carry = "correct the state at the last training frame by what was observed until then, where training frames say that it helps"
+    kinds = {"choices": ("residuals", "state"), "nargs": "?", "const": "residuals", "default": None}
+    parser.add_argument("--carry-over", help=carry, **kinds)  # type: ignore[arg-type]
+    shared.add_settings(parser)
     shared.add_device(parser)
     shared.add_output(parser)
 
 
 def command(a: Namespace) -> None:
     """`neuspring rollout`."""
-    run(a.observations, a.twin, a.carry_over, a.device, a.output)
+    run(a.observations, a.twin, a.carry_over, a.device, a.output, shared.read_settings(a.settings))
 
 
-def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, device: str, output: Path) -> None:
+def run(
+    observations_path: Path,
+    twin_records: Sequence[Path],
+    carry: Carry | None,
+    device: str,
+    output: Path,
+    settings: Config | None = None,
+) -> None:
     """Write trajectory.npz and the record `output`. A rollout that diverges is recorded as a failure.
 
     With several records, the result is the mean of their trajectories. `carry` corrects the state at the last training frame by
-    what was observed there, where training frames say that it helps.
+    what was observed until then, where training frames say that it helps. A twin that saw the future is called `oracle`.
     """
+    settings = settings or Config()
     device = resolve_device(device)
     before = {path: StageRecord.load(path) for path in twin_records}
     inputs = {f"{record.stage}{index or ''}": path for index, (path, record) in enumerate(before.items())}
+    own: dict[str, Any] = {"carry_over": carry or False}
+    if carry == "state":
+        own |= {"task": "prediction from the last frame"} | select(settings, STAGES["rollout"].reads)
+    if any(record.settings.get("oracle") for record in before.values()):
+        own["oracle"] = True
     record = Recorder(
         "rollout",
         output,
         inputs={"observations": observations_path} | inputs,
-        settings={"carry_over": carry},
+        settings=own,
         device=device,
     )
     failed = next((stage for stage in before.values() if stage.status == "failed"), None)
@@ -62,7 +80,7 @@ def run(observations_path: Path, twin_records: Sequence[Path], carry: bool, devi
         trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity)
         updates += (len(trajectory.positions) - 1) * twin.counts["springs"] * twin.counts["substeps"]
         if carry:
-            trajectory, correction = carry_over(trajectory, twin, observations, velocity, device)
+            trajectory, correction = carry_over(trajectory, twin, observations, velocity, device, carry, settings.last_frame)
             corrections.append(correction)
         trajectories.append(trajectory)
     # A diverged rollout ends earlier; the mean would hide that.

@@ -30,6 +30,9 @@ PICTURE_ROLES = ("strip", "video", "turntable")
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
 """What a reader of image scores must know."""
 
+HELD = 0.05
+"""A share of springs at their bound above this, or of texels that moved below it, says that the settings were in training's way."""
+
 
 def options(parser: ArgumentParser) -> None:
     """Add the options of `neuspring score`."""
@@ -126,6 +129,7 @@ def run(
         **content,
         # Why LPIPS was not computed names places on this machine: beside the content, not in it.
         images=_picture_facts(stages.records),
+        floors=metrics.floors(observations),
         run_key=key_of(content, stages.results | {"scores": digest_file(folder / "scores.parquet")}),
         source=observations.scenario.source,
         category=observations.scenario.category,
@@ -232,10 +236,16 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
         if record.facts.get("links") == 0:
             notes.append(f"{name}: no anchor lies near a controller in frame 0, so the hands move nothing")
         if record.facts.get("rollbacks"):
-            epochs, wanted = record.facts["epochs"], record.settings["fit"]["epochs"]
+            epochs, wanted = record.facts["epochs"], record.facts["epochs_asked"]
             notes.append(f"{name}: {len(record.facts['rollbacks'])} of {epochs} epochs rolled back, {wanted} asked for")
         if record.facts.get("collision_overflow"):
             notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
+        if record.facts.get("at_bound", 0.0) > HELD:
+            notes.append(
+                f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"
+            )
+        if record.facts.get("texels_moved", 1.0) < HELD:
+            notes.append(f"{name}: only {record.facts['texels_moved']:.1%} of the texels moved by a tenth of their first scale")
     return notes
 
 

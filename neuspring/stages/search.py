@@ -1,4 +1,4 @@
-"""Observations -> coarse twin, by CMA-ES."""
+"""Observations -> coarse twin, by CMA-ES and a polish."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from neuspring.core.files import write_history
 from neuspring.core.records import Recorder
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
+from neuspring.twin.polish import CMAES, SLOPES
 from neuspring.twin.recordings import Recording
 from neuspring.twin.search import SearchProblem, search
 
@@ -105,10 +106,15 @@ def run(
         return
     result.twin.save(files["twin"])
     costs = result.trace["cost"]
-    write_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}, files["history"])
+    # Candidates for slopes are never the result.
+    best = costs.where(result.trace["stage"] != SLOPES).cummin().ffill()
+    write_history(costs.index, {"cost": costs, "best_cost": best}, files["history"])
     facts = {
         **result.values,
         "cost": result.cost,
+        "cost_before_polish": float(costs[result.trace["stage"] == CMAES].min()),
+        "spacing": problem.spacing,
+        "controller_reach": problem.reach,
         "rollouts": len(result.trace),
         "failed_rollouts": int((result.trace["reason"] != "").sum()),
         "collision_overflow": int(result.trace["collision_overflow"].max()),

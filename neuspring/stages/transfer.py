@@ -84,7 +84,9 @@ def _baseline_predictor(record: StageRecord, path: Path, settings: Config, devic
 def _twin_predictor(record: StageRecord, path: Path, settings: Config, device: str) -> Predictor:
     """How a twin predicts another recording."""
     twin = Twin.load(record.file("twin", path))
-    keep_lengths = bool(record.settings.get("fit", {}).get("rest_length_bound"))
+    settings_of_fit = record.settings.get("fit", {})
+    trained = settings_of_fit.get("rest_length_bound") or settings_of_fit.get("rest_shape", {}).get("handles")
+    keep_lengths = bool(trained)
     keep_frame_time = record.settings["released_quirks"]["frame_time_667"]
 
     def predict(observations: Observations) -> tuple[Trajectory, int, dict[str, float]]:

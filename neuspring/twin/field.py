@@ -19,8 +19,6 @@ from neuspring.config import SpringField as Settings
 
 AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
-PLANE_SCALE = 0.1
-"""Standard deviation of the texels at the start."""
 FEWEST_TEXELS = 2
 """Bilinear interpolation needs two texels per side."""
 
@@ -129,7 +127,7 @@ class SpringField(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.planes = None
         if settings.triplane:
-            self.planes = TriPlane(mapped, self.resolution, settings.channels, PLANE_SCALE, generator)
+            self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.texel_scale, generator)
         widths = [self._encoded_width(), settings.hidden, settings.hidden, outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         with torch.no_grad():

@@ -1,10 +1,14 @@
 """First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
-An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training
-span) one optimiser step is made with the gradient through those frames; the state is detached there and goes on while
-parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the
-training frames, to which the start counts too; test frames are never read. A non-finite loss or gradient restores the
+An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training span) one
+optimiser step is made with the gradient through those frames; the state is detached there and goes on while parameters change. The
+best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the training frames, to which the
+start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
 parameters of the epoch's start, halves the learning rates and is reported.
+
+What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
+is recorded is in m^2. Several weights of a prior are several trainings from the start, one after the other, and the held-back
+tail selects among the epochs of all.
 """
 
 from __future__ import annotations
@@ -28,11 +32,14 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame, solver_for
+from neuspring.physics.path import waypoints
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.company import Seat
-from neuspring.twin.losses import FrameLoss
+from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.motion import initial_velocity
+from neuspring.twin.movement import median_gradient, movement, watched
 from neuspring.twin.parameters import TwinParameters
+from neuspring.twin.unloaded import topology_spacing
 
 LOWEST_RATE = 0.01
 """Where the cosine schedule ends, as a fraction of the learning rate."""
@@ -58,11 +65,25 @@ class FitProblem:
     kind: Kind = "springs"
     seed: int = 0
     """Of the field's first weights."""
+    oracle: bool = False
+    """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
+
+    def __post_init__(self) -> None:
+        if self.oracle and self.fit.selection == "tail":
+            raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
+
+    @property
+    def frame_end(self) -> int:
+        """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
+        return frames_seen(self.observations, oracle=self.oracle)
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate)."""
+    """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate).
+
+    Epochs count through all weights of the priors. Gradients are those of the loss in its unit (`fit.loss_unit`).
+    """
 
     twin: Twin
     history: pd.DataFrame
@@ -78,6 +99,8 @@ class FitResult:
     collision_overflow: int
     epochs_together: int
     """Epochs that ran together with those of other fits."""
+    figures: dict[str, Any]
+    """What moved and what was in the way (`movement`), gradient_over_epsilon, and the chosen weights where there were several."""
 
 
 @dataclass
@@ -94,6 +117,8 @@ class _State:
     best_substeps: int
     substeps: int
     overflow: int = 0
+    gradient_over_epsilon: float | None = None
+    """Median |gradient| per step over Adam's epsilon, in the first epoch in which the median is not zero."""
 
     def checkpoint(self) -> Checkpoint:
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ARRAYS}
@@ -122,10 +147,15 @@ class TwinFit:
         observations, settings = problem.observations, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
-            observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators
+            observations,
+            problem.losses,
+            problem.device,
+            frozen_counts=problem.quirks.frozen_loss_denominators,
+            oracle=problem.oracle,
         )
-        end = observations.scenario.train_end
-        self.hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        end = problem.frame_end
+        hands = torch.tensor(observations.controller_points[:end], device=problem.device)
+        self.hands = waypoints(hands, problem.twin.simulation)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
@@ -133,7 +163,11 @@ class TwinFit:
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
-        self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas)
+        self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas, eps=settings.epsilon)
+        self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
+        """Loss units per m^2."""
+        self.gradients: list[float] | None = None
+        """Where to put the median |gradient| of each step, if it is wanted."""
         self.twin = problem.twin
         self._solver: FrameSolver | Seat | None = None
         self._overflow = 0
@@ -192,7 +226,8 @@ class TwinFit:
             if grown.load(simulation.substep) < enough:
                 return simulation.substeps
         topology = self.twin.topology
-        spectrum = stability.rest_spectrum(topology.springs, topology.nodes, topology.controllers, stiffness, dashpot)
+        graph = topology.springs, topology.nodes, topology.controllers
+        spectrum = stability.rest_spectrum(*graph, stiffness, dashpot, self.twin.material.mass)
         self._known = (spectrum, stiffness, dashpot)
         if spectrum.load(simulation.substep) < enough:
             return simulation.substeps
@@ -207,6 +242,8 @@ class TwinFit:
     def start_epoch(self, epoch: int, rate: float) -> None:
         """Set what an epoch trains, and the learning rates: the settings' times `rate` (halved by rollbacks)."""
         settings = self.problem.fit
+        weights, epoch = divmod(epoch, settings.epochs)
+        self.parameters.priors = settings.priors[weights]
         self.parameters.homogeneous = epoch < settings.homogeneous_epochs
         factor = rate * min((epoch + 1) / (settings.warmup_epochs + 1), 1.0)
         if settings.schedule == "cosine":
@@ -229,7 +266,7 @@ class TwinFit:
             x, v, mean = self._simulate(x, v, window, packed)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
-            objective = mean + self.parameters.penalty()
+            objective = self.loss_scale * mean + self.parameters.penalty()
             if objective.requires_grad:
                 objective.backward()  # type: ignore[no-untyped-call]
             total += float(mean.detach()) * len(window)
@@ -267,6 +304,8 @@ class TwinFit:
         norm = torch.nn.utils.get_total_norm([tensor.grad for tensor in tensors])  # type: ignore[misc]
         if not bool(torch.isfinite(norm)):
             raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
+        if self.gradients is not None:
+            self.gradients.append(median_gradient(watched(self.parameters)))
         limit = self.problem.fit.clip_gradient_norm
         if limit:
             torch.nn.utils.clip_grads_with_norm_(tensors, limit, norm)
@@ -277,6 +316,16 @@ class TwinFit:
         """Set parameters and Adam's state."""
         self.parameters.restore(values)
         restore_adam(self.optimiser, moments)
+
+    def figures(self, state: _State) -> dict[str, Any]:
+        """What the fit's record says of the selected values, which are the present ones."""
+        settings, figures = self.problem.fit, movement(self.parameters)
+        if state.gradient_over_epsilon is not None:
+            figures["gradient_over_epsilon"] = state.gradient_over_epsilon
+        if len(settings.priors) > 1 and state.best_epoch >= 0:
+            chosen = settings.priors[state.best_epoch // settings.epochs]
+            figures |= dict(zip(("rest_prior", "rest_shape_prior"), chosen, strict=True))
+        return figures
 
 
 def fit(
@@ -294,17 +343,19 @@ def fit(
     `seat` the simulation shares launches with other fits (company.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
     several recordings (pooled.py). Raises NumericalFailure if no epoch could be completed.
     """
-    label = f"fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
+    label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(seat.company.seats) if seat else 1.0
-    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
+    loop = TrainingLoop("the fit", label, problem.fit.total_epochs, problem.fit.checkpoint_every, partial, key, share=share)
     run = (run_of or TwinFit)(problem, seat)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
     for epoch in loop:
-        if len(state.rollbacks) >= MAX_ROLLBACKS:
+        if len(state.rollbacks) >= MAX_ROLLBACKS * len(problem.fit.priors):
             break
+        if epoch and epoch % problem.fit.epochs == 0:
+            _start_again(run, state)
         row = _advance(run, state, problem, epoch)
         state.overflow = overflow + run.collision_overflow
         loop.record(row, f"loss {row['loss']:.3e} m^2" if not row["rolled_back"] else "rolled back")
@@ -326,7 +377,16 @@ def fit(
         loop.earlier_seconds,
         state.overflow,
         loop.epochs_together,
+        run.figures(state),
     )
+
+
+def _start_again(run: TwinFit, state: _State) -> None:
+    """Back to where the fit began, for the next weights; the best epoch so far is kept."""
+    state.values, state.moments, state.rate = run.parameters.first, {}, 1.0
+    state.substeps = run.problem.twin.simulation.substeps
+    run.use_substeps(state.substeps)
+    run.restore(state.values, state.moments)
 
 
 def _start(run: TwinFit, problem: FitProblem) -> _State:
@@ -356,8 +416,11 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
     row["learning_rate"] = run.optimiser.param_groups[0]["lr"]
     try:
         before = (state.values, state.substeps)
+        run.gradients = [] if state.gradient_over_epsilon is None else None
         losses = run.epoch()
         run.settled()
+        if run.gradients and (median := float(np.median(run.gradients))):
+            state.gradient_over_epsilon = median / problem.fit.epsilon
         if problem.fit.selection == "tail" and not run.one_step:
             losses["tail_loss"] = run.tail_loss()
         state.values, state.moments, state.substeps = (
@@ -367,9 +430,10 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
         )
         row |= losses
         loss = losses["tail_loss" if problem.fit.selection == "tail" else "loss"]
-        if _eligible(epoch, problem) and loss < state.best_loss:
+        within = epoch % problem.fit.epochs
+        if _eligible(within, problem) and loss < state.best_loss:
             state.best_loss = loss
-            state.best_epoch = epoch - run.one_step
+            state.best_epoch = epoch - run.one_step if within else (-1 if run.one_step else epoch)
             state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
     except NonFinite as failure:
         state.rollbacks.append(f"epoch {epoch}: {failure}")

@@ -21,6 +21,12 @@ CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
 
 
+def frames_seen(observations: Observations, *, oracle: bool) -> int:
+    """Frames that a loss may read, from frame 0 on: those before the split; all of them for an oracle."""
+    scenario = observations.scenario
+    return scenario.frame_count if oracle else scenario.train_end
+
+
 def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
     """Index [P] of the nearest node (Euclidean, lowest index on ties) for points [P, 3] among nodes [M, 3]."""
     rows = max(1, CHUNK_ENTRIES // max(1, len(nodes)))
@@ -64,7 +70,7 @@ def acceleration(change: torch.Tensor, previous: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class FrameLoss:
-    """The observations of a scenario as tensors, and the loss of each training frame.
+    """The observations of a scenario as tensors, and the loss of each frame that they hold: the training frames.
 
     `frozen_counts` divides every frame by the valid counts of frame 1 (released quirk 4).
     """
@@ -85,9 +91,13 @@ class FrameLoss:
         dtype: torch.dtype = torch.float32,
         *,
         frozen_counts: bool = False,
+        oracle: bool = False,
     ) -> FrameLoss:
-        """Keep training frames only: losses never see the future."""
-        end = observations.scenario.train_end
+        """Keep training frames only: losses never see the future. `oracle` is the one exception: all frames are kept.
+
+        Only a method row with `oracle: true` sets it. Such a row predicts nothing, and its records say so.
+        """
+        end = frames_seen(observations, oracle=oracle)
         points = torch.tensor(observations.object_points[:end], dtype=dtype, device=device)
         visible = torch.tensor(observations.object_visibility[:end], device=device)
         valid = torch.tensor(observations.object_motion_valid[:end], device=device)

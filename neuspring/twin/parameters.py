@@ -6,8 +6,10 @@ rest lengths stay free per spring unless `rest_lengths_by` says otherwise). With
     stiffness    Y = Y0 exp(b(o_Y)), clamped to the stiffness range     (linear field: Y0 (1 + b(o_Y)))
     dashpot      g = g0 exp(b(o_g))                                     if damping is trained
     rest length  l = l0 exp(r tanh(o_l))                                if rest_length_bound r > 0
+                 l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (unloaded.py)
 
-Beside them: four contact scalars, drag = drag0 exp(.), and the homogeneous factors of a warm start.
+Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`, or a warm start),
+drag and dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
 """
 
 from __future__ import annotations
@@ -29,8 +31,13 @@ from neuspring.physics import contact
 from neuspring.physics.autograd import pack, twin_tensors
 from neuspring.physics.solver import Parameters
 from neuspring.twin.field import SpringField, midpoints
+from neuspring.twin.unloaded import UnloadedShape
 
 CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
+DAMPING_FACTORS = ("drag", "dashpot", "drag_quadratic")
+"""Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
+SPRING_FACTORS = ("stiffness", "dashpot")
+"""Those that may have a factor of their own for controllers' springs."""
 UNTRAINED = ("contact_distance",)
 """It only selects pairs, so it has no gradient."""
 LOWEST_STIFFNESS = 1e-3
@@ -78,6 +85,7 @@ class TwinParameters(nn.Module):
         self.channels += ["rest_lengths"] if settings.rest_length_bound and shared_rest else []
         topology = twin.topology
         count = len(topology.springs)
+        self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
         self.covered = count if settings.field.controllers or kind == "springs" else topology.object_spring_count
         self.offsets, self.field, self.rest_offsets = None, None, None
         if settings.rest_length_bound and not shared_rest:
@@ -91,13 +99,22 @@ class TwinParameters(nn.Module):
             points = midpoints(topology.canonical, topology.springs)[: self.covered]
             self.field = SpringField(points, settings.field, len(self.channels), seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
-        self.factors = nn.ParameterDict()
-        names = ["stiffness"] if settings.homogeneous_epochs else []
-        for name in names + (["drag", "dashpot"] if settings.damping != "fixed" else []):
-            self.factors[name] = nn.Parameter(torch.zeros(()))
+        self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
+        self.unloaded = UnloadedShape(topology, settings.rest_shape.handles) if settings.rest_shape.handles else None
         self.homogeneous = False
-        """While true, offsets are not trained."""
+        """While true, offsets and the unloaded shape are not trained."""
+        self.priors = settings.priors[0]
+        """Weights (rest_prior, rest_shape.prior) of the penalty."""
         self.to(device)
+        self.first = self.copy()
+        """The trained values before the first step."""
+
+    def _factor_names(self) -> list[str]:
+        """Common factors that are trained: what they scale, or `controller_` and what they scale of controllers' springs."""
+        s = self.settings
+        names = ["stiffness"] if s.homogeneous_epochs or s.global_stiffness else []
+        names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
+        return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
 
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later) and weight decay."""
@@ -112,7 +129,11 @@ class TwinParameters(nn.Module):
                 groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate, decay))
         if self.rest_offsets is not None:
             groups.append(([self.rest_offsets], s.rest_learning_rate or rate, 0.0))
-        groups.append(([*self.scalars.values(), *self.factors.values()], s.scalar_learning_rate or rate, 0.0))
+        groups.append((self.scalars.values(), s.scalar_learning_rate or rate, 0.0))
+        if self.factors:
+            groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate, 0.0))
+        if self.unloaded is not None:
+            groups.append((self.unloaded.parameters(), s.rest_shape.learning_rate, 0.0))
         return [{"params": list(each), "lr": rate, "base_rate": rate, "weight_decay": decay} for each, rate, decay in groups]
 
     def raw_offsets(self) -> torch.Tensor:
@@ -126,30 +147,48 @@ class TwinParameters(nn.Module):
             raw = torch.cat([raw, raw.new_zeros(missing, raw.shape[1])]) if missing else raw
         return raw.detach() if self.homogeneous else raw
 
-    def physical(self) -> dict[str, torch.Tensor]:
-        """Every physical parameter, with the keyword names of `autograd.pack`."""
-        s, values = self.settings, dict(self.start)
+    def raw(self) -> dict[str, torch.Tensor]:
+        """Offsets [S] before bounding, by what they change."""
         raw = dict(zip(self.channels, self.raw_offsets().unbind(dim=1), strict=True))
         if self.rest_offsets is not None:
             raw["rest_lengths"] = self.rest_offsets.detach() if self.homogeneous else self.rest_offsets
-        offset = bounded(raw["stiffness"], s.output_bound)
-        linear = self.kind == "field" and s.field.scale == "linear"
-        factor = 1 + offset if linear else offset.exp()
-        if linear and s.output_bound:
-            factor = inward_clamp(factor, math.exp(-s.output_bound), math.exp(s.output_bound))
-        if "stiffness" in self.factors:
-            factor = factor * self.factors["stiffness"].exp()
-        stiffness = self.start["stiffness"] * factor
+        return raw
+
+    def deviation(self, offset: torch.Tensor) -> torch.Tensor:
+        """Factor of each spring's stiffness [S], apart from common factors, for offsets [S] before bounding."""
+        bound = self.settings.output_bound
+        within = bounded(offset, bound)
+        if self.kind == "springs" or self.settings.field.scale == "log":
+            return within.exp()
+        return inward_clamp(1 + within, math.exp(-bound), math.exp(bound)) if bound else 1 + within
+
+    def _common(self, name: str) -> torch.Tensor | float:
+        """The common factor of a physical value: one number, or a number per spring."""
+        if name not in self.factors:
+            return 1.0
+        factor: torch.Tensor = self.factors[name].exp()
+        if f"controller_{name}" not in self.factors:
+            return factor
+        of_controllers = self.factors[f"controller_{name}"].exp()
+        return torch.where(self.on_controller, of_controllers, factor)
+
+    def physical(self) -> dict[str, torch.Tensor]:
+        """Every physical parameter, with the keyword names of `autograd.pack`."""
+        s, values, raw = self.settings, dict(self.start), self.raw()
+        stiffness = self.start["stiffness"] * (self.deviation(raw["stiffness"]) * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
         values["stiffness"] = clamp(stiffness, *s.stiffness_range)
-        if "drag" in self.factors:
-            values["drag"] = self.start["drag"] * self.factors["drag"].exp()
-            values["dashpot"] = self.start["dashpot"] * self.factors["dashpot"].exp()
+        for name in DAMPING_FACTORS:
+            if name in self.factors:
+                values[name] = self.start[name] * self._common(name)
         if "dashpot" in raw:
             values["dashpot"] = values["dashpot"] * bounded(raw["dashpot"], s.output_bound).exp()
+        if self.unloaded is not None:
+            ratio = self.unloaded()
+            values["rest_lengths"] = self.start["rest_lengths"] * (ratio.detach() if self.homogeneous else ratio)
         if "rest_lengths" in raw:
-            values["rest_lengths"] = self.start["rest_lengths"] * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).exp()
+            values["rest_lengths"] = values["rest_lengths"] * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).exp()
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float) -> Parameters:
@@ -157,11 +196,19 @@ class TwinParameters(nn.Module):
         return pack(**self.physical(), substep=substep)
 
     def penalty(self) -> torch.Tensor:
-        """The regularizer of a step: the weighted roughness of the planes."""
-        weight = self.settings.field.plane_smoothness
-        if self.field is None or not weight or self.homogeneous:
-            return torch.zeros(())
-        return weight * self.field.roughness()
+        """The regularizers of a step, in the loss unit: roughness of the planes, changes of rest lengths, each with its weight."""
+        s, total = self.settings, torch.zeros(())
+        if self.homogeneous:
+            return total
+        if self.field is not None and s.field.plane_smoothness:
+            total = total + s.field.plane_smoothness * self.field.roughness()
+        lengths, shape = self.priors
+        raw = self.raw() if lengths else {}
+        if "rest_lengths" in raw:
+            total = total + lengths * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).square().mean()
+        if self.unloaded is not None and shape:
+            total = total + shape * (self.unloaded() - 1).square().mean()
+        return total
 
     def copy(self) -> dict[str, np.ndarray]:
         """The trained values as arrays."""
@@ -183,6 +230,9 @@ class TwinParameters(nn.Module):
             value = np.clip(values[name], *limits)
             material[name] = value if value.ndim else float(value)
         topology = twin.topology
-        if self.settings.rest_length_bound:
+        if self.settings.rest_length_bound or self.unloaded is not None:
             topology = replace(topology, rest_lengths=values["rest_lengths"])
+        if self.unloaded is not None:
+            shape = topology.canonical + self.unloaded.displacement().detach().cpu().numpy()
+            topology = replace(topology, rest_shape=shape.astype(np.float32))
         return replace(twin, material=replace(twin.material, **material), topology=topology)

@@ -1,7 +1,8 @@
 """First-order stage on several recordings of one object: one material; for each recording its own hands, start and frames.
 
 An epoch is one pass over each recording in turn, with the same parameters and the same state of Adam. Stiffness, dashpots, drag and
-contact are shared, and so are trained rest lengths, as factors on the distances in each recording's rest shape.
+contact are shared, and so are trained rest lengths, as factors on the distances in each recording's rest shape: those of springs,
+and those that the estimated shape makes (unloaded.py), whose displacement lives in the rest shape of the problem's own recording.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from neuspring.twin.recordings import on_recording, require_pool
 class PooledFit(TwinFit):
     """Epochs over a pool. Parameters and twin are those on the nodes of the problem; with no pool, the fit is that of `TwinFit`.
 
-    All recordings take as many substeps per frame as the one that needs most. Losses are means over the recordings.
+    All recordings take as many substeps per frame as the one that needs most. Losses are means over the recordings, in one unit.
+    An oracle's are over all frames of the recordings that count.
     """
 
     def __init__(
@@ -45,6 +47,8 @@ class PooledFit(TwinFit):
         member.parameters = copy.copy(self.parameters)
         member.parameters.start = start
         member.optimiser = self.optimiser
+        # Frame 0 of each recording has a spacing of its own; a meter must weigh the same in all.
+        member.loss_scale = self.loss_scale
         return member
 
     @property
@@ -76,10 +80,12 @@ class PooledFit(TwinFit):
         """As of one recording."""
         super().start_epoch(epoch, rate)
         for member in self._members:
-            member.parameters.homogeneous = self.parameters.homogeneous
+            member.parameters.homogeneous, member.parameters.priors = self.parameters.homogeneous, self.parameters.priors
 
     def epoch(self) -> dict[str, float]:
         """One pass over each recording; raises NonFinite. Means over the recordings, and the largest gradient of any step."""
+        for member in self._members:
+            member.gradients = self.gradients
         rows = [member.epoch() for member in self._members]
         if len(rows) == 1:
             return rows[0]

@@ -11,6 +11,7 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
+from neuspring.physics.path import waypoints
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.transfer import corresponds, rebase
@@ -19,11 +20,11 @@ from neuspring.twin.trials import Outcome
 
 @dataclass(frozen=True)
 class Recording:
-    """The training frames of a recording: hands and start state of its own, and the losses of its frames."""
+    """The training frames of a recording: hands and start velocities of its own, and the losses of its frames."""
 
     observations: Observations
     hands: torch.Tensor
-    """Controllers [train_end, C, 3], m."""
+    """Waypoints of the controllers (path.py), [train_end, C, 3] or [train_end, C, 6], m."""
     velocity: torch.Tensor
     """Of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
@@ -38,10 +39,11 @@ class Recording:
         device: str = "cpu",
     ) -> Recording:
         """A recording, judged with the settings of a search."""
+        hands = torch.tensor(observations.controller_points, device=device)[: observations.scenario.train_end]
         velocity = initial_velocity(observations, simulation.initial_velocity)
         return cls(
             observations,
-            torch.tensor(observations.controller_points, device=device)[: observations.scenario.train_end],
+            waypoints(hands, simulation),
             torch.tensor(velocity, dtype=torch.float32, device=device),
             FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators),
         )

@@ -1,7 +1,8 @@
 """A twin on other nodes of the same body: another sampling, another spacing.
 
-Nodes have unit mass, so n nodes are a body of n kg, and the same motion needs the same forces per mass at every sampling. For a
-strain eps, a strain rate eps' and a displacement u of the hand against the body, with springs of length l along d:
+Nodes have unit mass, or masses with that mean, so n nodes are a body of n kg, and the same motion needs the same forces per mass at
+every sampling. For a strain eps, a strain rate eps' and a displacement u of the hand against the body, with springs of length l
+along d:
 
     elastic energy per node    (1/n) sum_e  Y_e l_e (d eps d)^2 / 2     so   sum Y l / n     is kept   (Y ~ 1 / spacing)
     dissipation per node       (1/n) sum_e  g_e l_e^2 (d eps' d)^2      so   sum g l^2 / n   is kept   (g ~ 1 / spacing^2)
@@ -23,8 +24,9 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.field import midpoints
+from neuspring.twin.masses import volume_masses
 from neuspring.twin.register import Registration, register, spacing
-from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology
+from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology, unloaded
 
 NEAREST = 8
 """Springs that a spring's values are the mean of."""
@@ -38,9 +40,10 @@ MARGIN = 1 + 1e-6
 def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
     """The twin on the nodes and hands of another recording, and how its shape was laid onto the twin's.
 
-    A spring takes stiffness, dashpot and strain at rest (rest length over distance) from the nearest springs of the twin, object
-    and controller springs apart, as geometric means weighted by inverse distance, and the sums above are kept. Substeps and
-    scenario are still the twin's. Raises InputError if the shapes do not fit, or no hand reaches a node.
+    A spring takes stiffness, dashpot and strain at rest (rest length over distance without force) from the nearest springs of the
+    twin, object and controller springs apart, as geometric means weighted by inverse distance, and the sums above are kept. Masses,
+    where nodes have any, are those of the new nodes' volumes. Substeps and scenario are still the twin's. Raises InputError if the
+    shapes do not fit, or no hand reaches a node.
     """
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
     nodes, count = len(old.nodes), len(observations.nodes)
@@ -69,11 +72,13 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
         max(round(held * count / nodes), 1),
         repair=True,
         rest_shape=observations.rest_shape,
+        controller_rest=old.controller_rest,
     )
     if old.object_spring_count < len(old.springs) and new.object_spring_count == len(new.springs):
         rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
         raise InputError(name, rule, "none is", "Check the controllers of frame 0.")
-    material = replace(twin.material, contact_distance=twin.material.contact_distance * factor)
+    mass = volume_masses(there[:count]) if len(twin.material.mass) else twin.material.mass
+    material = replace(twin.material, contact_distance=twin.material.contact_distance * factor, mass=mass)
     return _carried(twin, new, material, np.concatenate([laid.points, laid.others])), laid
 
 
@@ -127,7 +132,7 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
     values = {
         "stiffness": twin.material.stiffness.astype(np.float64),
         "dashpot": twin.material.dashpot.astype(np.float64),
-        "strain": old.rest_lengths / lengths[id(old)],
+        "strain": old.rest_lengths / _without_force(old),
     }
     middle, middle_laid = midpoints(old.canonical, old.springs), midpoints(laid, new.springs)
     found = {name: np.zeros(len(new.springs)) for name in values}
@@ -146,7 +151,13 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
             found[name][there] *= before / after if after > 0 else 1.0
     found["strain"][found["strain"] == 0] = 1.0
     material = replace(material, stiffness=found["stiffness"], dashpot=found["dashpot"])
-    return replace(twin, topology=replace(new, rest_lengths=lengths[id(new)] * found["strain"]), material=material)
+    return replace(twin, topology=replace(new, rest_lengths=_without_force(new) * found["strain"]), material=material)
+
+
+def _without_force(topology: Topology) -> np.ndarray:
+    """Distance of the ends of each spring [S], m, where it has no force."""
+    parts = topology.nodes, topology.controllers, topology.springs, topology.rest_shape
+    return unloaded(*parts, topology.controller_rest)
 
 
 def _parts(topology: Topology) -> tuple[slice, slice]:

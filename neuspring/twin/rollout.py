@@ -11,6 +11,7 @@ import torch
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.physics import stability
 from neuspring.physics.autograd import solver_for
+from neuspring.physics.path import waypoints
 from neuspring.physics.solver import FrameSolver
 
 FAR = 1e3
@@ -32,7 +33,7 @@ def frames(
     velocity: np.ndarray | None = None,
     positions: np.ndarray | None = None,
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
-    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3]. Raises Diverged.
+    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (path.waypoints). Raises Diverged.
 
     `velocity` [N, 3], m/s, and `positions` [N, 3], m, are those of frame 0; none means at rest, and where the twin's nodes are.
     """
@@ -75,7 +76,7 @@ def simulate(
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
     try:
-        for frame, x, _ in frames(twin, solver, hands, velocity):
+        for frame, x, _ in frames(twin, solver, waypoints(hands, twin.simulation), velocity):
             positions.append(x.cpu())
             if progress is not None:
                 progress(frame)

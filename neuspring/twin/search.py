@@ -1,10 +1,10 @@
-"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
+"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code), then a polish (polish.py).
 
-Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them. A candidate is a
-whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss. The best
-candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology; then
-the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so does a
-finished one with a larger budget: CMA-ES is replayed with the recorded costs.
+Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them, less `search.fixed`. A
+candidate is a whole twin: its springs are built, it is rolled out over the training frames, and its cost is the mean training loss.
+The best candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology;
+then the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so
+does a finished one with a larger budget: CMA-ES is replayed with the recorded costs, the polish with the recorded products.
 """
 
 from __future__ import annotations
@@ -13,27 +13,34 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import cma
 import numpy as np
 import pandas as pd
 import torch
 
 from neuspring import config
+from neuspring.config.search import LENGTHS
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.files import write_atomically
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.physics.path import waypoints
+from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
+from neuspring.twin.masses import volume_masses
 from neuspring.twin.motion import initial_velocity
+from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
+from neuspring.twin.proposals import Proposals
 from neuspring.twin.recordings import Recording, mean_outcome, on_recording, require_pool
+from neuspring.twin.residuals import Residuals
+from neuspring.twin.rollout import FAR
+from neuspring.twin.spacing import controller_reach, node_spacing
 from neuspring.twin.topology import isolated, piecewise_topology, regions
-from neuspring.twin.trials import Outcome, outcomes
+from neuspring.twin.trials import Outcome, motions, outcomes
 
 INTEGERS = ("object_neighbours", "controller_neighbours")
 REGIONAL = ("object_radius", "object_neighbours")
@@ -63,19 +70,34 @@ class SearchProblem:
     threads: int = 1
     """Threads that simulate at the same time, on a CPU."""
     pool: tuple[Recording, ...] = ()
-    """Other recordings of the object. A candidate is moved to each, and its cost is the mean over all."""
+    """Other recordings of the object; a candidate's cost is the mean over all.
+
+    Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's masses, `spacing`
+    and `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
+    nodes there, and the material of one topology would be judged on another.
+    """
     leave_out: bool = False
-    """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts."""
+    """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts, neither for costs nor for slopes."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
+    mass: np.ndarray = field(init=False)
+    """Mass of each node [N], kg; empty: 1 each."""
     velocity: np.ndarray = field(init=False)
     """Velocity of each node in frame 0 [N, 3], m/s."""
+    spacing: float = field(init=False)
+    """Distance between neighboring nodes in the rest shape, m (spacing.py)."""
+    reach: float = field(init=False)
+    """Smallest distance between a controller and a node in the rest shape, m."""
 
     def __post_init__(self) -> None:
         require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
-        nodes = self.observations.canonical[: len(self.observations.nodes)]
+        canonical, count = self.observations.canonical, len(self.observations.nodes)
+        nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
+        object.__setattr__(self, "mass", volume_masses(nodes) if self.simulation.mass == "volume" else np.zeros(0))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+        object.__setattr__(self, "spacing", node_spacing(nodes))
+        object.__setattr__(self, "reach", controller_reach(nodes, hands))
 
     @property
     def simulated_frames(self) -> int:
@@ -84,36 +106,54 @@ class SearchProblem:
         return sum(observations.scenario.train_end - 1 for observations in counted)
 
     @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of the variables: those of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one region)."""
+    def names(self) -> tuple[str, ...]:
+        """All that makes a candidate: the fields of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
         for f in fields(config.SearchRanges):
+            if f.name in self.search.absent:
+                continue
             regional = f.name in REGIONAL and self.clusters > 1
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
         return tuple(names)
 
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of what is searched: `names` without `search.fixed`."""
+        return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
+
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
-        """Physical values of normalized variables [2K + 10]; neighbor counts are truncated to integers."""
+        """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
+        searched = dict(zip(self.variables, normalized, strict=True))
         values = {}
-        for name, u in zip(self.variables, normalized, strict=True):
-            base, low, high, logarithmic = self._range(name)
-            value = float(low * (high / low) ** float(u)) if logarithmic else low + float(u) * (high - low)
-            values[name] = float(int(value)) if base in INTEGERS else value
+        for name in self.names:
+            base = name.partition(".")[0]
+            if name in searched:
+                low, high = getattr(self.search.ranges, base)
+                u = float(searched[name])
+                value = float(low * (high / low) ** u) if self._is_log(base) else low + u * (high - low)
+            else:
+                value = float(getattr(self.search.start, base))
+            values[name] = float(int(value)) if base in INTEGERS else self._meters(base, value)
         return values
 
     def encode(self) -> np.ndarray:
-        """Normalized variables [2K + 10] of the starting values."""
+        """Normalized `variables` of the starting values."""
         normalized = []
         for name in self.variables:
-            base, low, high, logarithmic = self._range(name)
+            base = name.partition(".")[0]
+            low, high = getattr(self.search.ranges, base)
             value = getattr(self.search.start, base)
-            normalized.append(np.log(value / low) / np.log(high / low) if logarithmic else (value - low) / (high - low))
+            normalized.append(np.log(value / low) / np.log(high / low) if self._is_log(base) else (value - low) / (high - low))
         return np.array(normalized)
 
-    def _range(self, name: str) -> tuple[str, float, float, bool]:
-        """The setting of a variable, its range, and whether its scale is logarithmic."""
-        base = name.partition(".")[0]
-        return base, *getattr(self.search.ranges, base), base == "stiffness" and self.search.stiffness_scale == "log"
+    def _is_log(self, base: str) -> bool:
+        return bool(getattr(self.search.scales, base) == "log")
+
+    def _meters(self, base: str, value: float) -> float:
+        """A setting's value; of a length in m, whatever unit it is searched in."""
+        if base not in LENGTHS or self.search.lengths == "meter":
+            return value
+        return value * self.spacing + (self.reach if base == "controller_radius" else 0.0)
 
     def of_regions(self, values: dict[str, float], name: str) -> list[float]:
         """A regional variable's value in each region."""
@@ -133,6 +173,7 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         collision_capacity=settings.collision_capacity,
         controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
+        controller_path=settings.controller_path,
     )
 
 
@@ -166,6 +207,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         int(values["controller_neighbours"]),
         repair=isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
+        controller_rest=problem.search.controller_rest,
     )
     count = len(topology.springs)
     if count == 0:
@@ -173,22 +215,34 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     lonely = isolated(len(topology.nodes), topology.springs)
     if isolated_nodes == "penalise" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
-    material = homogeneous(values, count)
+    material = replace(homogeneous(values, count), mass=problem.mass)
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
-    """A material that is the same everywhere; `values` has a number for every field of `Material`."""
-    numbers: dict[str, Any] = {f.name: values[f.name] for f in fields(Material)}
-    arrays = {f.name: np.full(springs, values[f.name]) for f in fields(Material) if "shape" in f.metadata}
+    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
+    every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
+    numbers: dict[str, Any] = {name: values[name] for name in every}
+    arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}
     return Material(**(numbers | arrays))
 
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of candidates that are rolled out together over the training frames."""
+    return outcomes(twins, *_motion(problem), loss, problem.device)
+
+
+def _motion(problem: SearchProblem) -> tuple[torch.Tensor, torch.Tensor]:
+    """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    start = torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-    return outcomes(twins, hands, start, loss, problem.device)
+    hands = waypoints(hands, simulation_of(problem, 1))
+    return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
+
+
+def _recordings(problem: SearchProblem, loss: FrameLoss) -> dict[int, Recording]:
+    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own."""
+    own = {} if problem.leave_out else {0: Recording(problem.observations, *_motion(problem), loss)}
+    return own | dict(enumerate(problem.pool, start=1))
 
 
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
@@ -249,19 +303,27 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
     clock = time.perf_counter()
-    trace, attempts, earlier = _recorded(record, key)
+    rows, attempts, earlier = trace_file.recorded(record, key)
+    trace = [row for row in rows if row["stage"] == CMAES]
     saved = len(trace)
-    proposals = _Proposals(problem, seed)
+    proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    budget = problem.search.rollouts
-    progress = Progress(f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", budget)
+    budget = problem.search.cma_rollouts
+    progress = Progress(
+        f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", problem.search.rollouts
+    )
+
+    def save(kept: list[dict[str, Any]]) -> None:
+        if record is not None:
+            trace_file.save(record, key, kept, attempts, earlier + time.perf_counter() - clock)
+
     start = 0
     with _threads(problem.threads) as each:
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
         while start < budget:
             population = proposals.ask()[: budget - start]
             stop = start + len(population)
-            if not _replays(trace[start:stop], population, problem.variables):
+            if not trace_file.replays(trace[start:stop], population, problem.variables):
                 print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
                 trace, saved = trace[:start], start
                 if not start:
@@ -272,19 +334,101 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
             progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])
             start = stop
-            if record is not None and len(trace) > saved:
-                _save(record, key, trace, attempts, earlier + time.perf_counter() - clock)
-    table = pd.DataFrame(trace[:budget])
-    best = table.iloc[int(table["cost"].to_numpy().argmin())]
+            if len(trace) > saved:
+                save(trace)
+        polished: list[dict[str, Any]] = []
+        recorded = [row for row in rows if row["stage"] != CMAES]
+        for polished in _polished(problem, trace[:budget], recorded, loss, proposals.generation, each):
+            if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
+                save(trace + polished)
+            progress.update(budget + len(polished), "polish")
+    table = pd.DataFrame(trace[:budget] + polished)
+    judged = table[table["stage"] != SLOPES]
+    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
         if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
             rule = f"at least one of {len(table)} candidates must be stable with this count"
             raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
-    values = {name: float(best[name]) for name in problem.variables}
+    values = {name: float(best[name]) for name in problem.names}
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+
+
+def _polished(
+    problem: SearchProblem,
+    trace: Sequence[dict[str, Any]],
+    recorded: Sequence[dict[str, Any]],
+    loss: FrameLoss,
+    generation: int,
+    each: Map,
+) -> Iterator[list[dict[str, Any]]]:
+    """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
+    best = min(trace, key=lambda row: row["cost"])
+    if not problem.search.polish_rounds or best["cost"] >= PENALTY:
+        return
+    start = np.array([best[f"normalised.{name}"] for name in problem.variables])
+    columns = [problem.variables.index(name) for name in problem.search.polished]
+    polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
+    while not polish.done:
+        generation += 1
+        population, first = polish.ask(), len(trace) + len(rows)
+        made = list(recorded[len(rows) : len(rows) + len(population)])
+        same = len(made) == len(population) and all(row["rollout"] == first + k for k, row in enumerate(made))
+        if not same or not trace_file.replays(made, population, problem.variables):
+            made, recorded = [], []
+            if polish.stage == SLOPES:
+                made = _slopes(problem, population, polish.steps(), loss, first, generation, each)
+            else:
+                made = [row | {"stage": POLISH} for row in _evaluate(problem, population, loss, first, generation, each)]
+        rows = rows + made
+        polish.tell(made)
+        yield rows
+
+
+def _slopes(
+    problem: SearchProblem,
+    population: Sequence[np.ndarray],
+    steps: np.ndarray,
+    loss: FrameLoss,
+    index: int,
+    generation: int,
+    each: Map,
+) -> list[dict[str, Any]]:
+    """Rows of a base and its neighbors, with the products of their slopes.
+
+    The residuals of R recordings are stacked and divided by sqrt(R), so that the sum of their squares is the mean cost: products
+    are means over the recordings. A neighbor that leaves the scene in one of them has no slope.
+    On each recording all take as many substeps as the one that needs most: another step would move a twin as a small change of a
+    variable does.
+    """
+    clock = time.perf_counter()
+    made = list(each(lambda normalized: _made(problem, normalized), population))
+    base = made[0][1]
+    assert base, "the base was simulated before"
+    families = [family or base for _, family in made]
+    most = [max(twin.simulation.substeps for twin in twins) for twins in zip(*families, strict=True)]
+    fine, seen = [bool(family) for _, family in made], []
+    for place, recording in _recordings(problem, loss).items():
+        twins = [family[place] for family in families]
+        twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
+        positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
+        fine = [known and bool((positions[:, k].abs() < FAR).all()) for k, known in enumerate(fine)]
+        seen.append((Residuals.of(recording.loss, recording.velocity), positions, velocities))
+    # Only now is it known which candidates are fine everywhere.
+    parts = [slopes(residuals, positions, velocities, fine, steps) for residuals, positions, velocities in seen]
+    costs, products, gradient = (np.mean(values, axis=0) for values in zip(*parts, strict=True))
+    share = (time.perf_counter() - clock) / len(made)
+    rows = []
+    for k, (row, _) in enumerate(made):
+        row |= {"rollout": index + k, "generation": generation, "stage": SLOPES, "substeps": most[0], "seconds": share}
+        row["cost"] = min(float(costs[k]), PENALTY)
+        own = (0.0, np.zeros(len(steps))) if k == 0 else (gradient[k - 1], products[k - 1])
+        row |= {RESIDUAL: float(own[0])}
+        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.search.polished, own[1], strict=True)}
+        rows.append(row)
+    return rows
 
 
 @contextmanager
@@ -303,57 +447,6 @@ def _threads(count: int) -> Iterator[Map]:
             yield pool.map
     finally:
         torch.set_num_threads(before)
-
-
-class _Proposals:
-    """The candidates of CMA-ES, in all 2K + 10 normalized variables.
-
-    In the first `tied_rollouts` it searches the 12 variables of the uniform topology; then it starts again in all variables, from
-    the best candidate so far. K regions have too many variables for a few hundred rollouts: free from the start, the piecewise
-    search of cables ended above the uniform one on training frames, although its space contains the other's.
-    """
-
-    def __init__(self, problem: SearchProblem, seed: int) -> None:
-        self._problem, self._seed = problem, seed
-        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
-        self._columns = np.arange(len(problem.variables))
-        """Which of the searched variables each variable takes its value from."""
-        searched = problem
-        if self._tied:
-            searched = replace(problem, clusters=1)
-            self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
-        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
-        self._population: list[np.ndarray] = []
-        self._best = (np.inf, problem.encode())
-        self._evaluated = 0
-        self.generation = -1
-
-    def ask(self) -> list[np.ndarray]:
-        """The next generation; the last one with tied regions may be cut short."""
-        if self._tied and self._evaluated == self._tied:
-            self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
-            self._columns = np.arange(len(self._problem.variables))
-        self._population = self._strategy.ask()
-        if self._evaluated < self._tied:
-            self._population = self._population[: self._tied - self._evaluated]
-        self.generation += 1
-        return [np.asarray(searched)[self._columns] for searched in self._population]
-
-    def tell(self, costs: list[float]) -> None:
-        """Take the costs of the first candidates of the last generation; CMA-ES learns from whole generations only."""
-        least = int(np.argmin(costs))
-        if costs[least] < self._best[0]:
-            self._best = (costs[least], np.asarray(self._population[least])[self._columns])
-        self._evaluated += len(costs)
-        if len(costs) == self._strategy.popsize:
-            self._strategy.tell(self._population, costs)
-
-
-def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
-    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
-    no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
-    return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
 def _evaluate(
@@ -394,7 +487,7 @@ def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any
     """
     start = time.perf_counter()
     values = problem.decode(normalized)
-    row: dict[str, Any] = {"rollout": 0, "generation": 0, "cost": PENALTY, "reason": ""}
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
     row |= values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
     family: tuple[Twin, ...] = ()
@@ -410,35 +503,3 @@ def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any
         row["reason"] = f"{UNSTABLE}: {failure}"
     row["seconds"] = time.perf_counter() - start
     return row, family
-
-
-def _save(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
-    table = pd.DataFrame(trace)
-    table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
-    write_atomically(path, lambda p: table.to_parquet(p))
-
-
-def _recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
-    """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
-    fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
-    if path is None or not path.is_file():
-        return fresh
-    try:
-        table = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        print(f"{path}: unreadable ({error}); the search starts afresh")
-        return fresh
-    if table.attrs.get("key") != key:
-        print(f"{path}: made with other inputs or settings; the search starts afresh")
-        return fresh
-    print(f"continuing the search after {len(table)} rollouts")
-    records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
-    return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
-
-
-def _replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
-    """Whether recorded candidates are those that CMA-ES proposes now."""
-    return all(
-        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), normalized)
-        for row, normalized in zip(rows, population, strict=False)
-    )

@@ -115,15 +115,31 @@ def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
     return lengths
 
 
+def unloaded(
+    nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, rest_shape: np.ndarray, controller_rest: str = "rest_shape"
+) -> np.ndarray:
+    """Distance of the ends of each spring [S], m, in the shape where it has no force (double precision).
+
+    That is the rest shape [N + C, 3], m, or frame 0 where it is empty. With `controller_rest` first_frame it is frame 0 for the
+    springs of controllers: hands took hold of the body as it was there.
+    """
+    lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
+    if controller_rest == "first_frame":
+        held = (springs >= len(nodes)).any(axis=1)
+        lengths[held] = distances(np.concatenate([nodes, controllers]), springs[held])
+    return lengths
+
+
 def build(
     nodes: np.ndarray,
     controllers: np.ndarray,
     springs: np.ndarray,
     labels: np.ndarray | None = None,
     rest_shape: np.ndarray = NO_REST_SHAPE,
+    controller_rest: str = "rest_shape",
 ) -> Topology:
-    """A Topology whose rest lengths are the distances in the rest shape [N + C, 3], m, or in frame 0 (rounded to float32)."""
-    lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
+    """A Topology whose rest lengths are the distances of `unloaded` (rounded to float32)."""
+    lengths = unloaded(nodes, controllers, springs, rest_shape, controller_rest)
     if (lengths <= 0).any():
         pair = f"zero-length spring {springs[int(np.argmin(lengths))].tolist()}"
         raise InputError("topology", "a controller may not coincide with an object node", pair, "Move or drop that point.")
@@ -134,6 +150,7 @@ def build(
         rest_lengths=lengths,
         labels=np.zeros(len(nodes), np.int32) if labels is None else labels,
         rest_shape=rest_shape,
+        controller_rest=controller_rest,
     )
 
 
@@ -148,11 +165,13 @@ def piecewise_topology(
     *,
     repair: bool = False,
     rest_shape: np.ndarray = NO_REST_SHAPE,
+    controller_rest: str = "rest_shape",
 ) -> Topology:
     """A radius [m] and a neighbor count (self included) per region; `labels` [N] says which region a node belongs to.
 
     Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
-    any spring, controllers' included, to their nearest nodes. Raises InputError if a controller coincides with a node.
+    any spring, controllers' included, to their nearest nodes. Rest lengths: `unloaded`. Raises InputError if a controller coincides
+    with a node.
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
@@ -160,7 +179,8 @@ def piecewise_topology(
     outer = controller_springs(points, hands, controller_radius, controller_neighbours)
     if repair:
         inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
-    return build(np.asarray(nodes), np.asarray(controllers), np.concatenate([inner, outer]), labels, rest_shape)
+    springs = np.concatenate([inner, outer])
+    return build(np.asarray(nodes), np.asarray(controllers), springs, labels, rest_shape, controller_rest)
 
 
 def uniform_topology(

@@ -11,7 +11,7 @@ from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.twin.register import Registration
 from neuspring.twin.resample import resampled
-from neuspring.twin.topology import distances
+from neuspring.twin.topology import distances, unloaded
 
 SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
@@ -47,10 +47,12 @@ def move(
     """The twin on the nodes and hands of another recording. The rest shape is frame 0 unless recorded.
 
     Where both recordings have the same nodes in the same order (`corresponds`), a spring keeps its ends, stiffness, dashpot, and
-    the ratio of its rest length to the distance of its ends in the rest shape. With `keep_lengths` it keeps the rest length itself:
-    trained lengths belong to the body. Other nodes, as of filmed objects, take springs of their own (`resample`), which always keep
-    the ratio. Up, ground and, unless `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances
-    need more. Raises InputError if the shapes do not fit, or a spring would have no length.
+    the ratio of its rest length to the distance of its ends where it has no force: in the rest shape, or in frame 0 where the
+    twin's controllers rest there. With `keep_lengths` it keeps the rest length itself: trained lengths belong to the body. Those of
+    controllers that rest in frame 0 belong to the grip, and follow the new one. Nodes keep their masses. Other nodes, as of filmed
+    objects, take springs and masses of their own (`resample`), and always keep the ratio. Up, ground and, unless
+    `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more. Raises InputError if
+    the shapes do not fit, or a spring would have no length.
     """
     scenario, registration = observations.scenario, None
     if corresponds(twin.topology, observations):
@@ -86,11 +88,16 @@ def corresponds(topology: Topology, observations: Observations) -> bool:
 
 def _same_nodes(topology: Topology, observations: Observations, keep_lengths: bool) -> Topology:
     """The topology with the nodes of a recording, node i on node i."""
-    ratio = distances(observations.canonical, topology.springs) / distances(topology.canonical, topology.springs)
-    lengths = topology.rest_lengths.astype(np.float64) * (1.0 if keep_lengths else ratio)
+    nodes, hands = observations.nodes, observations.controller_points[0]
+    rest, springs = topology.controller_rest, topology.springs
+    ratio = unloaded(nodes, hands, springs, observations.rest_shape, rest)
+    ratio /= unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
+    if keep_lengths:
+        calibrated = rest == "first_frame"
+        ratio[: topology.object_spring_count if calibrated else None] = 1.0
+    lengths = topology.rest_lengths.astype(np.float64) * ratio
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         rule = "the ends of a spring may not coincide in the rest shape"
         raise InputError(f"transfer to {observations.scenario.name}", rule, f"spring {pair}")
-    hands = observations.controller_points[0]
-    return replace(topology, nodes=observations.nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)
+    return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)

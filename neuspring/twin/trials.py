@@ -37,7 +37,10 @@ class Outcome:
 
 
 def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
-    """Roll twins of the same nodes out over hands [T, C, 3] from velocity [N, 3], m/s, and judge the frames that the loss holds."""
+    """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
+
+    hands are the controllers' positions [T, C, 3], or what `path.waypoints` makes of them.
+    """
     solver = solver_of(twins, device, differentiable=False)
     count = len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
@@ -54,6 +57,21 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
         Outcome(math.inf if left else cost, left, overflow)
         for cost, left, overflow in zip(sums.costs(len(hands) - 1), sums.left, solver.overflows, strict=True)
     ]
+
+
+def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], on the CPU."""
+    solver, count = solver_of(twins, device, differentiable=False), len(twins)
+    nodes = torch.tensor(twins[0].topology.nodes, device=device)
+    solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
+    every = hands[:, None].expand(-1, count, -1, -1)
+    kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
+    for frame in range(1, len(hands)):
+        solver.advance(every[frame - 1], every[frame])
+        for name, states in kept.items():
+            states.append(solver.buffers.get_vectors(name, solver.last, solver.nodes).cpu())
+        solver.go_on()
+    return torch.stack(kept["x"]), torch.stack(kept["v"])
 
 
 class LossSums:

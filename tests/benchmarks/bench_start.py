@@ -22,7 +22,7 @@ sys.exit(main())"""
 
 def tiny(folder: Path) -> list[str]:
     """The command line of a rollout of a tiny scene, made here."""
-    settings = {"toy": {"frames": 5}, "search": {"rollouts": 2, "start": {"object_radius": 0.045, "stiffness": 1e4}}}
+    settings = {"toy": {"frames": 5}, "search": {"rollouts": 2}}
     (folder / "settings.yaml").write_text(json.dumps(settings))
     run = [sys.executable, "-m", "neuspring"]
     options = ["--settings", str(folder / "settings.yaml")]

@@ -25,7 +25,7 @@ def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
 
 TINY = {
     "toy": {"frames": 5},
-    "search": {"rollouts": 2, "start": {"object_radius": 0.045, "stiffness": 1e4}},
+    "search": {"rollouts": 2},
     "fit": {"epochs": 1, "field": {"channels": 2, "hidden": 4}},
 }
 

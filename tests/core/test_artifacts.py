@@ -250,6 +250,33 @@ def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
     assert_same(Topology.load(path), topology())
 
 
+LATER: dict[str, dict[str, Any]] = {"material": {"drag_quadratic": 0.0}, "simulation": {"controller_path": "linear"}}
+"""Plain fields that older files of twins lack, by part, and what they stand for."""
+
+
+def test_a_twin_of_an_older_version_has_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "old.npz"
+    made = twin()
+    made = dataclasses.replace(made, **{part: dataclasses.replace(getattr(made, part), **values) for part, values in LATER.items()})
+    made.save(path)
+    with np.load(path) as stored:
+        kept = json.loads(stored["meta"].tobytes())["fields"]
+    for part, values in LATER.items():
+        kept[part] = {name: value for name, value in kept[part].items() if name not in values}
+    rewrite(path, fields=kept)
+    assert_same(Twin.load(path), made)
+
+
+def test_masses_are_positive_and_one_per_node(tmp_path: Path) -> None:
+    made = dataclasses.replace(twin(), material=material(mass=np.array([0.5, 1.0, 1.5, 1.0])))
+    made.save(tmp_path / "it.npz")
+    assert_same(Twin.load(tmp_path / "it.npz"), made)
+    with pytest.raises(InputError, match=r"one mass per node \(4\), or none"):
+        dataclasses.replace(made, material=material(mass=np.ones(3)))
+    with pytest.raises(InputError, match=r"material\.mass: must be positive"):
+        material(mass=np.array([1.0, 0.0]))
+
+
 def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
     made = topology()
     points = len(made.nodes) + len(made.controllers)

@@ -83,7 +83,7 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
     pictured = scores[scores["metric"].isin(["psnr", "ssim", "iou"])]
     assert len(pictured) == 6
     assert pictured["value"].between(0, 100).all()
-    assert set(scores["metric"]) == {"chamfer", "track_error", "psnr", "ssim", "iou"}
+    assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound", "psnr", "ssim", "iou"}
     record = json.loads((run_folder / "run.json").read_text())
     assert record["images"]["lpips"].startswith("no AlexNet weights")
     assert record["images"]["masks"] == "given"
@@ -123,7 +123,7 @@ def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tm
     assert record["variant"]["model"] == "spring_gaus"
     assert "../../appearance-spring_gaus/0/appearance.json" in record["artifacts"]["records"]
     scores = pd.read_parquet(folder / "spring_gaus" / "0" / "scores.parquet")
-    assert set(scores["metric"]) == {"chamfer", "track_error", "psnr", "ssim", "iou"}
+    assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound", "psnr", "ssim", "iou"}
     assert (folder / "spring_gaus" / "0" / "centres.npz").is_file()
 
 

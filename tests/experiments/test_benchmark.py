@@ -257,7 +257,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
         benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
     benchmark(tmp_path, methods=["coarse"], **narrow)
-    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [0.0, 4.0e+4]}}}\n"
+    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [10.0, 4.0e+4]}}}\n"
     write(tmp_path / "soft.yaml", text)
     benchmark(tmp_path, search_table="soft.yaml", **narrow)
 
@@ -359,6 +359,25 @@ def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) ->
     assert made.applies("one", "a")
 
 
+def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path) -> None:
+    pooled(tmp_path)
+    oracle = "oracle: {search: uniform, fit: springs, pool: all, oracle: true, description: x}\n"
+    write(tmp_path / "more.yaml", (tmp_path / "pooled.yaml").read_text() + oracle)
+    made = pooled(tmp_path, method_table="more.yaml", methods=["one", "oracle"])
+    assert list(made.searches) == ["uniform-all"], "no search alone is needed"
+    assert made.fit_of_method == {"one": "one", "oracle": "oracle"}
+    inputs, needs = Inputs(made), Needs(made, "cpu")
+    jobs = [SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods]
+    assert [(json.loads(inputs.variant(job)).get("oracle"), json.loads(inputs.variant(job))["pool"]) for job in jobs] == [
+        (None, "all"),
+        (True, "all"),
+    ]
+    assert "released_quirks" in json.loads(inputs.settings("fit", jobs[1]))
+    body = needs.sizes.body("a")
+    work = [needs.work("fit", job) for job in jobs]
+    assert work[1] / work[0] == (body.frames - 1) / (body.train_end - 1) > 1
+
+
 def test_fits_on_a_pool_share_no_launches(tmp_path: Path) -> None:
     together = pooled(tmp_path, seeds=[0, 1, 2], twins_per_launch=8).fits_together("a")
     assert together == (("full", 0), ("full", 1), ("full", 2))
@@ -420,9 +439,11 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "baselines"],
         ["mocap", "clusters"],
         ["mocap", "mocap_first_frame"],
+        ["mocap", "mocap_clamps"],
         ["mocap", "mocap_free"],
         ["mocap", "mocap_fine"],
         ["mocap", "mocap_eval"],
+        ["mocap", "mocap_heldout"],
         ["mocap", "mocap_pieces"],
         ["mocap", "mocap_field"],
         ["mocap", "mocap_prediction"],
@@ -505,7 +526,12 @@ def test_every_method_that_is_shipped_is_valid():
         "plus_average": "neuspring",
         "neuspring_plus_carry_over": "neuspring_plus",
         "neuspring_plus_average": "neuspring_plus",
+        "baseline_from_last_frame": "baseline",
+        "neuspring_from_last_frame": "neuspring",
+        "neuspring_plus_from_last_frame": "neuspring_plus",
     }
+    # An oracle's fit has seen the future: it is shared with nobody, not even where all settings are equal.
+    assert {benchmark.fit_of_method[name] for name in ("oracle_neuspring", "oracle_plus")} == {"oracle_neuspring", "oracle_plus"}
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
@@ -522,3 +548,40 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
     three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
     assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))
+
+
+def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
+    values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "released_search", "phystwin_released"], "seeds": [0]}
+    inputs = Inputs(Benchmark.of(values, ROOT))
+
+    def settings(stage: str, **job: str) -> dict[str, Any]:
+        found = json.loads(inputs.settings(stage, SimpleNamespace(scenario="toy_rope_lift_smooth", seed="0", **job)))
+        parse(Config, found, "what the command reads")
+        return found
+
+    for row, method, on in (("uniform", "baseline", False), ("released_quirks", "phystwin_released", True)):
+        for found in (settings("search", search=row), settings("fit", method=method)):
+            assert found["released_quirks"] == dict.fromkeys(config.plain(config.ReleasedQuirks()), on)
+    assert not any(settings("search", search="released_uniform")["released_quirks"].values())
+    fitted = settings("fit", method="phystwin_released")["fit"]
+    assert (fitted["horizon"], fitted["learning_rate"]) == (1, 1e-3)
+    variant = json.loads(inputs.variant(SimpleNamespace(method="phystwin_released")))
+    assert variant["released_quirks"] == sorted(config.plain(config.ReleasedQuirks()))
+    assert "released_quirks" not in json.loads(inputs.variant(SimpleNamespace(method="baseline")))
+
+
+def test_the_released_rows_have_the_released_search() -> None:
+    made = Benchmark.of({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
+    for name, row in made.searches.items():
+        search = tables.search_of(made.config, row, name)
+        scales = config.plain(search.scales)
+        assert {scales[name] for name in scales if name not in search.absent} == {"linear"}
+        assert (search.lengths, search.polish_rounds, search.fixed) == ("meter", 0, ())
+        assert (search.ranges.stiffness, search.start.stiffness, search.start.object_radius) == ((0.0, 1e5), 3e4, 0.02)
+    assert tables.search_of(made.config, made.searches["released_quirks"], "x").isolated_nodes == "allow"
+
+
+def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "odd.yaml", SEARCHES.replace("uniform: {", "uniform: {released_quirks: {no_such: true}, ", 1))
+    with pytest.raises(InputError, match=r"search uniform, released_quirks:(?s:.*)no_such: unknown key"):
+        benchmark(tmp_path, search_table="odd.yaml")

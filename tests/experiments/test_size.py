@@ -22,6 +22,7 @@ from neuspring.experiments import size
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.needs import CARRY_OVER, Needs
 from neuspring.twin.search import RELEASED_SUBSTEPS, SearchProblem, candidate
+from tests.support import small
 from tests.support.project import ROOT, config_with
 from tests.support.scenarios import observations
 
@@ -76,15 +77,31 @@ def test_bodies_follow_the_released_table_and_the_sampling():
     assert expected(dataclasses.replace(row, path="x/mine"), settings) == USUAL
 
 
+def test_a_limit_of_nodes_widens_the_spacing_and_never_narrows_it():
+    row = config.ScenarioRow(
+        scenario="a", source="phystwin_raw", category="cloth", path="x/weird_package", self_collision=True, ground=True
+    )
+    for most, nodes, spacing in ((4532, 4532, 0.005), (1133, 1133, 0.01), (10**6, 4532, 0.005)):
+        values = {"perception": {"sample": {"voxel": 0.005, "nodes": most}}}
+        body = expected(row, config.parse(config.Config, config_with(values), "test"))
+        assert (body.nodes, body.spacing) == (nodes, pytest.approx(spacing))
+
+
+def test_clamped_cables_have_the_controllers_that_are_read():
+    row = config.ScenarioRow(scenario="a", source="mocap", category="DLO1", path="x", self_collision=False, ground=False)
+    for grip, controllers in (("markers", 4), ("clamp", 4 + 4 * 3)):
+        settings = config.parse(config.Config, config_with({"mocap": {"grip": grip, "ring": 3}}), "test")
+        assert expected(row, settings).controllers == controllers
+
+
 @pytest.mark.parametrize("name", TOYS)
 def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(name):
     shape = {"rope": "rope/lift/smooth", "cloth": "cloth/lift/smooth", "blob": "blob/lift/smooth"}[name]
     row = config.ScenarioRow(scenario="a", source="toy", category=name, path=shape, self_collision=False, ground=True)
-    search = config.parse(config.Search, {"start": {"object_radius": 0.045, "stiffness": 1e4}}, "test")
-    simulation = config.Simulation()
+    search, simulation = config.Search(), config.Simulation()
     settings = config.parse(config.Config, config_with({"toy": {"frames": 8}}), "test")
     problem = SearchProblem(toy.make(row, settings.toy).observations, search, simulation, config.Losses(), config.ReleasedQuirks())
-    start = candidate(problem, dataclasses.asdict(search.start))
+    start = candidate(problem, problem.decode(problem.encode()))
     springs, substeps = size.expected_size(expected(row, settings), search, simulation)
     assert 1 / OFF < springs / len(start.topology.springs) < OFF
     assert 1 / OFF < substeps / start.simulation.substeps < OFF
@@ -99,7 +116,7 @@ def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(nam
 )
 def test_twice_the_nodes_are_twice_the_springs_and_a_stiffer_start_has_more_substeps(nodes, neighbours, radius, stiffness, spacing):
     start = {"object_neighbours": neighbours, "object_radius": radius, "stiffness": stiffness}
-    search = config.parse(config.Search, {"start": start}, "test")
+    search = small.released(start=start)
     stiffer = dataclasses.replace(search, start=dataclasses.replace(search.start, stiffness=min(4 * stiffness, 1e5)))
     simulation = config.Simulation(max_substeps=10**9)
     body = Expected(nodes=nodes, spacing=spacing, frames=50, controllers=0)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import Lift
@@ -16,6 +17,9 @@ from neuspring.perception.results import Masks, PixelTracks
 from tests.support.captures import FRAMES, describe, entry
 
 SETTINGS = Lift(neighbourhood=0.03, outlier_neighbours=460.0, least_neighbours=3, least_controllers=3, controllers=4)
+
+NEAR = np.zeros((1, 3))
+"""An object's cloud, for hands whose distance from it does not matter."""
 
 
 @pytest.fixture
@@ -161,6 +165,74 @@ def test_rigid_motions_are_recovered_and_fill_gaps():
     np.testing.assert_allclose(fill_rigidly(damaged, trusted), points, atol=1e-9)
 
 
+def grasp(frames: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Rotation]]:
+    """Two hands of 150 points each that turn and move in their own ways, [T, 300, 3]; the object's cloud; the hands' turns. Each
+    hand reaches 15 cm away from the object."""
+    rng = np.random.default_rng(1)
+    cloud = rng.uniform([-0.05, -0.02, 0.0], [0.05, 0.02, 0.02], (400, 3))
+    arm = rng.uniform([0.0, -0.03, 0.0], [0.15, 0.03, 0.04], (2, 150, 3)) * np.array([[[-1.0, 1, 1]], [[1.0, 1, 1]]])
+    arm[0, :, 0] -= 0.06
+    arm[1, :, 0] += 0.08
+    turns = [Rotation.from_rotvec(np.linspace(0, 1, frames)[:, None] * turn) for turn in ([0.4, 0.1, -0.3], [-0.2, 0.5, 0.2])]
+    shifts = np.linspace(0, 1, frames)[:, None] * [[0.1, 0.0, 0.2]], np.linspace(0, 1, frames)[:, None] * [[-0.2, 0.1, 0.1]]
+    moving = [
+        np.stack([one.apply(part) + shift for one, shift in zip(turn, way, strict=True)])
+        for part, turn, way in zip(arm, turns, shifts, strict=True)
+    ]
+    return np.concatenate(moving, axis=1), cloud, rng.random((frames, 300)) < 0.5, turns
+
+
+PATCH = Lift(grip="patch", grip_reach=0.04, controllers=30, controller_gaps="rigid", controller_share=0.1)
+
+
+def test_patches_lie_near_the_object_and_move_rigidly_with_their_hand():
+    points, cloud, seen, _ = grasp()
+    seen[0] = True
+    controllers, facts = choose_controllers(np.where(seen[..., None], points, 0.0), seen, seen, cloud, PATCH, "here")
+    assert controllers.shape == (8, 30, 3)
+    # Each is a point of the hands throughout, hidden or not: it has gone where the hand has.
+    distance, own = cKDTree(points[0]).query(controllers[0])
+    assert distance.max() == 0
+    np.testing.assert_allclose(controllers, points[:, own], atol=1e-9)
+    assert facts["patch_misfit_mm"] < 1e-6
+    from_object = cKDTree(cloud).query(points[0])[0]
+    for hand in (range(150), range(150, 300)):
+        part = [k for k in own if k in hand]
+        assert part, "every hand holds"
+        assert from_object[part].max() <= from_object[hand].min() + PATCH.grip_reach
+    spread, _ = choose_controllers(points, seen | True, seen | True, cloud, replace(PATCH, grip="points"), "here")
+    assert cKDTree(cloud).query(spread[0])[0].max() > 0.1, "forearm and all"
+
+
+def test_patches_average_the_noise_of_the_tracks():
+    points, cloud, _, _ = grasp()
+    seen = np.ones(points.shape[:2], bool)
+    noisy = points + np.random.default_rng(2).normal(0, 0.002, points.shape)
+    noisy[0] = points[0]
+    controllers, facts = choose_controllers(noisy, seen, seen, cloud, PATCH, "here")
+    own = cKDTree(points[0]).query(controllers[0])[1]
+    # 150 points fix six numbers: sqrt(6 / 150 / 3) of the noise per coordinate at the middle, some times as much at the rim.
+    assert np.abs(controllers - points[:, own]).max() < 0.002
+    assert np.std(controllers[1:] - points[1:, own]) < 0.0005
+    # Seven of eight frames have three coordinates of noise, less what the six fitted numbers take up.
+    assert facts["patch_misfit_mm"] == pytest.approx(2.0 * np.sqrt(3 * 7 / 8), rel=0.05)
+
+
+def test_a_hand_that_has_yet_to_come_grips_with_what_is_foremost():
+    points, cloud, _, _ = grasp()
+    seen = np.ones(points.shape[:2], bool)
+    controllers, _ = choose_controllers(points, seen, seen, cloud - np.array([0.5, 0, 0]), PATCH, "here")
+    assert (controllers[0, :, 0] < -0.1).any()
+    assert (controllers[0, :, 0] > 0.05).any()
+
+
+def test_a_patch_that_is_too_small_is_named():
+    points, cloud, _, _ = grasp()
+    seen = np.ones(points.shape[:2], bool)
+    with pytest.raises(InputError, match=r"near the object in frame 0.*grip_reach"):
+        choose_controllers(points, seen, seen, cloud, replace(PATCH, grip_reach=1e-6), "here")
+
+
 def test_hands_apart_move_apart():
     rng = np.random.default_rng(0)
     start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), rng.uniform(0, 0.03, (8, 3)) + np.array([0.3, 0, 0])])
@@ -204,13 +276,13 @@ def test_released_controllers_are_visible_throughout():
     points = np.repeat(grid(6)[None], 4, axis=0)
     visible, valid = np.ones((4, 36), bool), np.ones((4, 36), bool)
     visible[2, :10], valid[1, 10:20] = False, False
-    controllers, facts = choose_controllers(points, visible, valid, Lift(controllers=30, least_controllers=16), "here")
+    controllers, facts = choose_controllers(points, visible, valid, NEAR, Lift(controllers=30, least_controllers=16), "here")
     assert facts["hand_tracks_kept"] == 16
     assert controllers.shape == (4, 16, 3)
     with pytest.raises(InputError, match=r"here: at least 17 points of the hands.*received 16 of 36"):
-        choose_controllers(points, visible, valid, Lift(least_controllers=17), "here")
+        choose_controllers(points, visible, valid, NEAR, Lift(least_controllers=17), "here")
     # With gaps filled, everything that is seen in enough frames counts.
-    _, facts = choose_controllers(points, visible, valid, Lift(controller_gaps="rigid", controller_share=0.7), "here")
+    _, facts = choose_controllers(points, visible, valid, NEAR, Lift(controller_gaps="rigid", controller_share=0.7), "here")
     assert facts["hand_tracks_kept"] == 36
 
 

@@ -1,11 +1,14 @@
 """The visual hull of known bodies, alignment of meshes, and structure points one per voxel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config.perception import Sampling, ShapePriorSettings
+from neuspring.config import ScenarioRow
+from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, CameraEntry, Writer
 from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
@@ -13,8 +16,9 @@ from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, Part, Renderer
 from neuspring.data.synthetic.sensor import quantised
 from neuspring.perception import shape_mesh, shape_prior
+from neuspring.perception.assemble import assemble
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
-from neuspring.perception.sample import inside, on_table, structure
+from neuspring.perception.sample import inside, on_table, structure, voxel_for
 from tests.support.captures import FRAMES, K, describe
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
@@ -139,7 +143,7 @@ def tracked(points: np.ndarray) -> LiftedTracks:
 def test_one_point_per_voxel():
     points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3))
     points[0] = 0.0
-    indices, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
+    indices, _, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
     cells = np.floor(points[indices] / 0.02).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells) == 125
 
@@ -147,8 +151,8 @@ def test_one_point_per_voxel():
 def test_observed_points_come_before_the_surface_and_it_before_the_inside(tmp_path):
     _, _, cloud, truth = film(tmp_path, 3)
     everything = tracked(cloud[::3])
-    indices, outer, inner = structure(everything, truth, Sampling(voxel=0.01), 1.0, 0)
-    alone, bare, _ = structure(tracked(cloud[:1]), truth, Sampling(voxel=0.01), 1.0, 0)
+    indices, outer, inner, _ = structure(everything, truth, Sampling(voxel=0.01), 1.0, 0)
+    alone, bare, _, _ = structure(tracked(cloud[:1]), truth, Sampling(voxel=0.01), 1.0, 0)
     assert len(indices) > 50
     assert 10 < len(outer) < len(bare)
     assert len(alone) == 1
@@ -165,7 +169,7 @@ def test_sampling_follows_the_seed(tmp_path):
 
 def test_without_a_prior_only_what_was_seen_remains():
     points = np.array([[0.0, 0, 0.01], [0.0, 0, 0.01], [0.05, 0, -0.01], [0.1, 0, 0.02]])
-    indices, outer, inner = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
+    indices, outer, inner, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
     assert indices.tolist() == [0, 2, 3]
     assert not len(outer)
     assert not len(inner)
@@ -174,3 +178,62 @@ def test_without_a_prior_only_what_was_seen_remains():
 @pytest.mark.parametrize(("up", "expected"), [(1.0, 0.0), (-1.0, -0.01)])
 def test_points_below_the_table_are_lifted_to_it(up, expected):
     assert on_table(np.array([[0.0, 0.0, -0.01]]), up)[0, 2] == expected
+
+
+def line_and_ball() -> tuple[np.ndarray, np.ndarray]:
+    """A rope of 0.6 m and a ball of 8 cm, 3000 points each."""
+    rng = np.random.default_rng(3)
+    rope = rng.uniform([0, 0, 0.1], [0.6, 0.01, 0.11], (3000, 3))
+    ball = rng.normal(size=(3000, 3))
+    return rope, 0.08 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + np.array([0, 0, 0.2])
+
+
+def test_more_nodes_never_make_a_coarser_spacing_and_are_never_exceeded():
+    for points in line_and_ball():
+        before = np.inf
+        for most in (1, 8, 20, 37, 38, 39, 100, 101, 300, 1000, 3000):
+            voxel = voxel_for(points, most, 0.002)
+            kept, _, _, used = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.002, nodes=most), 1.0, 0)
+            assert 0.002 <= voxel <= before
+            assert len(kept) <= most
+            assert used == pytest.approx(voxel, rel=1e-5)
+            before = voxel
+
+
+def test_a_rope_is_sampled_finer_than_a_ball_at_equal_cost():
+    rope, ball = line_and_ball()
+    # One node per voxel: 0.6 m / 100 along the rope is finer than its section; (4 pi r^2 = 0.08 m^2) / 100 on the ball's surface.
+    assert voxel_for(rope, 100, 0.002) < 0.011
+    assert 0.02 < voxel_for(ball, 100, 0.002) < 0.05
+
+
+def test_the_spacing_is_never_below_the_voxel_and_the_voxel_itself_where_nodes_suffice():
+    rope, _ = line_and_ball()
+    lifted, prior = tracked(rope), shape_prior.no_prior()
+    plain, plenty = (structure(lifted, prior, Sampling(voxel=0.01, nodes=most), 1.0, 0) for most in (None, 10**6))
+    assert plain[3] == plenty[3] == 0.01
+    np.testing.assert_array_equal(plain[0], plenty[0])
+
+
+def test_a_chosen_spacing_is_written_down_and_only_then(tmp_path):
+    capture, _, cloud, _ = film(tmp_path, 2)
+    row = ScenarioRow(scenario="x", source="capture", category="rope", path="x", self_collision=False, ground=True)
+    count = capture.frame_count
+    one = tracked(cloud[::7])
+    lifted = replace(
+        one,
+        object_points=np.repeat(one.object_points[:1], count, axis=0),
+        object_visibility=np.ones((count, one.object_points.shape[1]), bool),
+        object_motion_valid=np.zeros((count, one.object_points.shape[1]), bool),
+        controller_points=np.zeros((count, 1, 3)),
+    )
+    for nodes in (None, 30):
+        settings = Perception(sample=Sampling(voxel=0.004, nodes=nodes))
+        seen = assemble(row, capture, lifted, shape_prior.no_prior(), settings)
+        written = seen.scenario.provenance.get("node spacing")
+        if nodes is None:
+            assert written is None
+            assert len(seen.nodes) > 30
+        else:
+            assert float(written.removesuffix(" m")) > 0.004
+            assert len(seen.nodes) <= 30

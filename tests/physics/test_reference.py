@@ -23,7 +23,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "upside down": {"up": "-z"},
     "self-collision": {"self_collision": True},
     "moving hands": {"controller_velocity": True},
-    "all": {"up": "-z", "self_collision": True, "controller_velocity": True},
+    "all": {"up": "-z", "self_collision": True, "controller_velocity": True, "drag_quadratic": 1.0},
+    "thick air": {"drag_quadratic": 5.0},
+    "cubic path": {"controller_path": "cubic"},
+    "cubic path with velocity": {"controller_path": "cubic", "controller_velocity": True},
+    "masses": {"mass": np.linspace(0.2, 1.8, 10), "self_collision": True},
     "odd substeps": {"substeps": 21},
     "one substep": {"substeps": 1, "frame_time": 1e-3},
 }
@@ -58,7 +62,7 @@ def test_single_precision_is_close(seed: int) -> None:
     assert np.abs(x - reference.rollout(*body)[0]).max() < SINGLE
 
 
-@pytest.mark.parametrize("variant", ["ground", "all"])
+@pytest.mark.parametrize("variant", ["ground", "all", "masses"])
 def test_node_order_does_not_matter(variant: str) -> None:
     """Renaming nodes renames the result: nothing depends on the order of storage."""
     body, x, v, hands = random_scene(3, **VARIANTS[variant])
@@ -72,6 +76,8 @@ def test_node_order_does_not_matter(variant: str) -> None:
         dashpot=body.dashpot,
         drag=body.drag,
         contact_distance=body.contact_distance,
+        drag_quadratic=body.drag_quadratic,
+        mass=np.broadcast_to(body.mass, body.nodes)[order],
         frame_time=body.simulation.frame_time,
     )
     shuffled = replace(shuffled, simulation=body.simulation)

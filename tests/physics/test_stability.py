@@ -144,3 +144,13 @@ def test_gershgorin_alone_accepts_most(monkeypatch: pytest.MonkeyPatch) -> None:
     twin = random_twin(0, substeps=200)
     monkeypatch.setattr(stability, "twin_spectrum", lambda _: pytest.fail("not needed"))
     stability.check(twin)
+
+
+def test_masses_change_the_spectrum() -> None:
+    """Two nodes on a spring: lambda = k (1/m_1 + 1/m_2), and Gershgorin's bound 2 k / least mass is above it."""
+    points, pairs = np.array([[0.0, 0, 0], [0.1, 0.1, 0]]), np.array([[0, 1]])
+    k, c, mass = np.array([30.0]), np.array([4.0]), np.array([0.25, 2.0])
+    found = stability.rest_spectrum(pairs, points, np.zeros((0, 3)), k, c, mass)
+    assert (found.stiffness, found.damping) == (pytest.approx(30.0 * 4.5, rel=1e-3), pytest.approx(4.0 * 4.5, rel=1e-3))
+    bound = stability.gershgorin(pairs, 2, k, c, mass)
+    assert (bound.stiffness, bound.damping, bound.node) == (240.0, 32.0, 0)

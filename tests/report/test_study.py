@@ -37,8 +37,8 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
     for (scenario, method, seed), scores in values.items():
         counts = (frames or {}).get(scenario, 10)
         rows += [(scenario, "rope", method, seed, *key, value, "", counts) for key, value in scores.items()]
-        runs.append((scenario, method, seed, "ok", "", "", None, source, "k"))
-    runs += [(*run, "failed", "it diverged", "", None, source, "k") for run in failed]
+        runs.append((scenario, method, seed, "ok", "", "", None, source, "k", False, "{}"))
+    runs += [(*run, "failed", "it diverged", "", None, source, "k", False, "{}") for run in failed]
     return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(RUN_COLUMNS)))
 
 
@@ -150,7 +150,7 @@ def test_errors_weigh_scenarios_and_pictures_weigh_frames():
 
 
 def test_the_spread_is_that_of_the_averages():
-    runs = collected(varied({"baseline": 1.0, "neuspring": 0.8}, noise=0.1))
+    runs = collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, noise=0.1))
     expected = averages(runs.scores).set_index("method")["seed_std"]
     found = cells_of("table2", runs)["spread"]
     assert found[("Baseline", *CD)] == pytest.approx(expected["baseline"])
@@ -161,7 +161,7 @@ def test_the_spread_is_that_of_the_averages():
 
 def test_intervals_agree_with_those_of_the_summary():
     """The same bootstrap with other draws: the ends of 10,000 resamples agree within some per cent of the width."""
-    runs = collected(varied({"baseline": 1.0, "neuspring": 0.8}, noise=0.3))
+    runs = collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, noise=0.3))
     found = cells_of("table2", runs).loc[("NeuSpring (PT+NSF)", *CD)]
     row = paired_differences(runs.scores, "baseline").iloc[0]
     width = row["high"] - row["low"]
@@ -176,7 +176,7 @@ def test_intervals_agree_with_those_of_the_summary():
 def test_changes_are_paired(metric):
     """Scenarios of very different errors and lengths, the same change in all: the change is known exactly."""
     frames = {name: 10 + 7 * index for index, name in enumerate(RELEASED)}
-    found = cells_of("table2", collected(varied({"baseline": 1.0, "neuspring": 0.8}, metric=metric), frames))
+    found = cells_of("table2", collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, metric=metric), frames))
     row = found.loc[("NeuSpring (PT+NSF)", *metric)]
     assert row[["relative", "relative_low", "relative_high"]].tolist() == pytest.approx([-0.2] * 3)
     assert row["low"] < 0.95 * row["ours"]
@@ -203,7 +203,7 @@ def test_intervals_and_spreads_of_pictures_are_weighted_too():
 )
 def test_a_change_is_judged_by_its_interval(factor, noise, scenarios, direction):
     names = [f"toy_{index}" for index in range(scenarios)]
-    found = cells_of("table2", collected(varied({"baseline": 1.0, "model_b": factor}, names, noise=noise), source="toy"))
+    found = cells_of("table2", collected(varied({"baseline": 1.0, "model_b_one_frame": factor}, names, noise=noise), source="toy"))
     assert found.loc[("Model-B (NSF)", *CD), "direction"] == direction
     assert found.loc[("Model-B (NSF)", *CD), "verdict"] == "other data"
     assert found.loc[("Baseline", *CD), "direction"] == "baseline"
@@ -217,15 +217,15 @@ def test_a_change_that_the_paper_does_not_show_is_not_confirmed():
         "here",
     )
     key = ("reconstruction", "ssim")
-    runs = collected(varied({"model_a": 1.0, "model_b": 0.8}, metric=key))
+    runs = collected(varied({"model_a": 1.0, "model_b_one_frame": 0.8}, metric=key))
     found = tables_cells.cells(study, tables_cells.of_study(study, runs)).set_index(["label", "task", "metric"])
     assert found.loc[("Model-B (NSF)", *key), "direction"] == "no change in the paper"
 
 
 def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
-    values = everywhere("baseline", {CD: 0.01}, ["a", "b"]) | everywhere("neuspring", {CD: 0.02}, ["a"])
+    values = everywhere("baseline", {CD: 0.01}, ["a", "b"]) | everywhere("neuspring_one_frame", {CD: 0.02}, ["a"])
     values["b", "baseline", 0] = {CD: 0.5}
-    runs = collected(values, failed=(("b", "neuspring", 0),))
+    runs = collected(values, failed=(("b", "neuspring_one_frame", 0),))
     own = tables_cells.of_study(STUDIES["table2"], runs)
     found = cells_of("table2", runs)
     assert found.loc[("Baseline", *CD), "ours"] == pytest.approx(0.01)
@@ -237,8 +237,10 @@ def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
 
 
 def test_a_score_that_one_method_lacks_is_left_out_for_all():
-    values = everywhere("baseline", {CD: 0.01, PSNR: 30.0}, ["a", "b"]) | everywhere("neuspring", {CD: 0.02, PSNR: 20.0}, ["a"])
-    values |= everywhere("neuspring", {CD: 0.04}, ["b"])
+    values = everywhere("baseline", {CD: 0.01, PSNR: 30.0}, ["a", "b"]) | everywhere(
+        "neuspring_one_frame", {CD: 0.02, PSNR: 20.0}, ["a"]
+    )
+    values |= everywhere("neuspring_one_frame", {CD: 0.04}, ["b"])
     values["b", "baseline", 0] = {CD: 0.01, PSNR: 90.0}
     found = cells_of("table2", collected(values))
     assert found.loc[("Baseline", *PSNR), ["ours", "scenarios"]].tolist() == [30.0, 1]
@@ -359,7 +361,7 @@ def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_p
 
 
 def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
-    methods = {"baseline": 1.0, "neuspring": 0.8}
+    methods = {"baseline": 1.0, "neuspring_one_frame": 0.8}
     for number, (method, factor) in itertools.product(range(7), methods.items()):
         write_run(tmp_path, f"cable_{number}", method, 0, {CD: 0.01 * factor * (1 + number)}, source="mocap")
     names = [f"cable_{number}" for number in range(7)]
@@ -372,14 +374,16 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
     assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
-    write_run(tmp_path, "cable_6", "neuspring", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged")
+    write_run(
+        tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
+    )
     tables.write(collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
     scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
     other = scores[scores["task"] == "future"].assign(task="reconstruction")
     pd.concat([scores, other]).to_csv(tmp_path / "tables" / "scores.csv", index=False)
     for _ in range(2):
         runs = read_scores(tmp_path / "tables" / "scores.csv").runs.set_index(["scenario", "method"])["status"]
-        assert (runs["cable_6", "neuspring"], runs["cable_6", "baseline"]) == ("failed", "ok")
+        assert (runs["cable_6", "neuspring_one_frame"], runs["cable_6", "baseline"]) == ("failed", "ok")
         (tmp_path / "tables" / "runs.csv").unlink(missing_ok=True)
     assert main(command) == 2
     assert "--scores, or --scenarios, --methods and --seeds" in capsys.readouterr().err

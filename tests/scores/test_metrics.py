@@ -15,6 +15,7 @@ from tests.support.scenarios import observations, scenario
 GOLDEN = 1e-5
 """Relative; the golden README's tolerance (we compute in float64 and agree to rounding). Traps differ by 14 % or more."""
 TRAP = 0.1
+DISTANCES = ("chamfer", "track_error", "track_error_bound")
 
 
 def load(name: str) -> dict[str, np.ndarray]:
@@ -117,10 +118,10 @@ def test_a_row_says_what_it_is() -> None:
     given = observations(tracks=np.zeros((5, 1, 3)))
     rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 7)
     assert tuple(rows.columns) == metrics.COLUMNS
-    assert rows[["task", "metric"]].to_numpy().tolist() == [[t, m] for t in metrics.TASKS for m in ("chamfer", "track_error")]
+    assert rows[["task", "metric"]].to_numpy().tolist() == [[t, m] for t in metrics.TASKS for m in DISTANCES]
     first = rows.iloc[0]
     assert (first["scenario"], first["category"], first["method"], first["seed"], first["unit"]) == ("scene", "toy", "ours", 7, "m")
-    assert rows["frames"].tolist() == [2, 2, 2, 2]
+    assert rows["frames"].tolist() == [2] * 6
 
 
 def test_tasks_split_at_the_end_of_training() -> None:

@@ -18,7 +18,7 @@ from neuspring.stages import fit, fits, observe, options, search
 from tests.support import small
 
 SETTINGS = config.Config(
-    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    search=config.Search(rollouts=11),
     fit=config.Fit(epochs=3, checkpoint_every=2, field=config.SpringField(channels=4, hidden=16, bands=2)),
     toy=config.Toy(frames=8),
     device="cpu",

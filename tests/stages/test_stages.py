@@ -17,10 +17,11 @@ from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
 from neuspring.stages import fit, observe, rollout, score, search, transfer
+from neuspring.twin.spacing import node_spacing
 from tests.support import small
 
 SETTINGS = config.Config(
-    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    search=config.Search(rollouts=11),
     fit=config.Fit(epochs=2),
     toy=config.Toy(frames=8),
     device="cpu",
@@ -45,7 +46,7 @@ def run_all(folder, name="small", *, method="phystwin", settings=SETTINGS):
     if kind:
         fit.run(seen, found, settings, kind, "cpu", out / "fit.json")
         records["fit"] = out / "fit.json"
-    rollout.run(seen, list(records.values())[-1:], False, "cpu", out / "rollout.json")
+    rollout.run(seen, list(records.values())[-1:], None, "cpu", out / "rollout.json")
     score.run(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
     return out / "run.json"
 
@@ -64,6 +65,10 @@ def test_every_step_leaves_what_its_record_names(finished):
     twin = Twin.load(record.file("twin", run.with_name("fit.json")))
     observations = Observations.load(folder / "small" / "observations.npz")
     assert len(twin.topology.nodes) == len(observations.nodes)
+    found = StageRecord.load(folder / "small" / "search-uniform" / "0" / "search.json").facts
+    assert found["spacing"] == node_spacing(observations.nodes)
+    assert 0 < found["controller_reach"] < found["controller_radius"]
+    assert found["cost_before_polish"] == found["cost"], "too few rollouts for a polish"
     assert Twin.load(folder / "small" / "truth.npz").topology.nodes.shape == twin.topology.nodes.shape
     assert not list(folder.rglob("*partial*"))
     assert not list(folder.rglob("*.part"))
@@ -103,11 +108,11 @@ def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     frames = seen.scenario.frame_count - 1
     assert StageRecord.load(run.with_name("rollout.json")).facts[SPRING_UPDATES] == frames * per_frame
     observations = folder / "small" / "observations.npz"
-    rollout.run(observations, [found, fitted], False, "cpu", tmp_path / "both.json")
+    rollout.run(observations, [found, fitted], None, "cpu", tmp_path / "both.json")
     coarse = facts["search"]["springs"] * facts["search"]["substeps"]
     assert StageRecord.load(tmp_path / "both.json").facts[SPRING_UPDATES] == frames * (coarse + per_frame)
     # Carrying over simulates more than its prediction.
-    rollout.run(observations, [fitted], True, "cpu", tmp_path / "carried.json")
+    rollout.run(observations, [fitted], "residuals", "cpu", tmp_path / "carried.json")
     assert SPRING_UPDATES not in StageRecord.load(tmp_path / "carried.json").facts
     transfer.run([observations, observations], fitted, "phystwin", 0, SETTINGS, "cpu", tmp_path / "transfer.json")
     moved = StageRecord.load(tmp_path / "transfer.json").facts[SPRING_UPDATES]
@@ -139,6 +144,19 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
     history = pd.read_parquet(run.with_name("history.parquet"))
     counts = history["metric"].value_counts().to_dict()
     assert counts == {"loss": 2, "tail_loss": 2, "gradient_norm": 2, "learning_rate": 2}
+
+
+def test_a_fit_that_its_settings_held_says_so_in_the_notes():
+    facts = {"at_bound": 0.25, "texels_moved": 0.0125}
+    settings = {"fit": {"epochs": 2}}
+    held = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
+    notes = score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
+    assert notes == [
+        "fit: 25% of the springs lie at the bound of their stiffness (fit.output_bound)",
+        "fit: only 1.2% of the texels moved by a tenth of their first scale",
+    ]
+    free = StageRecord(stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05}, settings=settings)
+    assert score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 
 def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
@@ -217,7 +235,7 @@ def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
     folder, _, _ = finished
     monkeypatch.setattr("neuspring.twin.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
     found = folder / "small" / "search-uniform" / "0" / "search.json"
-    rollout.run(folder / "small" / "observations.npz", [found], False, "cpu", tmp_path / "rollout.json")
+    rollout.run(folder / "small" / "observations.npz", [found], None, "cpu", tmp_path / "rollout.json")
     record = StageRecord.load(tmp_path / "rollout.json")
     assert record.status == "failed"
     assert "left the scene in frame" in record.reason

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from dataclasses import replace
+from pathlib import Path
 
 from neuspring import config
 from neuspring.core.artifacts import Observations
@@ -45,11 +47,24 @@ def spoiled_future() -> Observations:
     return replace(seen, **changed, tracks=seen.tracks + 1.0)
 
 
+@functools.cache
+def _released() -> dict[str, object]:
+    rows = config.read_yaml(Path(__file__).parents[2] / "config" / "searches.yaml")
+    return dict(rows["released_uniform"]["settings"])
+
+
+def released(**changes: object) -> config.Search:
+    """The settings of the released search (config/searches.yaml); `changes` replace keys, those of sections are merged."""
+    values = copy.deepcopy(_released())
+    config.merge(values, changes)
+    return config.parse(config.Search, values, "test")
+
+
 def search_problem(seen: Observations | None = None, **changes: object) -> SearchProblem:
-    """A search of two generations; `changes` replace fields of SearchProblem."""
+    """A released search of two generations; `changes` replace fields of SearchProblem."""
     settings: dict[str, object] = {
         "observations": seen or observations(),
-        "search": config.Search(rollouts=22, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+        "search": released(rollouts=22, start={"object_radius": 0.045, "stiffness": 1e4}),
         "simulation": config.Simulation(),
         "losses": config.Losses(),
         "quirks": config.ReleasedQuirks(),
@@ -59,8 +74,9 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 
 def start_values() -> dict[str, float]:
     """Physical values near the truth of the default scene, stiffness too low."""
-    start = config.plain(config.SearchStart(object_radius=0.045, object_neighbours=18, stiffness=6e3, drag=1.0, dashpot=20.0))
-    return {name: float(value) for name, value in start.items()}
+    own = {"object_radius": 0.045, "object_neighbours": 18.0, "stiffness": 6e3, "drag": 1.0, "dashpot": 20.0}
+    search = released(start=own)
+    return {name: float(value) for name, value in config.plain(search.start).items() if name not in search.absent}
 
 
 def fit_problem(seen: Observations | None = None, values: dict[str, float] | None = None, **changes: object) -> FitProblem:

@@ -20,8 +20,7 @@ from neuspring.experiments.tuning.store import slots as slots_of
 from tests.support import small
 
 OBSERVATIONS = "observations.npz"
-START = {"object_radius": 0.045, "stiffness": 1.0e4}
-BASE = {"scenarios": ["small"], "search": {"rollouts": 11, "start": START}, "fit": {"epochs": 3, "checkpoint_every": 1}}
+BASE = {"scenarios": ["small"], "search": {"rollouts": 11}, "fit": {"epochs": 3, "checkpoint_every": 1}}
 METHODS = {
     "search_only": {"search": "uniform", "fit": None, "description": "No second stage"},
     "baseline": {"search": "uniform", "fit": "springs", "description": "Springs"},

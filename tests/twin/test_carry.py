@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from neuspring.config import LastFrame
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.physics.autograd import solver_for
 from neuspring.twin import carry
@@ -49,7 +50,9 @@ def test_noise_is_not_carried_into_a_right_prediction():
     assert corrected is trajectory
 
 
-def test_the_future_is_not_read():
+@pytest.mark.parametrize("how", ["residuals", "state"])
+def test_the_future_is_not_read(how, monkeypatch):
+    monkeypatch.setattr(carry, "ORIGINS", 3)
     trajectory, twin, seen, velocity = kicked()
     end = seen.scenario.train_end
     points, visible, valid = (np.array(a) for a in (seen.object_points, seen.object_visibility, seen.object_motion_valid))
@@ -57,8 +60,10 @@ def test_the_future_is_not_read():
     visible[end:] ^= True
     valid[end - 1 :] ^= True
     blind = replace(seen, object_points=points, object_visibility=visible, object_motion_valid=valid, tracks=seen.tracks + 1.0)
-    result, facts = carry_over(trajectory, twin, blind, velocity)
-    expected, expected_facts = carry_over(trajectory, twin, seen, velocity)
+    settings = LastFrame(window=2, modes=4, iterations=1, weights=(1e-2, 1.0))
+    result, facts = carry_over(trajectory, twin, blind, velocity, "cpu", how, settings)
+    expected, expected_facts = carry_over(trajectory, twin, seen, velocity, "cpu", how, settings)
+    assert facts["carried"] == 1
     np.testing.assert_array_equal(result.positions, expected.positions)
     assert facts == expected_facts
 
@@ -87,7 +92,7 @@ def test_hidden_points_do_not_speak():
 
 def test_a_continuation_that_diverges_is_not_used(monkeypatch):
     trajectory, twin, seen, velocity = kicked()
-    monkeypatch.setattr(carry._Continuation, "corrected", lambda *_: None)
+    monkeypatch.setattr(carry.Residuals, "corrected", lambda *_: [None])
     corrected, facts = carry_over(trajectory, twin, seen, velocity)
     assert corrected is trajectory
     assert facts == {"gain": -1.0, "carried": 0.0}

@@ -94,6 +94,17 @@ EVERYTHING = {
         selection="tail",
     ),
 }
+WEIGHTS = {
+    "fit": config.Fit(
+        epochs=2,
+        learning_rate=5e-2,
+        checkpoint_every=1,
+        selection="tail",
+        global_stiffness=True,
+        controller_factors=True,
+        rest_shape=config.RestShape(handles=3, prior=(0.1, 10.0)),
+    )
+}
 LIMITED = {
     "fit": config.Fit(epochs=4, learning_rate=0.3, checkpoint_every=1),
     "simulation": config.Simulation(max_substeps=70),
@@ -103,8 +114,18 @@ LIMITED = {
 
 @pytest.mark.parametrize(
     ("changes", "killed_in"),
-    [({}, 3), (GROWING, 8), (GROWING, 10), (REGULARISED, 3), (EVERYTHING, 2), (EVERYTHING, 4), (LIMITED, 3)],
-    ids=["springs", "growing-8", "growing-10", "field", "everything-2", "everything-4", "limited"],
+    [
+        ({}, 3),
+        (GROWING, 8),
+        (GROWING, 10),
+        (REGULARISED, 3),
+        (EVERYTHING, 2),
+        (EVERYTHING, 4),
+        (LIMITED, 3),
+        (WEIGHTS, 3),
+        (WEIGHTS, 4),
+    ],
+    ids=["springs", "growing-8", "growing-10", "field", "everything-2", "everything-4", "limited", "weights-3", "weights-4"],
 )
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
     whole = fit(small.fit_problem(**changes))
@@ -128,6 +149,7 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, kill
     assert_same_twin(continued.twin, whole.twin)
     assert (continued.best_epoch, continued.best_loss) == (whole.best_epoch, whole.best_loss)
     pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
+    assert continued.figures == whole.figures
 
 
 def assert_same_twin(twin: Twin, expected: Twin) -> None:

@@ -66,6 +66,8 @@ TRAINED = {
     "field of rest lengths too": ("field", {}, ALL | {"rest_lengths_by": "field"}),
     "field without controllers": ("field", {"controllers": False, "fourier": "none"}, ALL | {"homogeneous_epochs": 1}),
     "springs": ("springs", {}, ALL | {"damping": "homogeneous", "homogeneous_epochs": 1}),
+    "common factors": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
+    "unloaded shape": ("springs", {}, ALL | {"rest_shape": config.RestShape(handles=3)}),
 }
 
 
@@ -211,6 +213,46 @@ def test_homogeneous_damping_has_one_factor_for_all_dashpots_and_one_for_drag():
     assert torch.equal(physical["stiffness"], start["stiffness"])
 
 
+def test_controllers_springs_may_have_factors_of_their_own():
+    """Everything that is common to springs is then common to those of one kind; drag belongs to no spring."""
+    settings = {"global_stiffness": True, "damping": "homogeneous", "controller_factors": True}
+    trained, inner = parameters("springs", **settings), twin().topology.object_spring_count
+    assert set(trained.factors) == {"stiffness", "drag", "dashpot", "controller_stiffness", "controller_dashpot"}
+    with torch.no_grad():
+        for name, value in (("stiffness", 2.0), ("controller_stiffness", 0.25), ("dashpot", 3.0), ("controller_dashpot", 0.5)):
+            trained.factors[name].fill_(math.log(value))
+    physical, start = trained.physical(), trained.start
+    for name, inside, outside in (("stiffness", 2.0, 0.25), ("dashpot", 3.0, 0.5)):
+        factor = torch.cat([torch.full((inner,), inside), torch.full((len(start[name]) - inner,), outside)])
+        torch.testing.assert_close(physical[name].detach(), start[name] * factor, rtol=SINGLE, atol=0)
+    assert 0 < inner < len(start["stiffness"])
+
+
+def test_the_common_factor_has_no_bound():
+    trained = offsets(parameters("springs", global_stiffness=True, output_bound=0.1, stiffness_range=(0.0, 1e9)), 50.0)
+    with torch.no_grad():
+        trained.factors["stiffness"].fill_(5.0)
+    expected = trained.start["stiffness"] * math.exp(5.1)
+    torch.testing.assert_close(trained.physical()["stiffness"].detach(), expected, rtol=1e-5, atol=0)
+
+
+def test_a_damping_of_zero_has_no_factor():
+    start = twin()
+    still = replace(start, material=replace(start.material, drag=0.0))
+    assert set(parameters(start=still, damping="homogeneous").factors) == {"dashpot"}
+
+
+def test_quadratic_drag_has_a_factor_where_there_is_some():
+    thick = replace(twin(), material=replace(twin().material, drag_quadratic=0.7))
+    trained = parameters(start=thick, damping="homogeneous")
+    with torch.no_grad():
+        trained.factors["drag_quadratic"].fill_(0.5)
+    torch.testing.assert_close(float(trained.physical()["drag_quadratic"]), 0.7 * np.exp(0.5), rtol=SINGLE, atol=0)
+    assert trained.as_twin(thick).material.drag_quadratic == pytest.approx(0.7 * np.exp(0.5), rel=SINGLE)
+    for without in (parameters(damping="homogeneous"), parameters(start=thick)):
+        assert "factors.drag_quadratic" not in dict(without.named_parameters())
+
+
 def test_fixed_damping_does_not_move():
     trained = disturb(parameters())
     assert "drag" not in dict(trained.named_parameters())
@@ -339,6 +381,18 @@ def test_learning_rates_and_decay_of_each_group():
     assert not names, "every trained value belongs to one group"
 
 
+def test_factors_and_the_unloaded_shape_have_rates_of_their_own():
+    shape = config.RestShape(handles=2, learning_rate=0.5)
+    trained = parameters(
+        "springs", global_stiffness=True, factor_learning_rate=0.3, scalar_learning_rate=0.2, rest_shape=shape, learning_rate=0.1
+    )
+    rates = {tensor: group["base_rate"] for group in trained.groups() for tensor in group["params"]}
+    assert rates[trained.factors["stiffness"]] == 0.3
+    assert rates[trained.scalars["ground_friction"]] == 0.2
+    assert rates[trained.unloaded.handles] == 0.5
+    assert rates[trained.offsets] == 0.1
+
+
 def test_unset_learning_rates_are_the_common_one():
     for kind in ("springs", "field"):
         assert {group["lr"] for group in parameters(kind, learning_rate=0.1, rest_length_bound=0.1).groups()} == {0.1}
@@ -351,6 +405,23 @@ def test_the_penalty_is_the_weighted_roughness():
     for other in (parameters(), parameters("springs", field={"plane_smoothness": 0.5})):
         assert disturb(other).penalty() == 0
     assert parameters(field={"plane_smoothness": 0.5, "triplane": False}).penalty() == 0
+
+
+@pytest.mark.parametrize("settings", [{}, {"rest_lengths_by": "field"}], ids=["by springs", "by field"])
+def test_the_prior_of_rest_lengths_is_their_mean_squared_logarithm(settings):
+    trained = disturb(parameters(rest_length_bound=0.2, rest_prior=3.0, **settings))
+    ratio = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"]
+    assert trained.penalty().item() == pytest.approx(3.0 * float(ratio.log().square().mean()), rel=1e-4)
+    assert trained.penalty() > 0
+    trained.homogeneous = True
+    assert trained.penalty() == 0
+
+
+def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
+    trained = disturb(parameters("springs", rest_shape=config.RestShape(handles=3, prior=2.0)))
+    strain = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"] - 1
+    assert trained.penalty().item() == pytest.approx(2.0 * float(strain.square().mean()), rel=1e-4)
+    assert trained.penalty() > 0
 
 
 @pytest.mark.parametrize("kind", ["springs", "field"])

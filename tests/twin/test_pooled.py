@@ -6,20 +6,31 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
+from neuspring.twin import search as module
 from neuspring.twin.fit import FitProblem, FitResult, fit
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.polish import POLISH, SLOPES, Polish
 from neuspring.twin.pooled import PooledFit
 from neuspring.twin.recordings import Recording, mean_outcome
 from neuspring.twin.search import SearchProblem, search
 from neuspring.twin.trials import Outcome
 from tests.support import small
 
+POLISHED = {
+    "scales": {"stiffness": "log", "dashpot": "log", "drag": "log"},
+    "ranges": {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]},
+}
+"""Settings of a search with a polish: one round in stiffness, dashpot and drag."""
+ROLLOUTS = 11 + 8
 MEAN = 1e-6
 """Relative: a mean of two losses in float32."""
 TIMES = ["seconds"]
+PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
 
 
@@ -28,12 +39,27 @@ def seen(path: str) -> Observations:
     return small.scene(path).observations
 
 
-def searched(here: str, *others: str, leave_out: bool = False, **changes) -> pd.DataFrame:
-    """The trace of a short search, without times."""
-    alone = small.search_problem(seen(here))
+def polished(own: Observations, **changes) -> SearchProblem:
+    """A search of one generation with a polish of one round."""
+    start = {"object_radius": 0.045, "stiffness": 6e3}
+    polish = {"rounds": 1, "share": 0.9}
+    return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=polish, **POLISHED), **changes)
+
+
+def on_pool(alone: SearchProblem, *others: str, leave_out: bool = False, **changes) -> SearchProblem:
+    """The search on other recordings too."""
     pool = tuple(Recording.of(seen(path), alone.simulation, alone.losses, alone.quirks) for path in others)
-    problem: SearchProblem = replace(alone, pool=pool, leave_out=leave_out, **changes)
+    return replace(alone, pool=pool, leave_out=leave_out, **changes)
+
+
+def traced(problem: SearchProblem) -> pd.DataFrame:
+    """The trace of a search, without times."""
     return search(problem, 0).trace.drop(columns=TIMES)
+
+
+def searched(here: str, *others: str, **options) -> pd.DataFrame:
+    """The trace of a short search."""
+    return traced(on_pool(small.search_problem(seen(here)), *others, **options))
 
 
 def spoiled(observations: Observations) -> Observations:
@@ -64,6 +90,85 @@ def test_a_recording_beside_itself_changes_nothing():
     pd.testing.assert_frame_equal(searched(LIFTED, LIFTED, leave_out=True), searched(LIFTED))
 
 
+SMOOTH = config.Simulation(controller_path="cubic", mass="volume")
+
+
+@pytest.mark.parametrize("simulation", [config.Simulation(), SMOOTH], ids=["plain", "cubic path, volume masses"])
+def test_a_recording_beside_itself_changes_nothing_of_a_polish(simulation):
+    alone = polished(seen(LIFTED), simulation=simulation)
+    expected = traced(alone)
+    assert expected["stage"].tolist()[11:] == [SLOPES] * 4 + [POLISH] * 4
+    for leave_out in (False, True):
+        found = traced(on_pool(alone, LIFTED, leave_out=leave_out))
+        pd.testing.assert_frame_equal(found, expected, check_exact=True)
+
+
+def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
+    """The same candidates, judged on both recordings, on one, and on the other."""
+    both = on_pool(polished(seen(LIFTED)), SHAKEN)
+    alone, moved = replace(both, pool=()), replace(both, leave_out=True)
+    loss = FrameLoss.of(both.observations, both.losses, "cpu")
+    settings = both.search
+    columns = [both.variables.index(name) for name in settings.polished]
+    polish = Polish(settings, columns, both.encode(), 1.0)
+    population, steps = polish.ask(), polish.steps()
+    tables = [pd.DataFrame(module._slopes(each, population, steps, loss, 0, 0, map)) for each in (both, alone, moved)]
+    judged = ["cost", *(name for name in tables[0] if name.startswith("product."))]
+    assert len(judged) == 5
+    mean, one, other = (table[judged].to_numpy() for table in tables)
+    np.testing.assert_allclose(mean, (one + other) / 2, rtol=1e-12, atol=0)
+    assert (np.abs(one[1:] / other[1:] - 1) > 0.1).any(), "two recordings say something else"
+
+
+def test_steps_of_a_polish_cost_the_mean_over_the_recordings():
+    problem = on_pool(polished(seen(LIFTED)), SHAKEN)
+    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
+    trace = traced(problem)
+    rows = trace[trace["stage"] == POLISH]
+    assert len(rows) == 4
+    population = rows[[f"normalised.{name}" for name in problem.variables]].to_numpy()
+    apart = [
+        module._evaluate(each, population, loss, 0, 0, map)
+        for each in (replace(problem, pool=()), replace(problem, leave_out=True))
+    ]
+    means = [np.mean([row["cost"] for row in pair]) for pair in zip(*apart, strict=True)]
+    np.testing.assert_allclose(rows["cost"], means, rtol=1e-12)
+
+
+def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
+    problem = on_pool(polished(seen(LIFTED)), SHAKEN)
+    loss, calls = FrameLoss.of(problem.observations, problem.losses, "cpu"), []
+    polish = Polish(problem.search, [problem.variables.index(name) for name in problem.search.polished], problem.encode(), 1.0)
+    motions = module.motions
+
+    def leaving(*arguments):
+        x, v = motions(*arguments)
+        calls.append(1)
+        if len(calls) == 2:
+            x[-1, 2] = float("nan")
+        return x, v
+
+    monkeypatch.setattr(module, "motions", leaving)
+    rows = module._slopes(problem, polish.ask(), polish.steps(), loss, 0, 0, map)
+    assert len(calls) == 2
+    assert [row["cost"] < module.PENALTY for row in rows] == [True, True, False, True]
+    assert [row["product.residual"] != 0 for row in rows] == [False, True, False, True]
+
+
+def test_springs_radii_and_masses_are_the_same_on_all_recordings():
+    """Lengths in spacings of the scenario's own body, whatever the poses of the others."""
+    search_settings = replace(polished(seen(LIFTED)).search, lengths="spacing")
+    alone = replace(polished(seen(LIFTED), simulation=SMOOTH), search=search_settings)
+    stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
+    recording = Recording.of(stretched, alone.simulation, alone.losses, alone.quirks)
+    _, (here, there) = module._made(replace(alone, pool=(recording,)), alone.encode())
+    np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
+    np.testing.assert_array_equal(here.material.mass, there.material.mass)
+    assert len(here.material.mass) == len(here.topology.nodes)
+    np.testing.assert_allclose(there.topology.rest_lengths, 1.1 * here.topology.rest_lengths, rtol=MEAN)
+    assert recording.hands.shape[-1] == 6, "positions and tangents"
+
+
 def test_threads_and_launches_change_nothing_in_a_pool():
     pd.testing.assert_frame_equal(searched(LIFTED, SHAKEN, threads=2, together=3), searched(LIFTED, SHAKEN))
 
@@ -78,13 +183,13 @@ def test_a_twin_that_leaves_one_recording_has_left():
 # Fit ------------------------------------------------------------------------------------------------------------------
 
 
-def problem_of(path: str, **settings) -> FitProblem:
+def problem_of(path: str, *, oracle: bool = False, **settings) -> FitProblem:
     """A fit of the rope's true twin whose stiffness is homogeneous and half as large."""
     truth = small.scene(path).truth
     low = np.full_like(truth.material.stiffness, 0.5 * float(np.median(truth.material.stiffness)))
     start = replace(truth, material=replace(truth.material, stiffness=low))
     changes = {"epochs": 4, "learning_rate": 5e-2, "checkpoint_every": 1} | settings
-    return small.fit_problem(seen(path), twin=start, fit=config.Fit(**changes))
+    return small.fit_problem(seen(path), twin=start, fit=config.Fit(**changes), oracle=oracle)
 
 
 def pooled(problem: FitProblem, *pool: Observations, leave_out: bool = False, **options) -> FitResult:
@@ -97,6 +202,7 @@ def require_equal(one: FitResult, other: FitResult) -> None:
     require_equal_twins(one.twin, other.twin)
     pd.testing.assert_frame_equal(one.history, other.history)
     assert (one.best_epoch, one.best_loss) == (other.best_epoch, other.best_loss)
+    assert one.figures == other.figures
 
 
 def require_equal_twins(one: Twin, other: Twin) -> None:
@@ -104,15 +210,18 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
     for name in ("stiffness", "dashpot"):
         np.testing.assert_array_equal(getattr(one.material, name), getattr(other.material, name))
     np.testing.assert_array_equal(one.topology.rest_lengths, other.topology.rest_lengths)
+    np.testing.assert_array_equal(one.topology.rest_shape, other.topology.rest_shape)
     assert one.simulation == other.simulation
     assert one.material.ground_friction == other.material.ground_friction
 
 
+SHAPE = config.RestShape(handles=4, prior=(1e-3, 10.0), learning_rate=0.02)
 SETTINGS = {
     "one frame": {},
     "all frames": {"horizon": 0},
     "tail": {"selection": "tail", "horizon": 2},
     "one step and tail": {"selection": "tail", "horizon": 0},
+    "shape, priors tried, meters": {"rest_shape": SHAPE, "selection": "tail", "epochs": 2, "loss_unit": "meter"},
     "lengths and damping": {"rest_length_bound": 0.1, "damping": "springs", "schedule": "cosine", "homogeneous_epochs": 2},
 }
 
@@ -121,6 +230,50 @@ SETTINGS = {
 def test_a_pool_of_one_is_the_plain_fit(name):
     problem = problem_of(LIFTED, **SETTINGS[name])
     require_equal(pooled(problem), fit(problem))
+    # With itself left out, the pool's fit is the plain one too.
+    require_equal(pooled(problem, problem.observations, leave_out=True), fit(problem))
+
+
+def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
+    problem, other, late = problem_of(LIFTED, oracle=True), seen(SHAKEN), small.spoiled_future()
+    require_equal(pooled(problem), fit(problem))
+    found = pooled(problem, other, leave_out=True)
+    require_equal(found, pooled(replace(problem, observations=late), other, leave_out=True))
+    own = fit(replace(problem, observations=other))
+    np.testing.assert_array_equal(found.twin.material.stiffness, own.twin.material.stiffness)
+    assert not np.array_equal(
+        pooled(problem, late).twin.material.stiffness, pooled(problem, problem.observations).twin.material.stiffness
+    )
+    plain = problem_of(LIFTED)
+    require_equal(pooled(plain, late), pooled(plain, plain.observations))
+
+
+def test_masses_and_controllers_on_a_cubic_path_reach_every_recording():
+    problem = problem_of(LIFTED, epochs=2)
+    mass = np.linspace(0.5, 1.5, len(problem.twin.topology.nodes)).astype(np.float32)
+    twin = replace(problem.twin, material=replace(problem.twin.material, mass=mass))
+    twin = replace(twin, simulation=replace(twin.simulation, controller_path="cubic"))
+    problem = replace(problem, twin=twin)
+    # On the same nodes, the other recording's own fit.
+    found, own = pooled(problem, seen(SHAKEN), leave_out=True), fit(replace(problem, observations=seen(SHAKEN)))
+    np.testing.assert_array_equal(found.twin.material.stiffness, own.twin.material.stiffness)
+    np.testing.assert_array_equal(found.twin.material.mass, mass)
+
+
+def test_recordings_share_one_unloaded_shape_and_one_unit():
+    problem = problem_of(LIFTED, epochs=1, rest_shape=replace(SHAPE, prior=1e-3))
+    larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
+    run = PooledFit(problem, pool=[larger])
+    with torch.no_grad():
+        run.parameters.unloaded.handles.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
+    here, there = (member.parameters.physical()["rest_lengths"] for member in run._members)
+    torch.testing.assert_close(there, 2 * here)
+    assert not torch.allclose(here, run.parameters.start["rest_lengths"], rtol=1e-2)
+    assert {member.loss_scale for member in run._members} == {run.loss_scale}
+    before = run.parameters.copy()
+    run.start_epoch(0, 1.0)
+    run.epoch()
+    assert not np.array_equal(before["unloaded.handles"], run.parameters.copy()["unloaded.handles"])
 
 
 def test_a_field_in_a_pool_of_one_is_the_plain_fit():
@@ -139,12 +292,17 @@ def test_left_out_recordings_lend_their_nodes_alone():
     assert not np.array_equal(found.twin.material.stiffness, fit(problem).twin.material.stiffness)
 
 
-def test_the_search_reads_nothing_of_what_is_left_out():
+@pytest.mark.parametrize(
+    "simulation", [config.Simulation(), replace(SMOOTH, initial_velocity="observed")], ids=["plain", "observed"]
+)
+def test_search_and_polish_read_nothing_of_what_is_left_out(simulation):
     here = seen(LIFTED)
-    alone = small.search_problem(here)
-    pool = (Recording.of(seen(SHAKEN), alone.simulation, alone.losses, alone.quirks),)
-    first, second = (search(replace(alone, observations=o, pool=pool, leave_out=True), 0) for o in (here, spoiled(here)))
-    pd.testing.assert_frame_equal(first.trace.drop(columns=TIMES), second.trace.drop(columns=TIMES))
+    alone = on_pool(polished(here, simulation=simulation), SHAKEN, leave_out=True)
+    first, second = (traced(replace(alone, observations=o)) for o in (here, spoiled(here)))
+    assert first["stage"].iloc[-1] == POLISH
+    pd.testing.assert_frame_equal(first, second, check_exact=True)
+    # What counts is read.
+    assert not traced(replace(alone, leave_out=False))["cost"].equals(first["cost"])
 
 
 def test_one_material_comes_nearer_to_two_recordings():

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
+from neuspring.twin.masses import volume_masses
 from neuspring.twin.resample import asked, held_by_hands, resampled, scale_between
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import distances, piecewise_topology, uniform_topology
@@ -161,6 +162,27 @@ def test_regions_and_strain_at_rest_are_carried():
     inner = np.arange(len(strain)) < topology.object_spring_count
     np.testing.assert_allclose(strain[inner & (middle[:, 1] > 0.06)], 1.05, rtol=0.01)
     np.testing.assert_allclose(strain[inner & (middle[:, 1] < -0.06)], 0.95, rtol=0.01)
+
+
+def test_masses_are_those_of_the_new_nodes_and_calibrated_grips_stay_calibrated():
+    size = BODIES["cloth"]
+    a, b = recording(grid(size, 0.03), hands_of(size)), recording(grid(size, 0.02, 1), hands_of(size))
+    a, b = (replace(seen, rest_shape=1.2 * seen.canonical) for seen in (a, b))
+    plain = twin_of(a, 0.03)
+    parts = a.nodes, a.controller_points[0], np.zeros(len(a.nodes), np.int32), [2.8 * 0.03], [30], 0.08, 50
+    topology = piecewise_topology(*parts, rest_shape=a.rest_shape, controller_rest="first_frame")
+    count, strain = len(topology.springs), 0.97
+    values = {"stiffness": np.full(count, 2e3), "dashpot": np.full(count, 2.0), "mass": volume_masses(a.nodes)}
+    topology = replace(topology, rest_lengths=strain * topology.rest_lengths)
+    twin = replace(plain, topology=topology, material=replace(plain.material, **values))
+    moved = move(twin, b).twin
+    np.testing.assert_allclose(moved.material.mass, volume_masses(b.canonical[: len(b.nodes)]), rtol=1e-6)
+    assert moved.topology.controller_rest == "first_frame"
+    new, body = moved.topology, moved.topology.object_spring_count
+    assert 0 < body < len(new.springs)
+    frame_0 = np.concatenate([b.nodes, b.controller_points[0]])
+    np.testing.assert_allclose(new.rest_lengths[:body], strain * distances(b.canonical, new.springs[:body]), rtol=1e-5)
+    np.testing.assert_allclose(new.rest_lengths[body:], strain * distances(frame_0, new.springs[body:]), rtol=1e-5)
 
 
 def test_a_body_that_lies_elsewhere_and_turned_is_found():

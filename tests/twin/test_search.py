@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cma
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuspring import config
+from neuspring.config.search import LENGTHS
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
@@ -25,6 +27,7 @@ from neuspring.twin.search import PENALTY, SearchProblem, candidate, groups, jud
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import small
+from tests.support.searches import assert_same_trace, budget
 
 RELEASED = {
     "stiffness": 0.3,
@@ -41,6 +44,24 @@ RELEASED = {
     "dashpot": 0.5,
 }
 """The released variables in the released order, and the released start on the normalized scale."""
+RELEASED_RANGES = {
+    "stiffness": (0.0, 1e5),
+    "object_radius": (0.01, 0.05),
+    "object_neighbours": (10, 50),
+    "controller_radius": (0.01, 0.08),
+    "controller_neighbours": (10, 80),
+    "ground_elasticity": (0.0, 1.0),
+    "ground_friction": (0.0, 2.0),
+    "contact_elasticity": (0.0, 1.0),
+    "contact_friction": (0.0, 2.0),
+    "contact_distance": (0.01, 0.05),
+    "drag": (0.0, 20.0),
+    "dashpot": (0.0, 200.0),
+}
+ROUND_TRIP = 1e-9
+"""Absolute, of normalized variables: rounding of float64, over ranges of a part of their bounds."""
+START_ROUNDING = 1e-12
+"""Absolute: the start's decimal fractions are rounded once more than its encoded values."""
 CODING = 1e-12
 """Relative: to the normalized scale and back, rounding of float64 only."""
 FLOAT32_LENGTHS = 1e-6
@@ -50,7 +71,7 @@ FLOAT32_LENGTHS = 1e-6
 def plain(**changes: object) -> SearchProblem:
     """A search with the released settings, for its coding."""
     clusters = {"clusters": changes.pop("clusters")} if "clusters" in changes else {}
-    return small.search_problem(search=config.Search(**changes), **clusters)
+    return small.search_problem(search=small.released(**changes), **clusters)
 
 
 # Variables ------------------------------------------------------------------------------------------------------------
@@ -75,20 +96,32 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     assert np.unique(problem.labels).tolist() == list(range(clusters))
 
 
-@pytest.mark.parametrize("changes", [{}, {"stiffness_scale": "log", "ranges": config.SearchRanges(stiffness=(1e2, 1e5))}])
+@pytest.mark.parametrize("changes", [{}, {"scales": {"stiffness": "log"}, "ranges": {"stiffness": [1e2, 1e5]}}])
 def test_the_start_is_decoded_to_itself(changes):
     problem = plain(clusters=3, **changes)
-    start = config.plain(config.SearchStart())
+    start = config.plain(problem.search.start)
     for name, value in problem.decode(problem.encode()).items():
         # Counts are truncated, and 30 may come back as 29.999...
         slack = {"abs": 1} if name.partition(".")[0] in module.INTEGERS else {"rel": CODING}
         assert value == pytest.approx(start[name.partition(".")[0]], **slack)
 
 
+def test_quadratic_drag_is_a_variable_where_it_is_asked_for():
+    """It comes last, so that searches without it keep their variables."""
+    values = small.start_values()
+    free = small.search_problem()
+    wanted = replace(free.search, extra=("drag_quadratic",), ranges=replace(free.search.ranges, drag_quadratic=(0.01, 100.0)))
+    searched = small.search_problem(search=wanted)
+    assert searched.variables == (*free.variables, "drag_quadratic")
+    assert searched.decode(np.full(13, 0.25))["drag_quadratic"] == pytest.approx(0.1, rel=CODING)
+    assert candidate(free, values).material.drag_quadratic == 0.0
+    assert candidate(searched, values | {"drag_quadratic": 1.5}).material.drag_quadratic == 1.5
+
+
 def test_the_logarithmic_scale_of_stiffness():
-    ranges = config.SearchRanges(stiffness=(1e1, 1e5))
+    ranges = {"stiffness": [1e1, 1e5]}
     middle = np.full(12, 0.5)
-    logarithmic = plain(stiffness_scale="log", ranges=ranges).decode(middle)
+    logarithmic = plain(scales={"stiffness": "log"}, ranges=ranges).decode(middle)
     linear = plain(ranges=ranges).decode(middle)
     assert (logarithmic["stiffness"], linear["stiffness"]) == (pytest.approx(1e3), pytest.approx(50005))
     # No other variable is touched.
@@ -97,14 +130,109 @@ def test_the_logarithmic_scale_of_stiffness():
 
 @given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
 def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalised, scale):
-    ranges = config.SearchRanges(stiffness=(1.0, 1e5))
     for clusters in (1, 3):
-        problem = plain(clusters=clusters, ranges=ranges, stiffness_scale=scale)
+        problem = plain(clusters=clusters, ranges={"stiffness": [1.0, 1e5]}, scales={"stiffness": scale})
         for name, value in problem.decode(np.array(normalised[: 2 * clusters + 10])).items():
             base = name.partition(".")[0]
-            low, high = getattr(ranges, base)
+            low, high = getattr(problem.search.ranges, base)
             assert low * (1 - CODING) <= value <= high * (1 + CODING)
             assert base not in module.INTEGERS or value == int(value)
+
+
+@given(st.lists(st.floats(0, 1), min_size=12, max_size=12), st.sampled_from(["spacing", "meter"]))
+def test_what_is_decoded_comes_from_where_it_is_decoded_to(normalized, lengths):
+    """Linear and logarithmic scales, both units: the start that has the decoded values is encoded to the same variables."""
+    problem = ours() if lengths == "spacing" else plain(scales={"drag": "log"}, ranges={"drag": [0.1, 20.0]})
+    values = problem.decode(np.array(normalized))
+    if lengths == "spacing":
+        values["controller_radius"] -= problem.reach
+        values |= {name: values[name] / problem.spacing for name in LENGTHS}
+    ranges = problem.search.ranges
+    inside = {name: float(np.clip(value, *getattr(ranges, name))) for name, value in values.items()}
+    back = replace(problem, search=replace(problem.search, start=config.SearchStart(**inside))).encode()
+    for name, u, again in zip(problem.variables, normalized, back, strict=True):
+        low, high = getattr(ranges, name)
+        slack = 1 / (high - low) if name in module.INTEGERS else ROUND_TRIP
+        assert again == pytest.approx(u, abs=slack)
+
+
+def ours(**changes: object) -> SearchProblem:
+    """A search with the program's defaults."""
+    return small.search_problem(changes.pop("seen", None), search=config.parse(config.Search, changes, "test"))
+
+
+def test_lengths_are_multiples_of_the_spacing_of_the_nodes():
+    problem = ours()
+    values, start = problem.decode(problem.encode()), problem.search.start
+    assert problem.spacing == pytest.approx(0.02, rel=0.1), "that of the toy rope"
+    for name in ("object_radius", "contact_distance"):
+        assert values[name] == pytest.approx(getattr(start, name) * problem.spacing)
+    # A controller's radius begins where there is a node.
+    assert values["controller_radius"] == pytest.approx(start.controller_radius * problem.spacing + problem.reach)
+    lowest = candidate(problem, problem.decode(np.zeros(12)))
+    assert len(lowest.topology.springs) > lowest.topology.object_spring_count
+
+
+def test_small_and_large_units_have_the_same_variables_and_springs():
+    """What is measured in spacings grows with the body: 1024 times, a power of two, so that no distance is rounded."""
+    seen = small.observations()
+    large = replace(
+        seen,
+        object_points=1024 * seen.object_points,
+        controller_points=1024 * seen.controller_points,
+        surface_points=1024 * seen.surface_points,
+        interior_points=1024 * seen.interior_points,
+        tracks=1024 * seen.tracks,
+    )
+    meters, units = ours(), ours(seen=large)
+    np.testing.assert_array_equal(units.encode(), meters.encode())
+    rng = np.random.default_rng(0)
+    for normalized in rng.random((5, 12)):
+        first, second = (problem.decode(normalized) for problem in (meters, units))
+        for name, value in first.items():
+            assert second[name] == pytest.approx(value * (1024 if name in LENGTHS else 1), rel=FLOAT32_LENGTHS)
+        springs = [candidate(p, v).topology.springs for p, v in ((meters, first), (units, second))]
+        np.testing.assert_array_equal(*springs)
+
+
+def test_fixed_variables_keep_their_start():
+    problem = ours(rollouts=11, fixed=["drag", "object_radius"], start={"drag": 0.0})
+    assert len(problem.variables) == len(problem.encode()) == 10
+    assert set(problem.names) - set(problem.variables) == {"drag", "object_radius"}
+    assert problem.search.polished == ("stiffness", "dashpot")
+    result = search(problem, seed=0)
+    # Outside the range, where no search would go.
+    assert (result.trace["drag"] == 0).all()
+    assert (result.trace["object_radius"] == 2.5 * problem.spacing).all()
+    assert result.twin.material.drag == 0
+    assert not {"normalised.drag", "normalised.object_radius"} & set(result.trace)
+
+
+def test_a_fixed_radius_is_that_of_every_region():
+    problem = small.search_problem(search=small.released(fixed=["object_radius"]), clusters=3)
+    assert len(problem.variables) == 2 * 3 + 10 - 3
+    assert [problem.decode(problem.encode())[f"object_radius.{region}"] for region in range(3)] == [0.02] * 3
+
+
+@pytest.mark.parametrize("clusters", [1, 3])
+def test_the_released_row_is_the_search_as_it_was(clusters):
+    """Bit for bit: the linear formula on the released ranges, and CMA-ES from the released start, told the same costs."""
+    trace = search(small.search_problem(search=small.released(rollouts=24), clusters=clusters), seed=3).trace
+    ranges = RELEASED_RANGES
+    names = [n for n in trace if n.removeprefix("normalised.") != n]
+    start = [RELEASED[n.removeprefix("normalised.").partition(".")[0]] for n in names]
+    for name in (n.removeprefix("normalised.") for n in names):
+        low, high = ranges[name.partition(".")[0]]
+        value = low + trace[f"normalised.{name}"] * (high - low)
+        whole = name.partition(".")[0] in module.INTEGERS
+        np.testing.assert_array_equal(trace[name], value.astype(int) if whole else value)
+    options = {"bounds": [0, 1], "seed": 4, "verbose": -9, "tolfun": 0, "tolx": 0}
+    strategy = cma.CMAEvolutionStrategy(start, 1 / 6, options)
+    while len(trace) >= strategy.popsize:
+        asked, trace_now = strategy.ask(), trace[: strategy.popsize]
+        np.testing.assert_allclose(trace_now[names], asked, atol=START_ROUNDING)
+        strategy.tell(asked, trace_now["cost"].tolist())
+        trace = trace[strategy.popsize :]
 
 
 # Candidates -----------------------------------------------------------------------------------------------------------
@@ -147,7 +275,7 @@ def test_regions_and_candidates_are_made_on_the_rest_shape():
 
 def loosely(**changes: object) -> SearchProblem:
     """A search whose radii may be so small that only nodes at the controllers have springs."""
-    return small.search_problem(search=config.Search(ranges=config.SearchRanges(object_radius=(0.001, 0.05)), **changes))
+    return small.search_problem(search=small.released(ranges={"object_radius": [0.001, 0.05]}, **changes))
 
 
 def test_isolated_nodes_are_repaired_penalised_or_left():
@@ -176,8 +304,8 @@ def test_allow_is_the_released_topology():
 
 def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
     """Radii around the distance of the rope's rings: some candidates leave nodes alone."""
-    ranges, start = config.SearchRanges(object_radius=(0.001, 0.03)), config.SearchStart(object_radius=0.012)
-    settings = config.Search(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
+    ranges, start = {"object_radius": [0.001, 0.03]}, {"object_radius": 0.012}
+    settings = small.released(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
     trace = search(small.search_problem(search=settings), seed=0).trace
     refused = trace[trace["reason"].str.contains("nodes have no spring")]
     assert 0 < len(refused) < len(trace)
@@ -242,17 +370,6 @@ def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
     assert (whole.attempts, continued.attempts) == (1, 2)
     assert continued.earlier_seconds > 0
     assert_same_trace(continued.trace, whole.trace)
-
-
-def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
-    """The default search with another budget."""
-    problem = small.search_problem(clusters=clusters)
-    return replace(problem, search=replace(problem.search, rollouts=rollouts))
-
-
-def assert_same_trace(trace: pd.DataFrame, expected: pd.DataFrame) -> None:
-    """Equal bit for bit, but for the time that each candidate took."""
-    pd.testing.assert_frame_equal(trace.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)
 
 
 @pytest.mark.parametrize(("clusters", "population"), [(1, 11), (3, 12)])
@@ -529,8 +646,7 @@ def test_threads_of_a_search_have_none_of_torch(monkeypatch):
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     """Some diverge, some are unstable, some have isolated nodes, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
-    start = config.SearchStart(object_radius=0.0145, stiffness=3e4)
-    settings = config.Search(rollouts=22, isolated_nodes="penalise", start=start)
+    settings = small.released(rollouts=22, isolated_nodes="penalise", start={"object_radius": 0.0145, "stiffness": 3e4})
     chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
     check = stability.check
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from neuspring.twin.topology import (
     REPAIR_SPRINGS,
     build,
     controller_springs,
+    distances,
     isolated,
     join,
     object_springs,
@@ -306,6 +309,38 @@ def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
     assert springs([0.01, 0.01], [5, 5]) == set()
     # A node's own values decide whom it asks, whichever region the other is in.
     assert springs([0.25, 0.01], [5, 1]) == {(0, 1), (0, 2), (1, 2), (1, 3)}
+
+
+# Where the springs of controllers have no force -----------------------------------------------------------------------
+
+
+def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_rest_shape() -> None:
+    nodes, hands, one = cloud(3), cloud(4, 3), np.zeros(25, np.int32)
+    rest_shape = np.concatenate([cloud(5), cloud(6, 3)])
+    plain, calibrated = (
+        piecewise_topology(nodes, hands, one, [0.5], [6], 0.6, 4, rest_shape=rest_shape, controller_rest=rest)
+        for rest in ("rest_shape", "first_frame")
+    )
+    np.testing.assert_array_equal(calibrated.springs, plain.springs)
+    body, frame0 = plain.object_spring_count, np.concatenate([nodes, hands])
+    assert 0 < body < len(plain.springs)
+    np.testing.assert_array_equal(calibrated.rest_lengths[:body], plain.rest_lengths[:body])
+    np.testing.assert_allclose(plain.rest_lengths, distances(rest_shape, plain.springs), rtol=LENGTH)
+    np.testing.assert_allclose(calibrated.rest_lengths[body:], distances(frame0, plain.springs[body:]), rtol=LENGTH)
+
+
+def test_without_a_rest_shape_calibration_changes_nothing() -> None:
+    one = np.zeros(25, np.int32)
+    first, other = (
+        piecewise_topology(cloud(3), cloud(4, 3), one, [0.5], [6], 0.6, 4, controller_rest=rest)
+        for rest in ("rest_shape", "first_frame")
+    )
+    np.testing.assert_array_equal(first.rest_lengths, other.rest_lengths)
+
+
+def test_another_place_of_rest_is_refused() -> None:
+    with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
+        replace(piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands")
 
 
 # Isolated nodes -------------------------------------------------------------------------------------------------------

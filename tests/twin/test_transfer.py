@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuspring.twin.rollout import mean_trajectory, roll_out
+from neuspring import config
+from neuspring.core.artifacts import Twin
+from neuspring.twin.rollout import mean_trajectory, roll_out, simulate
+from neuspring.twin.search import candidate
 from neuspring.twin.transfer import corresponds, move, rebase
 from tests.support import small
 
@@ -14,6 +17,8 @@ ROUNDED = 1e-6
 """Points in float32 laid onto themselves, m."""
 PLACES = ("object_points", "surface_points", "controller_points")
 TRACKED = ("object_points", "object_visibility", "object_motion_valid")
+STILL = 1e-5
+"""m: what the rounding of rest lengths moves a node in five frames; the wrong rest length moves it by centimeters."""
 
 
 def test_the_same_recording_gives_the_same_twin():
@@ -48,6 +53,51 @@ def test_rest_lengths_follow_the_rest_shape_where_there_is_one():
     # Another pose of a body in the same rest shape changes nothing.
     again = rebase(moved, replace(bent, object_points=seen.object_points * 3))
     np.testing.assert_array_equal(again.topology.rest_lengths, moved.topology.rest_lengths)
+
+
+def calibrated():
+    """Observations in another rest shape, a twin on them whose controllers rest in frame 0, and the first of their springs."""
+    seen = replace(small.observations(), rest_shape=small.observations().canonical * 1.5)
+    search = replace(small.search_problem(seen), search=config.Search(controller_rest="first_frame"))
+    values = small.start_values() | {"object_radius": 0.07, "controller_radius": 0.07}
+    twin = candidate(search, values)
+    assert 0 < twin.topology.object_spring_count < len(twin.topology.springs)
+    return seen, twin, twin.topology.object_spring_count
+
+
+def test_calibrated_grips_take_hold_of_the_body_as_it_is_in_the_new_recording():
+    seen, twin, body = calibrated()
+    learned = replace(twin, topology=replace(twin.topology, rest_lengths=twin.topology.rest_lengths * 1.03))
+    other = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
+    for keep in (False, True):
+        moved = rebase(learned, other, keep_lengths=keep).topology
+        assert moved.controller_rest == "first_frame"
+        # The body rests as before, for its rest shape is the same; the grips follow frame 0.
+        np.testing.assert_allclose(moved.rest_lengths[:body], learned.topology.rest_lengths[:body], rtol=SINGLE)
+        np.testing.assert_allclose(moved.rest_lengths[body:], twin.topology.rest_lengths[body:] * 2.06, rtol=SINGLE)
+
+
+def test_calibrated_grips_pull_at_nothing_in_frame_0():
+    seen, twin, body = calibrated()
+    alone = twin.material.stiffness.copy()
+    alone[:body] = 0.0
+    still = np.repeat(seen.controller_points[:1], 6, axis=0)
+
+    def moved(rest: str) -> float:
+        search = replace(small.search_problem(seen), search=config.Search(controller_rest=rest))
+        held = candidate(search, {**small.start_values(), "object_radius": 0.07, "controller_radius": 0.07})
+        free = replace(held.simulation, gravity=0.0, ground=False)
+        result = simulate(replace(held, material=replace(held.material, stiffness=alone), simulation=free), still)
+        return float(np.abs(result.positions - seen.nodes).max())
+
+    assert moved("first_frame") < STILL
+    assert moved("rest_shape") > 1000 * STILL
+
+
+def test_a_twin_remembers_where_its_grips_rest(tmp_path):
+    _, twin, _ = calibrated()
+    twin.save(tmp_path / "twin.npz")
+    assert Twin.load(tmp_path / "twin.npz").topology.controller_rest == "first_frame"
 
 
 def test_more_substeps_where_the_new_distances_need_them():

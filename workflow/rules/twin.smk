@@ -78,12 +78,15 @@ rule fit:
     params:
         kind=lambda wildcards: BENCHMARK.fits[wildcards.method].fit,
         pool=INPUTS.pool_options,
+        oracle=lambda wildcards: (
+            "--oracle" if BENCHMARK.fits[wildcards.method].oracle else ""
+        ),
         settings=settings_of("fit"),
         code=code_of("fit"),
     shell:
         gpu_job(
             "fit --observations {input.observations:q} --search {input.search:q} --settings {params.settings:q}"
-            " {params.pool} --kind {params.kind} --output {output:q}"
+            " {params.pool} --kind {params.kind} {params.oracle} --output {output:q}"
         )
 
 
@@ -107,12 +110,16 @@ rule rollout:
         runtime=NEEDS.minutes("rollout"),
     params:
         carry=lambda wildcards: (
-            "--carry-over" if BENCHMARK.methods[wildcards.method].carry_over else ""
+            f"--carry-over {how}"
+            if (how := BENCHMARK.methods[wildcards.method].carry_over)
+            else ""
         ),
+        settings=settings_of("rollout"),
         code=code_of("rollout"),
     shell:
         gpu_job(
-            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry} --output {output:q}"
+            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry} --settings {params.settings:q}"
+            " --output {output:q}"
         )
 
 

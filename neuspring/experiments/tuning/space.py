@@ -24,7 +24,7 @@ from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
 from neuspring.core.run_record import flat
-from neuspring.experiments.benchmark import fit_of, read_methods, read_searches, search_of
+from neuspring.experiments.benchmark import fit_of, quirks_of, read_methods, read_searches, search_of
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 """What a trial reads; observations are made before."""
@@ -53,10 +53,13 @@ class Plan:
         """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
         methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
         method = _row("tune.method", tune.method, methods, settings.method_table)
+        if method.oracle:
+            raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
         base = {name: config.plain(getattr(settings, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
         base["fit"] = config.plain(fit_of(settings, method, tune.method))
         base["search"] = config.plain(search_of(settings, row, method.search))
+        base["released_quirks"] = config.plain(quirks_of(settings, row, method.search))
         plan = cls(tune, method, row, base)
         for name, dimension in tune.space.items():
             plan._require_setting(name)

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
 from neuspring.report.figures.twin import CONTROLLER, stiffness_figure, topology_figure
 from neuspring.report.figures.views import View, limits, point_size, readable, sample, save, side_view, widest_axis
-from neuspring.scores.metrics import PICTURES, chamfer_per_frame, track_error_per_frame
+from neuspring.scores.metrics import PICTURES, errors_per_frame, track_error_per_frame
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
@@ -73,11 +73,13 @@ def run_figures(
 def _errors(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
     seconds = np.arange(len(trajectory.positions)) / observations.scenario.frame_rate
-    for label, values, color in (
-        ("track error (Euclidean)", track_error_per_frame(trajectory.positions, observations), "tab:blue"),
-        ("Chamfer distance (L1)", chamfer_per_frame(trajectory.positions, observations), "tab:orange"),
+    values = errors_per_frame(trajectory.positions, observations)
+    for metric, label, color in (
+        ("track_error", "track error (Euclidean)", "tab:blue"),
+        ("track_error_bound", "track error of bound points", "tab:green"),
+        ("chamfer", "Chamfer distance (L1)", "tab:orange"),
     ):
-        axis.plot(seconds, MM * values, label=label, color=color)
+        axis.plot(seconds, MM * values[metric], label=label, color=color)
     split = observations.scenario.train_end / observations.scenario.frame_rate
     axis.axvspan(split, observations.scenario.frame_count / observations.scenario.frame_rate, color="0.92", label="future")
     axis.set(xlabel="time [s]", ylabel="error [mm]", title=title, ylim=(0, None), xlim=(0, None))

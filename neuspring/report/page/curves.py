@@ -18,7 +18,7 @@ from neuspring.core.records import StageRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
 from neuspring.report.page import draw
 from neuspring.report.page.sources import UNREADABLE, Material, Run
-from neuspring.scores.metrics import METRICS, track_errors
+from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
 PENALTY = 1e3
 """Costs above this stand for candidates that could not be simulated."""
@@ -133,27 +133,31 @@ def _losses(stage: str) -> Callable[[Material, str], Curves]:
     return collect
 
 
-def _errors(material: Material, scenario: str) -> Curves:
-    """Track error of the first run of every method, from its trajectory."""
-    runs = {method: run for method, run in material.first_runs(scenario).items() if run.record.ok}
-    place = material.results / scenario / "observations.npz"
-    if not runs or not place.is_file():
-        return Curves(by_name={})
-    try:
-        observations = Observations.load(place)
-    except UNREADABLE as error:
-        material.lost(place, error)
-        return Curves(by_name={})
-    facts, by_name = observations.scenario, {}
-    for method, run in runs.items():
-        values = _track_error(material, run, observations.tracks)
-        if values is not None:
-            values = METRICS["track_error"].factor * values
-            by_name[method] = {run.seed: pd.Series(values, index=np.arange(len(values)) / facts.frame_rate)}
-    return Curves(by_name=by_name, future=facts)
+def _errors(metric: str) -> Callable[[Material, str], Curves]:
+    """Collects a track error of the first run of every method, from its trajectory."""
+
+    def collect(material: Material, scenario: str) -> Curves:
+        runs = {method: run for method, run in material.first_runs(scenario).items() if run.record.ok}
+        place = material.results / scenario / "observations.npz"
+        if not runs or not place.is_file():
+            return Curves(by_name={})
+        try:
+            observations = Observations.load(place)
+        except UNREADABLE as error:
+            material.lost(place, error)
+            return Curves(by_name={})
+        facts, by_name = observations.scenario, {}
+        for method, run in runs.items():
+            values = _track_error(material, run, observations.tracks, metric)
+            if values is not None:
+                values = METRICS[metric].factor * values
+                by_name[method] = {run.seed: pd.Series(values, index=np.arange(len(values)) / facts.frame_rate)}
+        return Curves(by_name=by_name, future=facts)
+
+    return collect
 
 
-def _track_error(material: Material, run: Run, tracks: np.ndarray) -> np.ndarray | None:
+def _track_error(material: Material, run: Run, tracks: np.ndarray, metric: str) -> np.ndarray | None:
     record = run.file("records", "rollout")
     if record is None:
         return None
@@ -162,19 +166,28 @@ def _track_error(material: Material, run: Run, tracks: np.ndarray) -> np.ndarray
         if "trajectory" not in stage.files:
             return None
         positions = Trajectory.load(record.parent / stage.files["trajectory"][0]).positions
-        values = track_errors(positions, tracks[: len(positions)])
+        values = TRACK_ERRORS[metric](positions, tracks[: len(positions)])
     except UNREADABLE as error:
         material.lost(record, error)
         return None
     return None if np.isnan(values).all() else values
 
 
+TRACK_ERRORS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "track_error": track_errors,
+    "track_error_bound": bound_track_errors,
+}
 PLOTS = (
     Plot(
         title="Track error over time",
         about="Track error in mm over time in s, one seed. Gray: the future, which no method has seen.",
-        collect=_errors,
+        collect=_errors("track_error"),
         open=True,
+    ),
+    Plot(
+        title="Bound track error over time",
+        about="The same for points that move with the nodes around them, in mm: it begins at 0.",
+        collect=_errors("track_error_bound"),
     ),
     Plot(
         title="Search: best cost",

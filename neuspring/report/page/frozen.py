@@ -27,12 +27,12 @@ from neuspring.scores.studies import Study
 
 def coverage(collected: Collected) -> str:
     """Which pairs are missing from all averages because of failures, and which methods do not apply where; empty if none."""
-    return " ".join([*removed_lines(collected.runs, collected.left_out), *left_out_lines(collected.left_out)])
+    return " ".join([*removed_lines(collected.comparison.runs, collected.left_out), *left_out_lines(collected.left_out)])
 
 
 def averages(collected: Collected) -> list[Block]:
     """The means without and with failed runs; nothing where no run has failed."""
-    means = both_averages(collected.scores, collected.runs, collected.frozen)
+    means = both_averages(*collected.comparison.parts)
     if not len(means):
         return []
     headings = headings_of(means)
@@ -70,12 +70,16 @@ def of_table(study: Study, collected: Collected) -> list[Block]:
     """The footnote of a study's table: both means of the rows that failed somewhere, in its units; nothing without failures."""
     own = of_study(study, collected)
     labels = {method: label for label, method in study.rows.items()}
-    means = both_averages(own.scores, own.runs, own.frozen)
+    means = both_averages(*own.comparison.parts)
     grid = failures_grid(study, means)
     blocks: list[Block] = []
     if grid.lines:
         rows = [[*(Cell(text=text) for text in stub), *(Cell(text=cell.text) for cell in cells)] for stub, cells in grid.lines]
         header = [*grid.stub, *grid.headings]
         blocks.append(Table(caption="Rows with failed runs", header=header, rows=rows, note=f"{WHY} {DASHES}"))
-    lines = [*unknown_lines(means, labels), *removed_lines(own.runs, own.left_out, labels), *left_out_lines(own.left_out, labels)]
+    lines = [
+        *unknown_lines(means, labels),
+        *removed_lines(own.comparison.runs, own.left_out, labels),
+        *left_out_lines(own.left_out, labels),
+    ]
     return [*blocks, *(Text(text=text) for text in lines)]

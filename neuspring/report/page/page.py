@@ -20,6 +20,7 @@ from neuspring.report.page.media import Media, embedded_png
 from neuspring.report.page.sources import Choice, Material, Run, damaged_records, job_records, on_disk
 from neuspring.report.page.words import hours, listed, several
 from neuspring.report.render import html_page
+from neuspring.report.tables.ratios import Judged, Judging, judged
 from neuspring.report.tables.summary import compared, draw_clusters, draw_ratios
 from neuspring.scores.failures import LeftOut
 from neuspring.scores.runs import collect, collect_transfers
@@ -141,10 +142,14 @@ def _choice(results: Path, options: Options, there: tuple[list[str], list[str], 
 def _sections(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
     """All in order, by key; those that depend on the others are empty."""
     usable, differences = compared(material.collected, material.choice.baseline)
+    config = material.settings or Config()
+    figures = judged(
+        material.collected, material.choice.baseline, Judging(objects=config.objects, aims=config.aims), material.transfers
+    )
     parts = [
         _empty("verdict"),
         studies.section(material, cells) if cells else None,
-        _with_figures(material, scores.section(material, usable, differences), usable, differences),
+        _with_figures(material, scores.section(material, usable, differences, figures), usable, figures),
         curves.section(material),
         _empty("pictures"),
         prose.perception(material),
@@ -196,7 +201,7 @@ def _data(runs: pd.DataFrame) -> Text:
     )
 
 
-def _with_figures(material: Material, section: Section, usable: pd.DataFrame, differences: pd.DataFrame) -> Section:
+def _with_figures(material: Material, section: Section, usable: pd.DataFrame, figures: Judged) -> Section:
     """The section with the pictures of ratios and of regions, as `tables` draws them."""
     if not len(usable):
         return section
@@ -208,7 +213,7 @@ def _with_figures(material: Material, section: Section, usable: pd.DataFrame, di
     blocks: list[Block] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        draw_ratios(usable, differences, folder, size)
+        draw_ratios(figures, folder, size)
         draw_clusters(material.collected, folder)
         for file, caption in captions.items():
             png = embedded_png(folder / file)

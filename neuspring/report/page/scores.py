@@ -12,8 +12,10 @@ from neuspring.report.blocks import Block, Cell, Chip, Fold, Items, Section, Tab
 from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import listed, number, several, signed
-from neuspring.report.tables.cells import LEAST_SCENARIOS
-from neuspring.report.tables.summary import compared, image_lines
+from neuspring.report.tables.cells import LEAST_SCENARIOS, ORACLE_LINE
+from neuspring.report.tables.ratios import Judged, about_ratios, aim_lines
+from neuspring.report.tables.summary import compared, floor_lines, image_lines
+from neuspring.scores import ratios
 from neuspring.scores.metrics import (
     DASH,
     HEADINGS,
@@ -25,16 +27,24 @@ from neuspring.scores.metrics import (
     averages,
     headings_of,
     present,
+    published,
 )
 from neuspring.scores.runs import Collected, finished_scores, pairs
 
 MOST_NOTES = 100
 Best = dict[tuple[str, str], float]
+VERDICTS = {
+    ratios.BELOW: Chip(text=ratios.BELOW, tone="good", symbol="▲"),
+    ratios.ABOVE: Chip(text=ratios.ABOVE, tone="bad", symbol="▼"),
+    ratios.NOT_RESOLVED: Chip(text=ratios.NOT_RESOLVED, symbol="~"),
+    ratios.TOO_FEW: Chip(text=ratios.TOO_FEW, symbol="~"),
+}
 
 
-def section(material: Material, usable: pd.DataFrame, differences: pd.DataFrame) -> Section:
-    """Averages and paired differences of the comparable scores, pictures and transfers, breakdowns."""
-    collected, baseline = material.collected, material.choice.baseline
+def section(material: Material, usable: pd.DataFrame, differences: pd.DataFrame, figures: Judged) -> Section:
+    """Averages, ratios and paired differences of the comparable scores, pictures and transfers, breakdowns."""
+    everything, baseline = material.collected, material.choice.baseline
+    collected = everything.comparison
     coverage = frozen.coverage(collected)
     if not len(usable):
         text = "No run has finished, so there is nothing to average."
@@ -43,18 +53,18 @@ def section(material: Material, usable: pd.DataFrame, differences: pd.DataFrame)
         reasons = [Text(text=text, tone="mute"), *([Text(text=coverage)] if coverage else [])]
         return Section(key="scores", title="Scores", blocks=[*reasons, *frozen.averages(collected)])
     blocks: list[Block] = [Text(text=f"{_coverage(collected, usable)} {coverage}".rstrip())]
-    blocks.append(_averages("Errors, mm", usable, collected, HEADINGS))
-    blocks += frozen.averages(collected)
+    blocks.append(_averages("Errors, mm", usable, collected, published(HEADINGS, usable)))
+    blocks += [*_oracles(everything, usable), *(Text(text=line) for line in floor_lines(collected.runs) if line)]
+    blocks += [*_primary(figures), *frozen.averages(collected)]
     images = {key: text for key, text in IMAGE_HEADINGS.items() if key in present(usable)}
     if images:
         blocks.append(_averages("Pictures: PSNR in dB, SSIM, LPIPS, IoU", usable, collected, images))
     if len(differences):
-        blocks.append(_differences(f"Paired difference to {baseline}, mm", differences, HEADINGS))
-        blocks.append(Fold(summary="Ratios", blocks=[_ratios(f"Ratio of the error to that of {baseline}", differences)]))
+        blocks.append(_differences(f"Paired difference to {baseline}, mm", differences, published(HEADINGS, usable)))
         if images:
             table = _differences(f"Pictures: paired difference to {baseline}", differences, images)
             blocks.append(Fold(summary="Paired differences of pictures", blocks=[table]))
-    blocks += [*_conditions(collected, usable, differences, baseline), *_transfers(material), *_breakdowns(collected)]
+    blocks += [*_conditions(collected, usable, differences, baseline), *_transfers(material, figures), *_breakdowns(collected)]
     about = "Means weigh scenarios equally, ± standard deviation over seeds; below, the mean weighted by frames. Best in bold."
     return Section(key="scores", title="Scores", about=about, blocks=blocks)
 
@@ -67,10 +77,10 @@ def _coverage(collected: Collected, usable: pd.DataFrame) -> str:
     return text + (f" Without any finished run, and not counted: {listed(left)}." if left else "")
 
 
-def _averages(caption: str, scores: pd.DataFrame, collected: Collected, headings: Headings) -> Table:
+def _averages(caption: str, scores: pd.DataFrame, collected: Collected, headings: Headings, *, marked: bool = True) -> Table:
     rows: list[Any] = list(averages(scores).itertuples())
     means = {(row.method, row.task, row.metric): row for row in rows}
-    best = _best((row.task, row.metric, row.equal) for row in rows)
+    best = _best((row.task, row.metric, row.equal) for row in rows) if marked else {}
     lines = []
     for method in dict.fromkeys(collected.runs["method"]):
         own = [means.get((str(method), *key)) for key in headings]
@@ -126,15 +136,42 @@ def _resolved(row: Any, *, higher: bool) -> Chip:
     return Chip(text="better", tone="good", symbol="▲") if (row.low > 0) == higher else Chip(text="worse", tone="bad", symbol="▼")
 
 
-def _ratios(caption: str, differences: pd.DataFrame) -> Table:
-    def cell(row: Any) -> Cell:
-        if not np.isfinite(row.ratio):
-            return Cell(text=DASH, value="")
-        small = [f"[{row.ratio_low:.3f}, {row.ratio_high:.3f}]"] if np.isfinite(row.ratio_low) else []
-        return Cell(text=f"{row.ratio:.3f}", small=small, value=float(row.ratio))
+def _oracles(collected: Collected, usable: pd.DataFrame) -> list[Block]:
+    """Methods that have seen all frames: a table of their own, on the pairs that count, without marks."""
+    oracles = collected.of(collected.oracles)
+    own = finished_scores(oracles) if len(oracles.runs) else oracles.scores
+    own = own.merge(usable[["scenario", "seed"]].drop_duplicates(), on=["scenario", "seed"])
+    if not len(own):
+        return []
+    return [_averages(ORACLE_LINE.capitalize(), own, oracles, published(HEADINGS, own), marked=False)]
 
-    note = "Geometric mean and 95 % interval; below 1 is better. No single scenario of large errors decides it."
-    return _by_method(caption, differences, HEADINGS, cell, note)
+
+def _primary(figures: Judged) -> list[Block]:
+    """Spread over seeds, ratios with verdicts, aims."""
+    blocks: list[Block] = []
+    if len(figures.seeds):
+        headings = published(HEADINGS, figures.seeds)
+        note = "Standard deviation of the log error over seeds, mean over scenarios."
+        blocks.append(
+            _by_method("Spread over seeds", figures.seeds, headings, lambda row: Cell(text=f"{100 * row.spread:.1f} %"), note)
+        )
+    if len(figures.ratios):
+        blocks.append(_ratios(f"Ratio of the error to that of {figures.baseline}", figures, figures.ratios, HEADINGS))
+    lines = aim_lines(figures.aims)
+    if lines:
+        rows = [[Cell(text=text.strip()) for text in line.strip("| ").split(" | ")] for line in lines[3:]]
+        header = [cell.text for cell in rows[0]]
+        blocks.append(Table(caption="Aims, declared in the configuration", header=header, rows=rows[2:]))
+    return blocks
+
+
+def _ratios(caption: str, figures: Judged, table: pd.DataFrame, headings: Headings) -> Table:
+    def cell(row: Any) -> Cell:
+        sure = np.isfinite(row.ratio_low)
+        small = [*([f"[{row.ratio_low:.3f}, {row.ratio_high:.3f}]"] if sure else []), f"n = {row.n}"]
+        return Cell(text=f"{row.ratio:.3f}", small=small, chips=[VERDICTS[row.verdict]], value=float(row.ratio))
+
+    return _by_method(caption, table, published(headings, table), cell, about_ratios(figures))
 
 
 def _by_method(caption: str, differences: pd.DataFrame, headings: Headings, cell: Callable[[Any], Cell], note: str) -> Table:
@@ -146,7 +183,7 @@ def _by_method(caption: str, differences: pd.DataFrame, headings: Headings, cell
     return Table(caption=caption, header=["Method", *headings.values()], rows=rows, sortable=True, note=note)
 
 
-def _transfers(material: Material) -> list[Block]:
+def _transfers(material: Material, figures: Judged) -> list[Block]:
     """Twins on other recordings of the same object."""
     collected, baseline = material.transfers, material.choice.baseline
     if not len(collected.runs) or not len(collected.scores):
@@ -155,9 +192,12 @@ def _transfers(material: Material) -> list[Block]:
     if not len(usable):
         return []
     caption = "Transfer to other recordings of the same object: errors, mm"
-    blocks: list[Block] = [_averages(caption, usable, collected, TRANSFER_HEADINGS)]
+    headings = published(TRANSFER_HEADINGS, usable)
+    blocks: list[Block] = [_averages(caption, usable, collected, headings)]
     if len(differences):
-        blocks.append(_differences(f"Transfer: paired difference to {baseline}, mm", differences, TRANSFER_HEADINGS))
+        blocks.append(_differences(f"Transfer: paired difference to {baseline}, mm", differences, headings))
+    if len(figures.transferred):
+        blocks.append(_ratios(f"Transfer: ratio to {baseline}", figures, figures.transferred, TRANSFER_HEADINGS))
     return blocks
 
 

@@ -15,9 +15,11 @@ from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import number, several, signed
 from neuspring.report.tables import cells as tables_cells
+from neuspring.report.tables import differing
 from neuspring.report.tables.cells import BETTER, CONFIRMED, OPPOSITE, WITHIN, WORSE
+from neuspring.report.tables.render import both_trainings
 from neuspring.scores import paper
-from neuspring.scores.metrics import DASH, IN_PAPER, Metric
+from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
 from neuspring.scores.studies import Study
 
 TASKS = {"reconstruction": "Reconstruction and resimulation", "future": "Future prediction"}
@@ -94,7 +96,13 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     """The tables of the studies; those without any run are folded."""
     blocks: list[Block] = []
     for name, study in material.studies.items():
-        inner = [*_tables(study, cells[name]), *frozen.of_table(study, material.collected)]
+        labels = {method: label for label, method in study.rows.items()}
+        inner = [
+            *_tables(study, cells[name]),
+            *_beside(study, material, cells, name),
+            *_footnote(material, labels),
+            *frozen.of_table(study, material.collected),
+        ]
         has_runs = len(cells[name]) > 0 and bool(cells[name]["ours"].notna().any())
         summary = f"{name}: {study.title}" + ("" if has_runs else " (not run)")
         blocks.append(Fold(summary=summary, blocks=inner, open=has_runs, key=f"study-{name}"))
@@ -106,6 +114,29 @@ def section(material: Material, cells: Mapping[str, pd.DataFrame]) -> Section:
     if not blocks:
         return Section(key="studies", title="The paper's tables", blocks=[Text(text="No table of studies was given.", tone="mute")])
     return Section(key="studies", title="The paper's tables", blocks=blocks, about=about)
+
+
+def _beside(study: Study, material: Material, cells: Mapping[str, pd.DataFrame], name: str) -> list[Block]:
+    """The same rows in another training, next to these."""
+    other = study.beside
+    if other is None or other not in cells or not len(cells[name]) or not len(cells[other]):
+        return []
+    grids = both_trainings(study, cells[name], material.studies[other], cells[other])
+    blocks: list[Block] = []
+    for grid in grids:
+        rows = [[Cell(text=text) for text in (*stub, *(cell.text for cell in texts))] for stub, texts in grid.lines]
+        blocks.append(Table(caption=grid.title, header=[*grid.stub, *grid.headings], rows=rows, note=grid.note, stub=2))
+    return [Fold(summary=f"Beside {other}", blocks=blocks)] if blocks else []
+
+
+def _footnote(material: Material, labels: Mapping[str, str]) -> list[Block]:
+    """Which settings differ between the rows; nothing if none does."""
+    rows = differing.differing(material.collected.records.values(), labels)
+    if not rows:
+        return []
+    cells = [[Cell(text=row.setting), Cell(text=row.text)] for row in rows]
+    table = Table(caption="Settings that differ", header=["Setting", "Value: rows"], rows=cells, note=differing.ABOUT)
+    return [Fold(summary="Settings that differ between the rows", blocks=[table])]
 
 
 def _tables(study: Study, cells: pd.DataFrame) -> list[Block]:
@@ -126,15 +157,17 @@ def _tables(study: Study, cells: pd.DataFrame) -> list[Block]:
 
 def _values(study: Study, cells: pd.DataFrame, title: str) -> Table:
     def first(cell: Any) -> Cell:
-        return Cell(text=str(cell.label), small=(cell.method, _runs(cell)))
+        return Cell(text=str(cell.label), small=(cell.method, _runs(cell), *([tables_cells.ORACLE_LINE] if cell.oracle else [])))
 
-    best = {name: _best(part["ours"], IN_PAPER[str(name)]) for name, part in cells.groupby("metric")}
+    others = cells[~cells["oracle"]]
+    best = {name: _best(part["ours"], IN_STUDIES[str(name)]) for name, part in others.groupby("metric")}
+    cells = pd.concat([others, cells[cells["oracle"]]])
     return _table(cells, title, first, lambda cell, metric: _value(cell, metric, best[metric.name], bool(study.reference)))
 
 
 def _table(cells: pd.DataFrame, title: str, first: Callable[[Any], Cell], value: Callable[[Any, Metric], Cell]) -> Table:
     """A line per label: its heading by `first`, then a cell per metric by `value`."""
-    metrics = [IN_PAPER[name] for name in dict.fromkeys(cells["metric"])]
+    metrics = [IN_STUDIES[name] for name in dict.fromkeys(cells["metric"])]
     rows = []
     for _, part in cells.groupby("label", sort=False):
         own: dict[Any, Any] = {cell.metric: cell for cell in part.itertuples()}
@@ -167,12 +200,12 @@ def _value(cell: Any, metric: Metric, best: float, referenced: bool) -> Cell:
     spread = f" ± {number(cell.spread, digits)}" if np.isfinite(cell.spread) else ""
     interval = [f"[{number(cell.low, digits)}, {number(cell.high, digits)}]"] if np.isfinite(cell.low) else []
     text = f"{number(cell.ours, digits)}{spread}"
-    is_best = bool(round(cell.ours, digits) == best)
+    is_best = bool(round(cell.ours, digits) == best) and not cell.oracle
     return Cell(text=text, small=[*interval, *printed], chips=chips, best=is_best, mark="best of ours")
 
 
 def _changes(study: Study, cells: pd.DataFrame, title: str) -> Table:
-    others = cells[cells["label"] != study.baseline]
+    others = cells[(cells["label"] != study.baseline) & ~cells["oracle"]]
     return _table(others, title, lambda cell: Cell(text=str(cell.label)), _change)
 
 

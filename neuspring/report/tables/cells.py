@@ -7,14 +7,14 @@ the study's baseline go where the paper's goes? That can be asked on any data. A
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from neuspring.scores import paper
-from neuspring.scores.metrics import IN_PAPER, Metric, averages, present
+from neuspring.scores.metrics import IN_PAPER, IN_STUDIES, Metric, averages, present
 from neuspring.scores.paper import Printed
 from neuspring.scores.runs import Collected, comparable
 from neuspring.scores.statistics import interval, resampled_means
@@ -24,6 +24,7 @@ NOT_RUN, NOT_COMPUTED, NOTHING_TO_COMPARE = "not run", "not computed", "nothing 
 OTHER_DATA, NO_VALUE, NO_INTERVAL = "other data", "not in the paper", "no interval"
 WITHIN, BETTER, WORSE = "within", "better", "worse"
 BASELINE, CONFIRMED, OPPOSITE = "baseline", "same direction, confirmed", "opposite"
+ORACLE, ORACLE_LINE = "oracle", "oracle: fitted on all frames, outside the comparison"
 NOT_RESOLVED, UNCHANGED, TOO_FEW = "not resolved", "no change in the paper", "too few scenarios"
 LEAST_SCENARIOS = 6
 """A verdict on a change needs so many. All of n scenarios change in one direction by chance once in 2^(n-1) studies, and then the
@@ -64,15 +65,14 @@ Estimates = dict[tuple[str, str, str], Estimate]
 def of_study(study: Study, collected: Collected) -> Collected:
     """The scores, in the paper's units, and the runs of a study's methods."""
     methods = list(study.rows.values())
-    runs = collected.runs[collected.runs["method"].isin(methods)]
-    left_out = {name: where for name, where in collected.left_out.items() if name in methods}
-    return Collected(_in_paper_units(collected.scores, methods), runs, _in_paper_units(collected.frozen, methods), left_out)
+    own = collected.of(methods)
+    return replace(own, scores=_in_paper_units(own.scores), frozen=_in_paper_units(own.frozen))
 
 
-def _in_paper_units(scores: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
-    """The scores of these methods in the paper's metrics and units."""
-    scores = scores[scores["method"].isin(methods) & scores["metric"].isin(list(IN_PAPER))]
-    factors = scores["metric"].map({name: metric.paper_factor for name, metric in IN_PAPER.items()}).astype(float)
+def _in_paper_units(scores: pd.DataFrame) -> pd.DataFrame:
+    """The scores in the metrics of studies, in the paper's units."""
+    scores = scores[scores["metric"].isin(list(IN_STUDIES))]
+    factors = scores["metric"].map({name: metric.paper_factor for name, metric in IN_STUDIES.items()}).astype(float)
     return scores.assign(value=scores["value"].astype(float) * factors)
 
 
@@ -80,8 +80,9 @@ def counted(own: Collected) -> pd.DataFrame:
     """The scores that averages take: of the pairs of scenario and seed that every method finished and has this metric of.
 
     A method without a finished run takes no part, nor does one without any value of a metric in the averages of that metric.
+    Oracles take no part.
     """
-    scores = comparable(own)
+    scores = comparable(own.comparison)
     if not len(scores):
         return scores
     here = scores.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
@@ -92,7 +93,7 @@ def accounted(study: Study, own: Collected) -> pd.DataFrame:
     """Every run of a study: label, its identity, status, whether it counts, and why not if it does not."""
     labels = {method: label for label, method in study.rows.items()}
     status = {(row.scenario, row.seed, row.method): str(row.status) for row in own.runs.itertuples()}
-    finished = list(dict.fromkeys(own.runs.loc[own.runs["status"] == "ok", "method"]))
+    finished = list(dict.fromkeys(own.runs.loc[(own.runs["status"] == "ok") & ~own.runs["method"].isin(own.oracles), "method"]))
     rows = []
     for run in own.runs.itertuples():
         lacking = [m for m in finished if status.get((run.scenario, run.seed, m)) != "ok"]
@@ -101,6 +102,7 @@ def accounted(study: Study, own: Collected) -> pd.DataFrame:
             absent = {m: "does not apply" if run.scenario in own.left_out.get(m, ()) else "missing" for m in lacking}
             names = ", ".join(f"{labels[m]} ({status.get((run.scenario, run.seed, m), absent[m])})" for m in lacking)
             why = f"not comparable, since without this scenario and seed: {names}" if lacking else ""
+            why = ORACLE_LINE if run.method in own.oracles else why
         identity = {"label": labels[str(run.method)], "scenario": run.scenario, "method": run.method, "seed": run.seed}
         rows.append(identity | {"status": run.status, "counted": not why, "why": why, "source": run.source, "run_key": run.run_key})
     columns = ["label", "scenario", "method", "seed", "status", "counted", "why", "source", "run_key"]
@@ -112,7 +114,7 @@ def estimates(scores: pd.DataFrame, baseline: str) -> Estimates:
     cells: Estimates = {}
     means = {(row["method"], row["task"], row["metric"]): row for row in averages(scores).to_dict("records")} if len(scores) else {}
     for key, part in scores.groupby(["task", "metric"], sort=False):
-        task, metric = str(key[0]), IN_PAPER[str(key[1])]
+        task, metric = str(key[0]), IN_STUDIES[str(key[1])]
         resamples, spreads = _resamples(part, metric), _spreads(part, metric)
         for method, resampled in resamples.items():
             mean = means[method, task, metric.name]
@@ -173,22 +175,37 @@ def _resamples(part: pd.DataFrame, metric: Metric) -> dict[str, np.ndarray]:
 
 
 def columns_of(study: Study, scores: pd.DataFrame) -> list[tuple[str, Metric]]:
-    """The columns of a study's table: the paper's; without a reference the Chamfer distance and all metrics that have scores."""
+    """The columns of a study's table: the paper's, and metrics of ours that have scores.
+
+    Without a reference: the Chamfer distance and all metrics that have scores.
+    """
+    there = present(scores) if len(scores) else set()
     of_paper = {key[1:] for key in study.values}
-    return in_order(of_paper if study.reference else present(scores) | {(task, "chamfer") for task in paper.TASKS})
+    ours = {(task, metric) for task, metric in there if metric not in IN_PAPER}
+    return in_order(of_paper | ours if study.reference else there | {(task, "chamfer") for task in paper.TASKS})
 
 
 def in_order(columns: Collection[tuple[str, str]]) -> list[tuple[str, Metric]]:
     """Columns in the paper's order."""
-    return [(task, metric) for task in paper.TASKS for metric in IN_PAPER.values() if (task, metric.name) in columns]
+    return [(task, metric) for task in paper.TASKS for metric in IN_STUDIES.values() if (task, metric.name) in columns]
 
 
 def cells(study: Study, own: Collected) -> pd.DataFrame:
     """One row per label, task and metric: the paper's value, ours (`Estimate`), their difference, and both verdicts."""
     scores = counted(own)
-    ours = estimates(scores, study.rows[study.baseline])
+    ours = estimates(scores, study.rows[study.baseline]) | _of_oracles(own, scores)
     columns = columns_of(study, scores)
     return pd.DataFrame([_cell(study, own, scores, ours, label, *column) for label in study.rows for column in columns])
+
+
+def _of_oracles(own: Collected, scores: pd.DataFrame) -> Estimates:
+    """Oracles on the scenarios and seeds that count, each alone, so that they take nothing from the others."""
+    cells: Estimates = {}
+    for method in own.oracles:
+        alone = counted(replace(own.of([method]), runs=own.of([method]).runs.assign(oracle=False)))
+        keys = ["scenario", "seed"]
+        cells |= estimates(alone.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else alone, "")
+    return cells
 
 
 def _cell(
@@ -205,7 +222,9 @@ def _cell(
         verdict = f"partial ({estimate.scenarios} of {len(paper.scenarios())}): {verdict}"
     of_base = study.values.get((study.baseline, task, metric.name))
     change = printed.value - of_base.value if printed and of_base else np.nan
-    lacking = absent or ("baseline not run" if np.isnan(estimate.change) else "")
+    oracle = method in own.oracles
+    verdict = ORACLE if oracle and not absent else verdict
+    lacking = absent or (ORACLE if oracle else "") or ("baseline not run" if np.isnan(estimate.change) else "")
     status = own.runs.loc[own.runs["method"] == method, "status"].value_counts()
     return {
         "label": label,
@@ -221,6 +240,7 @@ def _cell(
         "baseline": study.baseline,
         "paper_change": change,
         "paper_relative": change / of_base.value if of_base and metric.relative else np.nan,
+        "oracle": oracle,
         "direction": BASELINE if method == base else lacking or _direction(estimate, change, metric),
         **{name: int(status.get(name, 0)) for name in ("ok", "failed", "missing")},
     }

@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.markdown import markdown
-from neuspring.report.tables.cells import in_order
+from neuspring.report.tables.cells import ORACLE_LINE, in_order
+from neuspring.report.tables.differing import ABOUT, Differing
 from neuspring.scores import paper
 from neuspring.scores.failures import DASHES, WHY, mean_rows
-from neuspring.scores.metrics import DASH, IN_PAPER, SHORT, Metric, present
+from neuspring.scores.metrics import DASH, IN_STUDIES, SHORT, Metric, present
 from neuspring.scores.studies import Study
 
 Mark = Literal["", "best", "second"]
@@ -67,7 +68,7 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
     columns = _columns(cells)
     marks = {source: _marks(study, cells, columns, source) for source in ("paper", "ours")}
     lines: list[Line] = []
-    for label, part in _rows(cells):
+    for label, part in _rows(cells[~cells["oracle"]]):
         printed, ours, verdicts = [], [], []
         for task, metric in columns:
             cell = part[task, metric.name]
@@ -79,6 +80,7 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
         lines += [((label, "", "paper"), printed)] if study.reference else []
         lines.append((("" if study.reference else label, _runs(cell), "ours"), ours))
         lines += [(("", "", "verdict"), verdicts)] if study.reference else []
+    lines += [((names[0], "", names[1]), texts) for names, texts in _oracle_lines(cells, columns)]
     note = (
         f"{_units(columns)} Ours: mean over scenarios, seeds averaged within each, ± standard deviation over seeds"
         f"{_conventions(columns)}."
@@ -86,6 +88,66 @@ def main_grid(study: Study, cells: pd.DataFrame) -> Grid:
     if cells["failed"].any():
         note += f" {FAILED_MARK} Some runs failed; the table of failures has both averages, without and with them."
     return Grid(title="", note=note, stub=("Method", "Runs", ""), columns=columns, lines=lines)
+
+
+def _oracle_lines(cells: pd.DataFrame, columns: list[tuple[str, Metric]]) -> list[Line]:
+    """A line that says what oracles are, then theirs; never marked."""
+    lines: list[Line] = []
+    for label, part in _rows(cells[cells["oracle"]]):
+        texts = [Text(metric.paper_text(part[task, metric.name].ours)) for task, metric in columns]
+        lines += [] if lines else [((ORACLE_LINE, ""), [Text("")] * len(columns))]
+        lines.append(((label, "ours"), texts))
+    return lines
+
+
+def beyond_grid(study: Study, cells: pd.DataFrame) -> Grid:
+    """Metrics that the paper does not have: ours, its interval, the change against the baseline and its verdict."""
+    columns, lines = _columns(cells), list[Line]()
+    for label, part in _rows(cells[~cells["oracle"]]):
+        here = [(part[task, metric.name], metric) for task, metric in columns]
+        spreads = [f" ± {metric.paper_text(cell.spread)}" if np.isfinite(cell.spread) else "" for cell, metric in here]
+        ours = [metric.paper_text(cell.ours) + spread for (cell, metric), spread in zip(here, spreads, strict=True)]
+        lines.append(((label, "ours"), [Text(text) for text in ours]))
+        intervals = [_interval(cell.low, cell.high, metric.paper_text) or DASH for cell, metric in here]
+        lines.append((("", "95 %"), [Text(text) for text in intervals]))
+        if label != study.baseline:
+            lines.append((("", "change"), [Text(our_change(cell, metric)) for cell, metric in here]))
+            lines.append((("", "verdict"), [Text(cell.direction) for cell, _ in here]))
+    lines += _oracle_lines(cells, columns)
+    note = (
+        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. TE has "
+        f"a floor, its value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
+    )
+    return Grid(title="Without a floor", note=note, stub=("Method", ""), columns=columns, lines=lines)
+
+
+def both_trainings(study: Study, cells: pd.DataFrame, beside: Study, others: pd.DataFrame) -> list[Grid]:
+    """Two studies of the same labels under one heading: values, and changes against the baseline of the same training."""
+    blocks = [(beside, others), (study, cells)]
+    finished = [table[table["ours"].notna()] for _, table in blocks if len(table)]
+    columns = in_order({(task, metric.name) for table in finished for task, metric in _columns(table)})
+    by_label = [dict(_rows(table[~table["oracle"]])) for _, table in blocks]
+    values, changes = list[Line](), list[Line]()
+    for label in (label for label in study.rows if label in by_label[0] and label in by_label[1]):
+        for number, (block, rows) in enumerate(zip(blocks, by_label, strict=True)):
+            here = [(rows[label].get((task, metric.name)), metric) for task, metric in columns]
+            stub = ("" if number else label, block[0].training)
+            values.append((stub, [Text(_value(cell, metric)) for cell, metric in here]))
+            if label != block[0].baseline:
+                changes.append((stub, [Text(our_change(cell, metric) if cell else DASH) for cell, metric in here]))
+    note = "The same rows in two trainings. Each is averaged over the scenarios and seeds that all its rows finished."
+    against = f"{note} Against {study.baseline} of the same training, with the paired 95 % bootstrap interval."
+    grids = [("Both trainings", note, values), ("Both trainings: change", against, changes)]
+    stub = ("Method", "Training")
+    return [
+        Grid(title=title, note=text, stub=stub, columns=columns, lines=lines) for title, text, lines in grids if lines and columns
+    ]
+
+
+def _value(cell: Any, metric: Metric) -> str:
+    if cell is None:
+        return DASH
+    return metric.paper_text(cell.ours) + (f" ± {metric.paper_text(cell.spread)}" if np.isfinite(cell.spread) else "")
 
 
 def interval_grid(cells: pd.DataFrame) -> Grid:
@@ -107,7 +169,7 @@ def interval_grid(cells: pd.DataFrame) -> Grid:
 def change_grid(study: Study, cells: pd.DataFrame) -> Grid:
     """The change against the baseline, in the paper and here."""
     columns, lines = _columns(cells), list[Line]()
-    for label, part in _rows(cells):
+    for label, part in _rows(cells[~cells["oracle"]]):
         if label == study.baseline:
             continue
         here = [(part[task, metric.name], metric) for task, metric in columns]
@@ -188,7 +250,7 @@ def _percent(value: float) -> str:
 
 def _columns(cells: pd.DataFrame) -> list[tuple[str, Metric]]:
     pairs = dict.fromkeys(zip(cells["task"], cells["metric"], strict=True))
-    return [(str(task), IN_PAPER[str(metric)]) for task, metric in pairs]
+    return [(str(task), IN_STUDIES[str(metric)]) for task, metric in pairs]
 
 
 def _rows(cells: pd.DataFrame) -> Iterable[tuple[str, dict[tuple[str, str], Any]]]:
@@ -218,7 +280,7 @@ def _marks(study: Study, cells: pd.DataFrame, columns: list[tuple[str, Metric]],
     """Best and, where the paper marks it, second best of every column, as far as the printed digits tell."""
     marks: dict[tuple[str, str, str], Mark] = {}
     for task, metric in columns:
-        part = cells[(cells["task"] == task) & (cells["metric"] == metric.name)]
+        part = cells[(cells["task"] == task) & (cells["metric"] == metric.name) & ~cells["oracle"]]
         values = pd.to_numeric(part[source]).round(metric.paper_digits)
         ranked = sorted(values.dropna().unique(), reverse=metric.higher_is_better)
         if values.notna().sum() < 2:
@@ -273,6 +335,19 @@ def as_latex(grid: Grid, label: str, title: str) -> str:
     caption = f"\\caption{{\\textbf{{{tex(title)}.}} {tex(grid.note)}}}"
     lines += ["\\bottomrule", "\\end{tabular}}", caption, f"\\label{{tab:{label}}}", "\\end{table*}"]
     return "\n".join(lines) + "\n"
+
+
+def differing_latex(rows: list[Differing], label: str, title: str) -> list[str]:
+    """The footnote on settings that differ, as a float of its own; nothing if none does."""
+    if not rows:
+        return []
+    lines = ["\\begin{table*}[t]\n\\centering\n\\footnotesize", "\\begin{tabular}{@{} l p{0.75\\linewidth} @{}}", "\\toprule"]
+    lines += [_tex_row([tex("Setting"), tex("Value: rows")]), "\\midrule"]
+    lines += [_tex_row([tex(row.setting), tex(row.text)]) for row in rows]
+    caption = f"\\caption{{\\textbf{{{tex(title)}: settings that differ.}} {tex(ABOUT)}}}"
+    return [
+        "\n".join([*lines, "\\bottomrule", "\\end{tabular}", caption, f"\\label{{tab:{label}-settings}}", "\\end{table*}"]) + "\n"
+    ]
 
 
 def _tex_row(cells: list[str]) -> str:

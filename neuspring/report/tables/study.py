@@ -25,12 +25,16 @@ from neuspring.core.markdown import markdown
 from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.tables.cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
+from neuspring.report.tables.differing import differing, differing_markdown
 from neuspring.report.tables.render import (
     PREAMBLE,
     Grid,
     as_latex,
     as_markdown,
+    beyond_grid,
+    both_trainings,
     change_grid,
+    differing_latex,
     failures_grid,
     interval_grid,
     main_grid,
@@ -39,7 +43,7 @@ from neuspring.report.tables.render import (
 )
 from neuspring.scores import paper
 from neuspring.scores.failures import NOTHING, LeftOut, both_averages, left_out_lines, removed_lines, unknown_lines
-from neuspring.scores.metrics import DASH, IN_PAPER, Metric, averages
+from neuspring.scores.metrics import DASH, IN_PAPER, IN_STUDIES, Metric, averages
 from neuspring.scores.runs import Collected, collect, mixed_settings, pairs
 from neuspring.scores.studies import Study
 
@@ -93,22 +97,23 @@ def write_study(
     known_methods: Iterable[str],
     folder: Path,
     left_out: LeftOut = NOTHING,
+    beside: Study | None = None,
 ) -> str:
     """Write all files of a study; returns the Markdown. Rows whose method is not among `known_methods` are "not run".
 
-    `left_out` maps a method to the scenarios to which it does not apply.
+    `left_out` maps a method to the scenarios to which it does not apply. `beside` is the study that is shown next to this one.
     """
-    benchmark = set(known_methods)
-    methods = [method for method in study.rows.values() if method in benchmark]
-    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder)
+    benchmark, shown = set(known_methods), [*study.rows.values(), *(beside.rows.values() if beside else ())]
+    methods = [method for method in dict.fromkeys(shown) if method in benchmark]
+    return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder, beside)
 
 
-def write_collected(name: str, study: Study, collected: Collected, folder: Path) -> str:
+def write_collected(name: str, study: Study, collected: Collected, folder: Path, beside: Study | None = None) -> str:
     """As `write_study`, from runs that are read already. Methods of other studies are ignored."""
     own = of_study(study, collected)
     scores, table, runs = counted(own), cells(study, own), accounted(study, own)
     scenarios, categories = by_scenario(study, own, runs), by_category(study, scores)
-    means = both_averages(own.scores, own.runs, own.frozen)
+    means = both_averages(*own.comparison.parts)
     files = {"": table.assign(study=name), "_runs": runs, "_scenarios": scenarios, "_categories": categories, "_failures": means}
     for suffix, rows in files.items():
         write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
@@ -117,11 +122,14 @@ def write_collected(name: str, study: Study, collected: Collected, folder: Path)
     methods = tuple(dict.fromkeys([*names["method"], *absent]))
     Made(name=name, study=study, scenarios=names["scenario"], methods=methods, seeds=names["seed"], left_out=absent).save(folder)
     grids = _captioned(study, own, scores, table, means)
+    grids += both_trainings(study, table, beside, cells(beside, of_study(beside, collected))) if beside else []
     titles = [f"{study.title}{f': {grid.title}' if grid.title else ''}" for grid in grids]
     floats = [as_latex(grid, f"{name}-{index + 1}", titles[index]) for index, grid in enumerate(grids)]
-    write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats]))
+    footnote = differing(own.records.values(), _labels(study))
+    write_text(folder / f"{name}.tex", "\n".join([PREAMBLE, *floats, *differing_latex(footnote, name, study.title)]))
     warning = mixed_settings(own.runs)
     parts = [f"# {study.title}\n", f"**{warning}**\n" if warning else "", *map(as_markdown, grids)]
+    parts.append(differing_markdown(footnote))
     parts.append(_curve(study, scores, folder / f"{name}_curve.png"))
     parts.append(_left_out(runs, study, name, own))
     if len(categories):
@@ -157,7 +165,7 @@ def by_category(study: Study, scores: pd.DataFrame) -> pd.DataFrame:
     if not len(scores):
         return pd.DataFrame(columns=[*columns, "unit"])
     table = averages(scores, by=("category", "method", "task", "metric"))
-    frames = table["metric"].map({name: metric.average == "frames" for name, metric in IN_PAPER.items()})
+    frames = table["metric"].map({name: metric.average == "frames" for name, metric in IN_STUDIES.items()})
     table = table.assign(label=table["method"].map(labels), value=np.where(frames, table["frames"], table["equal"]))
     return _in_order(study, table[columns])
 
@@ -177,10 +185,10 @@ def _in_order(study: Study, table: pd.DataFrame) -> pd.DataFrame:
     """The table with units. Scenarios or categories keep their order; their rows are in the order of the study."""
     first = table.columns[0]
     ranks = {first: list(dict.fromkeys(table[first])), "label": list(study.rows)}
-    ranks |= {"task": list(paper.TASKS), "metric": list(IN_PAPER)}
+    ranks |= {"task": list(paper.TASKS), "metric": list(IN_STUDIES)}
     place = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
     order = pd.DataFrame(place).sort_values(list(place)).index
-    units = table["metric"].map({name: metric.paper_unit for name, metric in IN_PAPER.items()})
+    units = table["metric"].map({name: metric.paper_unit for name, metric in IN_STUDIES.items()})
     return table.assign(unit=units).loc[order].reset_index(drop=True)
 
 
@@ -189,9 +197,11 @@ def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.Dat
     kept = pairs(scores)
     which = f"Averages take the {kept} of {pairs(own.runs)} pairs of scenario and seed "
     which += "that every method with a finished run has finished."
+    beyond = table[~table["metric"].isin(list(IN_PAPER))] if study.reference else table[:0]
+    table = table.drop(beyond.index)
     main, change = main_grid(study, table), change_grid(study, table)
     labels = _labels(study)
-    removed = " ".join(removed_lines(own.runs, own.left_out, labels))
+    removed = " ".join(removed_lines(own.comparison.runs, own.left_out, labels))
     finished = (own.runs["status"] == "ok").any()
     nothing = "No pair of scenario and seed was finished by every method." if finished else "Nothing has finished."
     notes = [main.note, VERDICTS if study.reference else "", which if kept else nothing, removed, _pictures(own)]
@@ -201,7 +211,9 @@ def _captioned(study: Study, own: Collected, scores: pd.DataFrame, table: pd.Dat
     failures = failures_grid(study, means)
     unknown = unknown_lines(means, labels)
     failures = dataclasses.replace(failures, note=" ".join([failures.note, *unknown]))
-    return [grid for grid in (main, failures, interval_grid(table), change, other_grid(table)) if grid.lines]
+    return [
+        grid for grid in (main, beyond_grid(study, beyond), failures, interval_grid(table), change, other_grid(table)) if grid.lines
+    ]
 
 
 def _labels(study: Study) -> dict[str, str]:
@@ -261,7 +273,7 @@ def _write_released(name: str, study: Study, own: Collected, folder: Path) -> st
     rows = []
     for (task, metric), part in table.groupby(["task", "metric"], sort=True):
         both = part.dropna(subset="ours")
-        of_paper = IN_PAPER[str(metric)]
+        of_paper = IN_STUDIES[str(metric)]
         lines = [[str(row.scenario), *_released_cells(row, of_paper)] for row in part.itertuples()]
         if len(both):
             mean = both[["released", "ours", "difference"]].mean()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ from neuspring.report.figures.clusters import NAME as CLUSTERS
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.figures.ratios import NAME as RATIOS
 from neuspring.report.figures.ratios import ratios_figure
+from neuspring.report.tables.cells import ORACLE_LINE
+from neuspring.report.tables.differing import differing, differing_markdown
+from neuspring.report.tables.ratios import Judged, Judging, judged, ratio_lines, transfer_lines
 from neuspring.scores.failures import both_averages, failures_text, left_out_lines, removed_lines
 from neuspring.scores.metrics import (
     COLUMNS,
@@ -28,6 +31,7 @@ from neuspring.scores.metrics import (
     Headings,
     averages,
     headings_of,
+    published,
 )
 from neuspring.scores.runs import Collected, comparable, finished_scores, mixed_settings, pairs
 from neuspring.scores.statistics import paired_differences
@@ -39,15 +43,19 @@ LISTED = 12
 
 def compared(collected: Collected, baseline: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The scores that can be compared, and the paired differences of every method to `baseline`."""
-    scores = comparable(collected)
+    scores = comparable(collected.comparison)
     return scores, paired_differences(scores, baseline) if len(scores) else pd.DataFrame()
 
 
-def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame | None = None) -> str:
-    """The tables in Markdown, in millimeters: both averages, the paired comparison, failures.
+def summary_text(
+    collected: Collected, baseline: str, differences: pd.DataFrame | None = None, figures: Judged | None = None
+) -> str:
+    """The tables in Markdown, in millimeters: both averages, ratios and aims, the paired comparison, failures.
 
-    `differences` are the paired ones if the caller has them already; the bootstrap takes seconds on a large benchmark.
+    `differences` and `figures` are the paired ones if the caller has them; the bootstrap takes seconds on a large benchmark.
     """
+    figures = figures or judged(collected, baseline, Judging())
+    everything, collected = collected, collected.comparison
     if differences is None:
         scores, differences = compared(collected, baseline)
     else:
@@ -56,19 +64,24 @@ def summary_text(collected: Collected, baseline: str, differences: pd.DataFrame 
     scenarios, seeds = runs["scenario"].nunique(), runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
     spread = ", ± standard deviation over seeds" if several else ""
-    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES)
+    shown = {metric for _, metric in published(HEADINGS, scores)}
+    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES if metric.name in shown)
     lines = [f"Errors in mm, lower is better ({size}; {explained}).", ""]
     lines += [f"Mean over scenarios{spread}; in brackets the frame-weighted mean.", ""]
     if removed := removed_lines(runs, collected.left_out):
         lines += [" ".join([_kept_line(scores, runs), *removed]), ""]
     if warning := mixed_settings(runs):
         lines += [f"**{warning}**", ""]
-    lines += _method_table(scores, runs, runs)
+    headings = published(HEADINGS, scores)
+    lines += [*_method_table(scores, runs, runs, headings), *_oracle_rows(everything, scores, headings)]
+    lines += [*floor_lines(runs), *ratio_lines(figures)]
     if len(differences):
         intro = f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios and seeds], same scenario and seed:"
-        ratio = f"Ratio to {baseline}, geometric mean [95 % interval], which no single scenario of large errors decides:"
-        lines += ["", intro, "", *_difference_table(differences), "", ratio, "", *_difference_table(differences, cell=_ratio)]
+        lines += ["", intro, "", *_difference_table(differences, headings)]
     lines += image_lines(collected, scores, differences, baseline)
+    runs = everything.runs
+    footnote = differing_markdown(differing(everything.records.values(), {name: name for name in dict.fromkeys(runs["method"])}))
+    lines += ["", footnote] if footnote else []
     bad = runs[runs["status"] != "ok"]
     if len(bad):
         lines += ["", "Not in the averages:", "", *_not_counted(bad)]
@@ -118,7 +131,7 @@ def _averaged_notes(runs: pd.DataFrame) -> list[str]:
 
 
 def _method_table(
-    scores: pd.DataFrame, runs: pd.DataFrame, counted: pd.DataFrame, headings: Headings = HEADINGS, absent: str = DASH
+    scores: pd.DataFrame, runs: pd.DataFrame, counted: pd.DataFrame, headings: Headings, absent: str = DASH
 ) -> list[str]:
     """Both averages of every method of `runs`, and how many of its runs in `counted` finished; `absent` stands for no value."""
     several = _several_seeds(scores)
@@ -133,6 +146,43 @@ def _method_table(
     return markdown(["Method", *headings.values(), "Runs"], rows)
 
 
+def _oracle_rows(collected: Collected, scores: pd.DataFrame, headings: Headings) -> list[str]:
+    """A line that says what oracles are, then theirs, to be added to the table of methods; on the pairs of `scores`."""
+    oracles = collected.of(collected.oracles)
+    if not len(oracles.runs):
+        return []
+    keys = ["scenario", "seed"]
+    own = finished_scores(oracles)
+    own = own.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else own
+    _, _, *rows = _method_table(own, oracles.runs, oracles.runs, headings)
+    return [f"| *{ORACLE_LINE}* |{' |' * (len(headings) + 1)}", *rows]
+
+
+def floor_lines(runs: pd.DataFrame) -> list[str]:
+    """The errors in frame 0, which is given: mean over scenarios, and the range. Nothing where records do not have them."""
+    found = floors_of(runs)
+    parts = []
+    for metric in DISTANCES:
+        values = found.loc[found["metric"] == f"{metric.name}_floor", "value"]
+        if len(values) and metric.paper_name:
+            spread = f" ({metric.text(values.min())} to {metric.text(values.max())})" if len(values) > 1 else ""
+            parts.append(f"{metric.heading} {metric.text(values.mean())} mm{spread}")
+    if not parts:
+        return []
+    of = f", mean of {count} scenarios (least to largest)" if (count := found["scenario"].nunique()) > 1 else ""
+    text = f"Floor in frame 0{of}: {', '.join(parts)}; TE bound 0 by construction."
+    return ["", f"{text} A floor is no motion: it is how far points are from nodes."]
+
+
+def floors_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Floors per scenario: scenario, metric (chamfer_floor, ...), value [m]. Methods of a scenario begin with the same nodes."""
+    rows: dict[tuple[str, str], float] = {}
+    for row in runs.itertuples() if "floors" in runs else ():
+        values = json.loads(row.floors) if isinstance(row.floors, str) else {}
+        rows |= {(str(row.scenario), f"{name}_floor"): value for name, value in values.items()}
+    return pd.DataFrame([(*key, value) for key, value in rows.items()], columns=["scenario", "metric", "value"])
+
+
 def _mean(row: Any, several: bool, absent: str) -> str:
     if row is None:
         return absent
@@ -141,13 +191,11 @@ def _mean(row: Any, several: bool, absent: str) -> str:
     return f"{metric.text(row.equal)}{spread} ({metric.text(row.frames)})"
 
 
-def _difference_table(
-    differences: pd.DataFrame, headings: Headings = HEADINGS, cell: Callable[[Any], str] | None = None
-) -> list[str]:
+def _difference_table(differences: pd.DataFrame, headings: Headings) -> list[str]:
     rows = []
     for method, part in differences.groupby("method", sort=False):
         values = {(row.task, row.metric): row for row in part.itertuples()}
-        rows.append([str(method), *((cell or _interval)(values[key]) if key in values else DASH for key in headings)])
+        rows.append([str(method), *(_interval(values[key]) if key in values else DASH for key in headings)])
     return markdown(["Method", *headings.values()], rows)
 
 
@@ -158,13 +206,6 @@ def _interval(row: Any) -> str:
     if np.isfinite(row.low):
         text += f" [{metric.text(row.low, '+')}, {metric.text(row.high, '+')}]"
     return text if metric.of_pictures else f"{text} ({100 * row.relative:+.1f} %)"
-
-
-def _ratio(row: Any) -> str:
-    if not np.isfinite(row.ratio):
-        return DASH
-    interval = f" [{row.ratio_low:.3f}, {row.ratio_high:.3f}]" if np.isfinite(row.ratio_low) else ""
-    return f"{row.ratio:.3f}{interval}"
 
 
 def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.DataFrame, baseline: str) -> list[str]:
@@ -260,61 +301,65 @@ def draw_clusters(collected: Collected, folder: Path) -> str:
     return f"\n## Number of regions\n\n![Chamfer distance against the number of regions K]({CLUSTERS})\n"
 
 
-def draw_ratios(scores: pd.DataFrame, differences: pd.DataFrame, folder: Path, size: str) -> str:
+def draw_ratios(figures: Judged, folder: Path, size: str) -> str:
     """Draw ratios.png if there is an interval to draw; returns the lines that show it, else nothing. `size` goes into its title."""
-    if len(differences):
-        order = list(dict.fromkeys(scores["method"]))
-        differences = differences.sort_values("method", key=lambda names: names.map(order.index), kind="stable")
-    if ratios_figure(differences, folder / RATIOS, size) is None:
+    if ratios_figure(figures.ratios, folder / RATIOS, size) is None:
         return ""
     return f"\n![Ratio of every method's errors to the baseline's]({RATIOS})\n"
 
 
-def transfer_text(collected: Collected, baseline: str) -> str:
+def transfer_text(collected: Collected, baseline: str, figures: Judged) -> str:
     """The section on transferred twins; nothing if there are none."""
     if not len(collected.runs):
         return ""
     scores, differences = compared(collected, baseline)
     what = "Each twin on other recordings of the same object, all frames after the first: mean over targets, then over sources"
     lines = ["", "## Transfer", "", f"{what} (in brackets weighted by frames). A run is one source and seed.", ""]
-    lines += _method_table(scores, collected.runs, collected.runs, TRANSFER_HEADINGS)
+    headings = published(TRANSFER_HEADINGS, scores)
+    lines += _method_table(scores, collected.runs, collected.runs, headings)
     if len(differences):
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"
         lines += ["", f"Paired difference to {baseline}, mm [{interval}]:", ""]
-        lines += _difference_table(differences, TRANSFER_HEADINGS)
-        lines += ["", f"Ratio to {baseline}, geometric mean [95 % interval]:", ""]
-        lines += _difference_table(differences, TRANSFER_HEADINGS, _ratio)
+        lines += _difference_table(differences, headings)
+    lines += transfer_lines(figures)
     return "\n".join(lines) + "\n"
 
 
-def write(collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None) -> str:
+def write(
+    collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None, judging: Judging | None = None
+) -> str:
     """Write the tables of a benchmark, and return the summary.
 
-    Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), transfers.csv,
-    summary.md. Where a method can be compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png;
-    summary.md shows them.
+    Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), floors.csv
+    (errors in frame 0), ratios.csv, aims.csv, seeds.csv (spread over seeds), transfers.csv, summary.md. Where a method can be
+    compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md shows them.
     """
     scores = collected.scores
     usable, differences = compared(collected, baseline)
+    figures = judged(collected, baseline, judging or Judging(), transfers)
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
-    failures = both_averages(scores, collected.runs, collected.frozen)
+    failures = both_averages(*collected.comparison.parts)
     tables = {
         "scores": scores,
         "runs": collected.runs,
         "averages": averages(usable) if len(usable) else pd.DataFrame(),
         "differences": differences,
         "held": failures,
+        "floors": floors_of(collected.runs),
+        "ratios": pd.concat([table for table in (figures.ratios, figures.transferred) if len(table)] or [figures.ratios]),
+        "aims": figures.aims,
+        "seeds": figures.seeds,
         "transfers": transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS)),
     }
     for name, table in tables.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     write_atomically(folder / "scores.parquet", lambda temporary: scores.to_parquet(temporary, index=False))
-    summary = summary_text(collected, baseline, differences)
+    summary = summary_text(collected, baseline, differences, figures)
     finished = finished_scores(collected)
     details = per_scenario_text(finished) if len(finished) else "No run has finished.\n"
     size = f"{usable['scenario'].nunique()} scenarios, {usable['seed'].nunique()} seed(s)"
-    text = f"# Scores\n\n{summary}{draw_ratios(usable, differences, folder, size)}{failures_text(failures)}"
-    text += transfer_text(transfers, baseline) if transfers else ""
+    text = f"# Scores\n\n{summary}{draw_ratios(figures, folder, size)}{failures_text(failures)}"
+    text += transfer_text(transfers, baseline, figures) if transfers else ""
     text += draw_clusters(collected, folder)
     text += f"\n## Per scenario (errors in mm, seeds averaged)\n\n{details}"
     text += f"\n## Time and memory (medians)\n\n{timing_text(collected.runs)}"

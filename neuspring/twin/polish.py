@@ -1,0 +1,137 @@
+"""Levenberg-Marquardt in few variables, after CMA-ES: asked for candidates and told what they cost, as CMA-ES is.
+
+A round first asks for slopes: the base and one neighbor per variable, by whose residuals r (residuals.py) the products J'J and J'r
+of finite differences are formed. Then it asks for four damped steps d of the normalized variables,
+
+    (J'J + damping diag J'J) d = -J'r        within the ranges, and at most `REACH` per variable,
+
+and takes the best of them if it costs less than the base. Nothing but the costs and products that it is told decides what it asks
+for next, so a polish is replayed from its record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuspring.config.search import TRIALS, Search
+from neuspring.twin.residuals import Residuals
+
+CMAES, SLOPES, POLISH = "cmaes", "slopes", "polish"
+"""Stages of a search; candidates of `SLOPES` are its means alone and never its result."""
+RESIDUAL, PRODUCT = "product.residual", "product."
+"""Columns of the trace: J_k'r and J_k'J_l in the row of the neighbor in variable k."""
+REACH = 0.25
+"""Longest step of a round in a normalized variable."""
+FIRST_DAMPING, MOST_DAMPING = 0.1, 1e4
+FACTORS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
+"""What the damping is multiplied with, for each step that is tried: from 0.01 to 10."""
+
+
+@dataclass
+class Polish:
+    """The state of a polish: its base, and what is asked for next."""
+
+    search: Search
+    columns: Sequence[int]
+    """Places of the polished variables among the searched ones."""
+    base: np.ndarray
+    """Normalized variables of the best candidate so far."""
+    cost: float
+    damping: float = FIRST_DAMPING
+    stage: str = SLOPES
+    """Of the candidates that are asked for now."""
+    rounds: int = 0
+    """Rounds that are done."""
+    finished: bool = False
+    _products: np.ndarray = field(init=False)
+    _gradient: np.ndarray = field(init=False)
+    _asked: list[np.ndarray] = field(init=False, default_factory=list)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing more is asked for."""
+        return self.finished or self.rounds >= self.search.polish_rounds
+
+    def steps(self) -> np.ndarray:
+        """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""
+        here, step = self.base[list(self.columns)], self.search.polish.step
+        return np.where(here - step < 0, step, -step)
+
+    def ask(self) -> list[np.ndarray]:
+        """The next candidates, in normalized variables."""
+        if self.stage == SLOPES:
+            moves = [np.zeros(len(self.columns)), *np.diag(self.steps())]
+        else:
+            here = self.base[list(self.columns)]
+            low, high = np.maximum(-here, -REACH), np.minimum(1 - here, REACH)
+            moves = [damped_step(self._products, self._gradient, self.damping * factor, low, high) for factor in FACTORS]
+        self._asked = [self.base.copy() for _ in moves]
+        for candidate, move in zip(self._asked, moves, strict=True):
+            candidate[list(self.columns)] = np.clip(candidate[list(self.columns)] + move, 0, 1)
+        return self._asked
+
+    def tell(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Take the rows of the trace of the candidates that were asked for."""
+        if self.stage == SLOPES:
+            names = [name for name in rows[1] if name.startswith(PRODUCT) and name != RESIDUAL]
+            self._products = np.array([[row[name] for name in names] for row in rows[1:]])
+            self._gradient = np.array([row[RESIDUAL] for row in rows[1:]])
+            self.finished = not self._gradient.any()
+            self.stage = POLISH
+            return
+        self.rounds += 1
+        costs = [row["cost"] for row in rows]
+        best = int(np.argmin(costs))
+        if costs[best] < self.cost:
+            self.finished = self.cost - costs[best] < self.search.polish.tolerance * self.cost
+            self.base, self.cost = np.asarray(self._asked[best]), costs[best]
+            self.damping *= FACTORS[best]
+            self.stage = SLOPES
+        else:
+            # The slopes are still those of the base; shorter steps are tried.
+            self.damping *= 10 * FACTORS[-1] / FACTORS[0]
+            self.finished = self.damping > MOST_DAMPING
+
+
+def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """d that solves (A + damping diag A) d = -g for A [V, V], g [V], and low <= d <= high; what leaves is held at its bound."""
+    scale = np.diag(products)
+    # A variable without effect stays where it is.
+    matrix = products + damping * np.diag(np.maximum(scale, 1e-12 * scale.max()))
+    step, free = np.zeros(len(gradient)), scale > 1e-12 * scale.max()
+    while free.any():
+        rest = -(gradient + matrix[:, ~free] @ step[~free])
+        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest[free])
+        beyond = np.where(free, np.maximum(low - step, step - high), 0.0)
+        if beyond.max() <= 0:
+            break
+        # One at a time: where it is held, others may not leave any more.
+        worst = int(np.argmax(beyond))
+        step[worst] = np.clip(step[worst], low[worst], high[worst])
+        free[worst] = False
+    return step
+
+
+def slopes(
+    residuals: Residuals, positions: torch.Tensor, velocities: torch.Tensor, fine: Sequence[bool], steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(costs [1 + V], J'J [V, V], J'r [V]) of the rollouts [F, 1 + V, N, 3] of a base and its neighbors, `steps` [V] away.
+
+    A rollout that is not `fine` (it left the scene) costs infinity and has no slope.
+    """
+    costs, none = np.full(1 + len(steps), np.inf), (np.zeros((len(steps), len(steps))), np.zeros(len(steps)))
+    if not fine[0]:
+        return costs, *none
+    assigned = residuals.assigned(positions[:, 0])
+    base = residuals(positions[:, 0], velocities[:, 0], assigned)
+    jacobian, costs[0] = np.zeros((len(steps), len(base))), base @ base
+    for k in np.flatnonzero(fine[1:]):
+        near = residuals(positions[:, k + 1], velocities[:, k + 1], assigned)
+        costs[k + 1] = near @ near
+        jacobian[k] = (near - base) / steps[k]
+    return costs, jacobian @ jacobian.T, jacobian @ base

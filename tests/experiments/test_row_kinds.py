@@ -1,0 +1,115 @@
+"""Rows that predict from the last frame, and oracles: what the workflow makes of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from neuspring import config
+from neuspring.config import Method, parse
+from neuspring.core.errors import InputError
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.inputs import Inputs
+from neuspring.experiments.needs import Needs
+from neuspring.experiments.tuning.space import Plan
+
+ROOT = Path(__file__).parents[2]
+NAMES = ["baseline", "neuspring", "oracle_neuspring", "baseline_carry_over", "baseline_from_last_frame"]
+SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth"]
+
+
+def benchmark(**changes: Any) -> Benchmark:
+    values = config.read_yaml(ROOT / "config" / "data" / "toy.yaml") | {"methods": NAMES, "scenarios": SCENES, "studies": []}
+    return Benchmark.of(values | changes, ROOT)
+
+
+def job(name: str) -> SimpleNamespace:
+    return SimpleNamespace(scenario=SCENES[0], method=name, seed=0)
+
+
+def test_records_name_oracles_and_tasks_and_leave_other_rows_as_they_were():
+    inputs = Inputs(benchmark())
+    variants = {name: json.loads(inputs.variant(job(name))) for name in NAMES}
+    assert {name for name, variant in variants.items() if "oracle" in variant} == {"oracle_neuspring"}
+    assert variants["oracle_neuspring"]["oracle"] is True
+    filtering = {name: variant["task"] for name, variant in variants.items() if "task" in variant}
+    assert filtering == dict.fromkeys(NAMES[3:], "prediction from the last frame")
+    assert variants["baseline"] == {
+        "search": "uniform",
+        "clusters": 1,
+        "fit": "springs",
+        "carry_over": False,
+        "average_seeds": False,
+    }
+
+
+def test_an_oracles_fit_is_its_own_though_its_settings_are_those_of_another():
+    made = benchmark(seeds=[0, 1, 2])
+    assert made.fit_of_method["oracle_neuspring"] == "oracle_neuspring"
+    inputs = Inputs(made)
+    assert inputs.settings("fit", job("oracle_neuspring")) == inputs.settings("fit", job("neuspring"))
+    assert inputs.search(job("oracle_neuspring")) == inputs.search(job("neuspring"))
+    together = json.loads(inputs.rows_of_fits(SimpleNamespace(scenario=SCENES[0])))
+    assert [bool(row.get("oracle")) for row in together] == [False, False, True]
+
+
+def test_the_work_of_an_oracle_is_that_of_all_frames():
+    found = Needs(benchmark(), "cpu")
+    body = found.sizes.body(SCENES[0])
+    normal, oracle = (found.work("fit", job(name)) for name in ("neuspring", "oracle_neuspring"))
+    assert body.train_end < body.frames
+    assert oracle * (body.train_end - 1) == normal * (body.frames - 1)
+
+
+def test_oracles_are_not_transferred():
+    made = benchmark(transfers={SCENES[0]: [SCENES[1]]})
+    assert {path.split("/")[-3] for path in Inputs(made).transfers()} == {"baseline", "neuspring"}
+
+
+def test_no_sweep_chooses_by_an_oracle():
+    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}, "seed": 0}
+    tune = parse(config.Config, {"tune": values}, "x").tune
+    assert tune is not None
+    with pytest.raises(InputError, match="an oracle sees the future"):
+        Plan.of(config.Config(), tune, ROOT)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"search": "uniform", "oracle": True}, "an oracle has a fit"),
+        ({"model": "static", "oracle": True}, "an oracle has a fit"),
+        ({"search": "uniform", "fit": "field", "oracle": True, "carry_over": "state"}, "not carried over"),
+        ({"search": "uniform", "carry_over": "everything"}, "carry_over"),
+    ],
+)
+def test_rows_that_cannot_be(row, message):
+    with pytest.raises(InputError, match=message):
+        parse(Method, {"description": "x"} | row, "x")
+
+
+def test_an_oracle_with_a_tail_is_refused_before_any_job(tmp_path):
+    row = "bad: {search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}"
+    (tmp_path / "bad.yaml").write_text(row)
+    with pytest.raises(InputError, match="an oracle is fitted on all frames and holds none back"):
+        benchmark(method_table=str(tmp_path / "bad.yaml"), methods=["bad"], compare_with=None)
+
+
+def test_what_older_tables_call_true_is_residuals():
+    kinds = {
+        value: parse(Method, {"search": "uniform", "description": "x", "carry_over": value}, "x") for value in (True, "residuals")
+    }
+    assert kinds[True] == kinds["residuals"]
+    assert kinds[True].carry_over == "residuals"
+    assert parse(Method, {"search": "uniform", "description": "x", "carry_over": False}, "x").task == "future prediction"
+
+
+def test_only_states_read_settings_of_the_last_frame():
+    inputs = Inputs(benchmark(last_frame={"window": 3}))
+    texts = {name: json.loads(inputs.settings("rollout", job(name))) for name in NAMES}
+    assert texts.pop("baseline_from_last_frame")["last_frame"]["window"] == 3
+    assert set(map(str, texts.values())) == {"{}"}

@@ -1,0 +1,21 @@
+"""Searches of several budgets, and what is equal between two of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pandas as pd
+
+from neuspring.twin.search import SearchProblem
+from tests.support import small
+
+
+def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
+    """The small search with another budget."""
+    problem = small.search_problem(clusters=clusters)
+    return replace(problem, search=replace(problem.search, rollouts=rollouts))
+
+
+def assert_same_trace(trace: pd.DataFrame, expected: pd.DataFrame) -> None:
+    """Equal bit for bit, but for the time that each candidate took."""
+    pd.testing.assert_frame_equal(trace.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)

@@ -1,0 +1,143 @@
+"""A fit does not depend on the unit of length, and the released one is still there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuspring import config
+from neuspring.core.training import adam_arrays
+from neuspring.twin.fit import FitProblem, TwinFit, fit
+from neuspring.twin.unloaded import node_spacing
+from tests.support import small
+
+SINGLE = 1e-5
+"""Relative: sums of gradients in float32."""
+TRAINED = 1e-3
+"""Relative: losses of three epochs in float32, whose rounding Adam's normalized steps pass on."""
+FIELD = config.SpringField(channels=4, hidden=16, bands=2, plane_smoothness=1e-2)
+SETTINGS = {
+    "springs": {"rest_length_bound": 0.1, "rest_prior": 0.1, "clip_gradient_norm": 1e-4},
+    "field": {"rest_shape": config.RestShape(handles=4), "output_bound": 1.5, "horizon": 2},
+}
+
+
+def in_unit(factor: float, kind: str, losses: config.Losses, **settings: object) -> FitProblem:
+    """The default scene without ground, all lengths multiplied by `factor`: positions, gravity, forces of unit mass."""
+    seen = small.observations()
+    lengths = ("object_points", "controller_points", "surface_points", "interior_points", "tracks")
+    seen = replace(seen, **{name: getattr(seen, name) * np.float32(factor) for name in lengths})
+    fit = config.Fit(
+        epochs=3,
+        learning_rate=1e-2,
+        global_stiffness=True,
+        damping="homogeneous",
+        field=FIELD,
+        stiffness_range=(0.0, 1e5 * factor),
+        **(SETTINGS[kind] | settings),
+    )
+    problem = small.fit_problem(kind=kind, fit=fit, losses=losses)
+    topology, material, simulation = problem.twin.topology, problem.twin.material, problem.twin.simulation
+    scaled = {name: getattr(topology, name) * np.float32(factor) for name in ("nodes", "controllers", "rest_lengths")}
+    twin = replace(
+        problem.twin,
+        topology=replace(topology, **scaled),
+        material=replace(
+            material, stiffness=material.stiffness * np.float32(factor), contact_distance=material.contact_distance * factor
+        ),
+        simulation=replace(simulation, gravity=simulation.gravity * factor, ground=False),
+    )
+    return replace(problem, observations=seen, twin=twin)
+
+
+# Smooth L1 has its corner at 1 m, so errors may not grow beyond it.
+UNITS = [(2.0**-10, config.Losses()), (2.0**10, config.Losses(track=0.0))]
+
+
+@pytest.mark.parametrize(("factor", "losses"), UNITS, ids=["small", "large"])
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_another_unit_of_length_gives_the_same_fit(kind, factor, losses):
+    """Bit for bit where the factor is a power of two, so that no number is rounded otherwise."""
+    here, there = TwinFit(in_unit(1.0, kind, losses)), TwinFit(in_unit(factor, kind, losses))
+    for epoch in range(3):
+        rows = []
+        for run in (here, there):
+            run.start_epoch(epoch, 1.0)
+            rows.append(run.epoch())
+        assert rows[1]["loss"] == rows[0]["loss"] * factor**2
+        assert rows[1]["gradient_norm"] == rows[0]["gradient_norm"] > 0
+    start = here.parameters.first
+    for name, values in here.parameters.copy().items():
+        np.testing.assert_array_equal(there.parameters.copy()[name], values, err_msg=name)
+        if not name.startswith("scalars"):
+            assert not np.array_equal(values, start[name]), name
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_meters_and_millimeters(kind):
+    histories = [fit(in_unit(factor, kind, config.Losses(track=0.0))).history["loss"] for factor in (1.0, 1e3)]
+    np.testing.assert_allclose(histories[1], histories[0] * 1e6, rtol=TRAINED)
+
+
+def test_the_released_unit_depends_on_the_unit():
+    """With the released epsilon and the loss in m^2, the same scene in kilometers does not train."""
+    released = {"epsilon": 1e-8, "loss_unit": "meter", "rest_prior": 0.0, "clip_gradient_norm": 0.0}
+    moved = []
+    for factor in (1.0, 2.0**-10):
+        run = TwinFit(in_unit(factor, "springs", config.Losses(), **released))
+        run.epoch()
+        moved.append(float(run.parameters.offsets.detach().abs().median()))
+    assert moved[1] < 0.01 * moved[0]
+
+
+def test_gradients_are_those_of_the_loss_in_its_unit():
+    first = {}
+    for unit in ("meter", "spacing"):
+        run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, loss_unit=unit, betas=(0.0, 0.0), horizon=0)))
+        row = run.epoch()
+        first[unit] = (adam_arrays(run.optimiser)["0.exp_avg"], row["loss"])
+    spacing = node_spacing(small.fit_problem().twin.topology)
+    np.testing.assert_allclose(
+        first["spacing"][0], first["meter"][0] / spacing**2, rtol=SINGLE, atol=SINGLE * np.abs(first["spacing"][0]).max()
+    )
+    assert first["spacing"][1] == first["meter"][1], "recorded in m^2"
+
+
+def test_epsilon_shortens_steps_of_small_gradients():
+    """The first step of Adam is rate g / (|g| + epsilon)."""
+    epsilon = 1e-6
+    run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, epsilon=epsilon, loss_unit="meter", horizon=0, learning_rate=0.1)))
+    run.epoch()
+    gradient = run.parameters.offsets.grad
+    expected = -0.1 * gradient / (gradient.abs() + epsilon)
+    torch.testing.assert_close(run.parameters.offsets.detach(), expected, rtol=SINGLE, atol=1e-9)
+    assert expected.abs().median() < 0.09
+
+
+def test_a_list_of_weights_is_one_training_for_each():
+    """Every training begins at the start, and the tail selects among all epochs."""
+    common = {"epochs": 3, "learning_rate": 1e-2, "selection": "tail", "tail_fraction": 0.5, "rest_length_bound": 0.1}
+    weights = (0.0, 10.0)
+    singles = [fit(small.fit_problem(fit=config.Fit(rest_prior=weight, **common))) for weight in weights]
+    both = fit(small.fit_problem(fit=config.Fit(rest_prior=weights, **common)))
+    expected = pd.concat([one.history for one in singles], ignore_index=True).assign(epoch=range(6))
+    pd.testing.assert_frame_equal(both.history, expected, check_exact=True)
+    chosen = int(np.argmin([one.best_loss for one in singles]))
+    best = singles[chosen]
+    assert both.best_loss == best.best_loss
+    np.testing.assert_array_equal(both.twin.topology.rest_lengths, best.twin.topology.rest_lengths)
+    assert both.figures["rest_prior"] == weights[both.best_epoch // 3] == weights[chosen]
+
+
+def test_several_weights_need_a_tail():
+    with pytest.raises(ValueError, match="selection: tail"):
+        config.Fit(rest_prior=(0.1, 1.0))
+    assert config.Fit(rest_prior=(0.1,)).total_epochs == 200
+    settings = config.Fit(rest_prior=(0.1, 1.0), rest_shape=config.RestShape(prior=(1.0, 2.0, 3.0)), selection="tail", epochs=10)
+    assert settings.total_epochs == 60
+    with pytest.raises(ValueError, match="at least one weight"):
+        config.Fit(rest_prior=())
+    parsed = config.parse(config.Fit, config.plain(settings), "here")
+    assert parsed == settings

@@ -1,0 +1,144 @@
+"""The oracle reads the future and says so; what is no oracle reads none of it, bit for bit."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuspring import config
+from neuspring.config import Carry, LastFrame
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.physics.autograd import twin_tensors
+from neuspring.stages import fit as fit_stage
+from neuspring.stages import fits, rollout
+from neuspring.stages import search as search_stage
+from neuspring.twin.carry import carry_over
+from neuspring.twin.fit import fit
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.search import search
+from tests.support import small
+
+SETTINGS = config.Config(
+    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    fit=config.Fit(epochs=2, learning_rate=5e-2),
+    device="cpu",
+)
+
+
+def spoiled() -> Observations:
+    """The default scene, in which everything that was observed after the split is wrong. How the hands move is given."""
+    seen = small.observations()
+    valid = seen.object_motion_valid.copy()
+    # That of the last training frame is about its way into the future.
+    valid[seen.scenario.train_end - 1 :] ^= True
+    return replace(small.spoiled_future(), controller_points=seen.controller_points, object_motion_valid=valid)
+
+
+def parameters(twin: Twin) -> np.ndarray:
+    return np.concatenate([values.numpy().ravel() for values in twin_tensors(twin, "cpu").values()])
+
+
+def whole(seen: Observations, *, oracle: bool) -> list[np.ndarray]:
+    """Everything that a row makes: the search's costs, the fit, rollouts with both corrections of the state."""
+    found = search(small.search_problem(seen), seed=0)
+    fitted = fit(small.fit_problem(seen, twin=found.twin, oracle=oracle))
+    made = [found.trace["cost"].to_numpy(), parameters(found.twin), parameters(fitted.twin), fitted.history["loss"].to_numpy(float)]
+    velocity = np.tile([0.0, 0.4, 0.0], (len(seen.nodes), 1))
+    plain = roll_out(fitted.twin, seen.controller_points, velocity=velocity)
+    made.append(plain.positions)
+    ways: tuple[Carry, ...] = ("residuals", "state")
+    for how in ways:
+        carried, facts = carry_over(plain, fitted.twin, seen, velocity, "cpu", how, LastFrame(window=2, modes=4, iterations=1))
+        made += [carried.positions, np.array(list(facts.values()))]
+    return made
+
+
+def test_without_an_oracle_nothing_after_the_split_changes_search_fit_or_rollout():
+    for first, second in zip(*(whole(seen, oracle=False) for seen in (small.observations(), spoiled())), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_an_oracle_reads_what_comes_after_the_split():
+    results = [fit(small.fit_problem(seen, oracle=True)).twin for seen in (small.observations(), spoiled())]
+    assert not np.array_equal(*map(parameters, results))
+
+
+def test_an_oracle_comes_closer_to_the_future():
+    seen = small.observations()
+    end, points = seen.scenario.train_end, seen.object_points.shape[1]
+    errors = []
+    for oracle in (False, True):
+        twin = fit(small.fit_problem(oracle=oracle, fit=config.Fit(epochs=12, learning_rate=5e-2, horizon=0))).twin
+        gap = roll_out(twin, seen.controller_points).positions[end:, :points] - seen.object_points[end:]
+        errors.append(np.square(gap).sum(axis=2).mean())
+    assert errors[1] < errors[0]
+
+
+def test_only_an_oracles_loss_holds_the_future():
+    seen = small.observations()
+    scenario = seen.scenario
+    kept = [len(FrameLoss.of(seen, config.Losses(), "cpu", **asked).points) for asked in ({}, {"oracle": True})]
+    assert kept == [scenario.train_end, scenario.frame_count]
+    assert [small.fit_problem(oracle=oracle).frame_end for oracle in (False, True)] == kept
+
+
+def test_an_oracle_holds_no_tail_back():
+    with pytest.raises(InputError, match=r"fit\.selection: an oracle is fitted on all frames"):
+        small.fit_problem(oracle=True, fit=config.Fit(selection="tail"))
+
+
+def test_settings_cannot_make_an_oracle():
+    """Only a row of the method table can: no key of any section does."""
+    with pytest.raises(InputError, match="oracle"):
+        config.parse(config.Fit, {"oracle": True}, "fit")
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("oracle")
+    small.observations().save(folder / "observations.npz")
+    search_stage.run(folder / "observations.npz", SETTINGS, 1, 0, "cpu", folder / "search.json")
+    return folder
+
+
+def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_path):
+    seen, found = started / "observations.npz", started / "search.json"
+    keys = {}
+    for oracle in (False, True):
+        recorder = fit_stage.recorder(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
+        keys[oracle] = fit_stage.prepared(recorder, seen, found, SETTINGS).key
+        fit_stage.run(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
+        rollout.run(seen, [tmp_path / f"{oracle}" / "fit.json"], None, "cpu", tmp_path / f"{oracle}" / "rollout.json")
+    assert keys[False] != keys[True]
+    for name in ("fit", "rollout"):
+        normal, seeing = (StageRecord.load(tmp_path / f"{oracle}" / f"{name}.json") for oracle in (False, True))
+        assert "oracle" not in normal.settings
+        assert seeing.settings["oracle"] is True
+    frames = [StageRecord.load(tmp_path / f"{oracle}" / "fit.json").facts["spring_updates"] for oracle in (False, True)]
+    scenario = small.observations().scenario
+    assert frames[1] * (scenario.train_end - 1) == frames[0] * (scenario.frame_count - 1)
+
+
+def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
+    seen, found = started / "observations.npz", started / "search.json"
+    settings = json.dumps({"fit": config.plain(SETTINGS.fit)})
+    names = ["normal", "oracle", "oracle_again"]
+    rows = [
+        fits.Row(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names
+    ]
+    fits.run(seen, rows, "cpu", tmp_path / "fits.json")
+    companies = StageRecord.load(tmp_path / "fits.json").facts["companies"]
+    assert companies == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
+    twins = []
+    for folder in (tmp_path / "oracle", tmp_path / "alone"):
+        fit_stage.run(seen, found, SETTINGS, "springs", "cpu", folder / "fit.json", oracle=True)
+        twins.append(Twin.load(folder / "twin.npz"))
+        history = pd.read_parquet(folder / "history.parquet")
+        assert len(history)
+    np.testing.assert_array_equal(*map(parameters, twins))
