@@ -14,7 +14,7 @@ from neuspring.stages import fit, search
 from tests.support import small
 
 SETTINGS = config.Config(
-    search=config.Search(rollouts=6, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    search=small.released(rollouts=6, start={"object_radius": 0.045, "stiffness": 1e4}),
     fit=config.Fit(epochs=2, learning_rate=5e-2, checkpoint_every=1),
 )
 

@@ -1,0 +1,68 @@
+"""Which settings fit the held-back tail of the training frames best, over development recordings.
+
+python workflow/scripts/choices.py RESULTS_FOLDER [REFERENCE]
+
+RESULTS_FOLDER was made with config/choices/ (`--until fit` is enough). Every row there trains on the first four fifths of the training
+frames and keeps the epoch that is best on the last fifth; frames behind the split are read by nothing. The table has, per row, the
+geometric mean over recordings and seeds of that best tail loss, as a ratio to the row REFERENCE (default: field), with a 95 % t-interval
+of the logarithm over recordings, and the ratio of the lowest training loss.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from neuspring.core.records import StageRecord
+
+
+def losses(results: Path) -> pd.DataFrame:
+    """One row per fit: recording, method, seed, best tail loss and lowest training loss, m^2; failed fits are left out."""
+    rows = []
+    for path in sorted(results.glob("*/*/*/fit.json")):
+        record = StageRecord.load(path)
+        recording, method, seed = path.parts[-4:-1]
+        if record.status != "ok":
+            print(f"{path}: {record.reason}")
+            continue
+        history = pd.read_parquet(path.with_name("history.parquet"))
+        lowest = float(history.loc[history["metric"] == "loss", "value"].min())
+        rows.append((recording, method, seed, float(record.facts["best_loss"]), lowest))
+    return pd.DataFrame(rows, columns=["recording", "method", "seed", "tail", "training"])
+
+
+def table(found: pd.DataFrame, reference: str) -> pd.DataFrame:
+    """Ratios of every method to `reference`, on the recordings and seeds that both have."""
+    base = found[found["method"] == reference].set_index(["recording", "seed"])
+    rows = []
+    for method, own in found.groupby("method", sort=False):
+        pairs = own.set_index(["recording", "seed"]).join(base, rsuffix="_base", how="inner")
+        logs = {name: np.log(pairs[name] / pairs[f"{name}_base"]).groupby("recording").mean() for name in ("tail", "training")}
+        tail, count = logs["tail"], len(logs["tail"])
+        half = stats.t.ppf(0.975, count - 1) * tail.std(ddof=1) / np.sqrt(count) if count > 1 else np.nan
+        rows.append(
+            {
+                "method": method,
+                "recordings": count,
+                "tail": np.exp(tail.mean()),
+                "low": np.exp(tail.mean() - half),
+                "high": np.exp(tail.mean() + half),
+                "better": int((tail < 0).sum()),
+                "training": np.exp(logs["training"].mean()),
+            }
+        )
+    return pd.DataFrame(rows).sort_values("tail", ignore_index=True)
+
+
+def main(results: Path, reference: str = "field") -> None:
+    """Print the table."""
+    found = losses(results)
+    print(table(found, reference).to_string(index=False, float_format=lambda value: f"{value:.2f}"))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *sys.argv[2:])
