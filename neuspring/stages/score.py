@@ -240,6 +240,8 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
             notes.append(f"{name}: {len(record.facts['rollbacks'])} of {epochs} epochs rolled back, {wanted} asked for")
         if record.facts.get("collision_overflow"):
             notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
+        if record.facts.get("at_ends"):
+            notes.append(f"{name}: at an end of its range: {record.facts['at_ends']}")
         if record.facts.get("at_bound", 0.0) > HELD:
             notes.append(
                 f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"

@@ -6,6 +6,8 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from neuspring.config import Config
 from neuspring.config.select import select
 from neuspring.core.artifacts import Observations
@@ -19,6 +21,11 @@ from neuspring.stages import options as shared
 from neuspring.twin.polish import CMAES, SLOPES
 from neuspring.twin.recordings import Recording
 from neuspring.twin.search import SearchProblem, search
+
+SURFACES = ("ground_", "contact_")
+"""How the names of variables begin that have no effect where nothing touches."""
+END = 0.01
+"""Distance from an end of its range, in normalized units, within which a variable counts as held by it."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -121,4 +128,13 @@ def run(
         "spring_updates": int((result.trace["springs"] * result.trace["substeps"]).sum()) * problem.simulated_frames,
         **result.twin.counts,
     }
+    if held := at_ends(result.trace, problem.variables):
+        facts["at_ends"] = ", ".join(held)
     record.save(files, facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)
+
+
+def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
+    """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
+    best = trace.loc[trace["cost"].where(trace["stage"] != SLOPES).idxmin()]
+    decisive = [name for name in variables if not name.startswith(SURFACES)]
+    return [name for name in decisive if not END <= best[f"normalised.{name}"] <= 1 - END]

@@ -1,0 +1,24 @@
+"""What the record of a search says beside its values."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from neuspring.stages.search import at_ends
+from neuspring.twin.polish import CMAES, SLOPES
+
+VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
+
+
+def trace(*rows: tuple[str, float, float, float, float, float]) -> pd.DataFrame:
+    """Rows of stage, cost, and the normalized variables."""
+    return pd.DataFrame(rows, columns=["stage", "cost", *(f"normalised.{name}" for name in VARIABLES)])
+
+
+def test_variables_at_the_ends_of_their_ranges_are_named():
+    best = (CMAES, 1.0, 0.995, 0.5, 0.002, 1.0)
+    assert at_ends(trace((CMAES, 2.0, 0.5, 1.0, 0.5, 0.5), best), VARIABLES) == ["stiffness", "drag"], "contact is left out"
+
+
+def test_a_candidate_for_slopes_is_never_the_best():
+    assert at_ends(trace((CMAES, 2.0, 0.5, 0.5, 0.5, 0.5), (SLOPES, 1.0, 1.0, 1.0, 1.0, 1.0)), VARIABLES) == []
