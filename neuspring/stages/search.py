@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -116,7 +117,7 @@ def run(
     # Candidates for slopes are never the result.
     best = costs.where(result.trace["stage"] != SLOPES).cummin().ffill()
     write_history(costs.index, {"cost": costs, "best_cost": best}, files["history"])
-    facts = {
+    facts: dict[str, Any] = {
         **result.values,
         "cost": result.cost,
         "cost_before_polish": float(costs[result.trace["stage"] == CMAES].min()),
@@ -135,6 +136,7 @@ def run(
 
 def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
     """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
-    best = trace.loc[trace["cost"].where(trace["stage"] != SLOPES).idxmin()]
+    judged = trace[trace["stage"] != SLOPES]
+    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     decisive = [name for name in variables if not name.startswith(SURFACES)]
     return [name for name in decisive if not END <= best[f"normalised.{name}"] <= 1 - END]

@@ -2,10 +2,10 @@
 
 python workflow/scripts/choices.py RESULTS_FOLDER [REFERENCE]
 
-RESULTS_FOLDER was made with config/choices/ (`--until fit` is enough). Every row there trains on the first four fifths of the training
-frames and keeps the epoch that is best on the last fifth; frames behind the split are read by nothing. The table has, per row, the
-geometric mean over recordings and seeds of that best tail loss, as a ratio to the row REFERENCE (default: field), with a 95 % t-interval
-of the logarithm over recordings, and the ratio of the lowest training loss.
+RESULTS_FOLDER was made with config/choices/ (`--until fit` is enough). Every row there trains on the first four fifths of the
+training frames and keeps the epoch that is best on the last fifth; frames behind the split are read by nothing. The table has, per
+row, the geometric mean over recordings and seeds of that best tail loss, as a ratio to the row REFERENCE (default: field), with a
+95 % t-interval of the logarithm over recordings, and the ratio of the lowest training loss.
 """
 
 from __future__ import annotations
