@@ -10,7 +10,7 @@ import torch
 from neuspring import config
 from neuspring.core.training import adam_arrays
 from neuspring.twin.fit import FitProblem, TwinFit, fit
-from neuspring.twin.unloaded import node_spacing
+from neuspring.twin.spacing import node_spacing
 from tests.support import small
 
 SINGLE = 1e-5
@@ -98,7 +98,7 @@ def test_gradients_are_those_of_the_loss_in_its_unit():
         run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, loss_unit=unit, betas=(0.0, 0.0), horizon=0)))
         row = run.epoch()
         first[unit] = (adam_arrays(run.optimiser)["0.exp_avg"], row["loss"])
-    spacing = node_spacing(small.fit_problem().twin.topology)
+    spacing = node_spacing(small.fit_problem().twin.topology.nodes)
     np.testing.assert_allclose(
         first["spacing"][0], first["meter"][0] / spacing**2, rtol=SINGLE, atol=SINGLE * np.abs(first["spacing"][0]).max()
     )

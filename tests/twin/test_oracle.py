@@ -25,7 +25,7 @@ from neuspring.twin.search import search
 from tests.support import small
 
 SETTINGS = config.Config(
-    search=config.Search(rollouts=11, start=config.SearchStart(object_radius=0.045, stiffness=1e4)),
+    search=small.released(rollouts=11, start={"object_radius": 0.045, "stiffness": 1e4}),
     fit=config.Fit(epochs=2, learning_rate=5e-2),
     device="cpu",
 )
