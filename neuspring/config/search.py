@@ -13,7 +13,7 @@ from neuspring.config.types import Count, NonNegative, Positive, Range, Section
 Scale = Literal["linear", "log"]
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
-EXTRA = ("drag_quadratic",)
+EXTRA = ("drag_quadratic", "bending")
 """Variables beyond the released ones."""
 TOPOLOGY = ("object_radius", "object_neighbours", "controller_radius", "controller_neighbours")
 """Variables that decide which springs there are, so that a twin changes in jumps with them."""
@@ -50,6 +50,8 @@ class SearchRanges(Section):
     """Damping along springs, N s/m."""
     drag_quadratic: Range = (0.001, 5.0)
     """Velocity decay per speed, 1/m; searched where `extra` names it."""
+    bending: Range = (0.001, 100.0)
+    """Stiffness and dashpot of bending springs over those of the others; searched where `extra` names it."""
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
@@ -94,6 +96,8 @@ class SearchScales(Section):
     """Damping along springs."""
     drag_quadratic: Scale = "log"
     """Velocity decay per speed."""
+    bending: Scale = "log"
+    """Stiffness and dashpot of bending springs over those of the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +130,8 @@ class SearchStart(Section):
     """Damping along springs, N s/m."""
     drag_quadratic: float = 0.2
     """Velocity decay per speed, 1/m."""
+    bending: float = 0.1
+    """Stiffness and dashpot of bending springs over those of the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +186,10 @@ class Search(Section):
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `ranges` and `start`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
-    extra: tuple[Literal["drag_quadratic"], ...] = ()
+    extra: tuple[Literal["drag_quadratic", "bending"], ...] = ()
     """Variables beyond the released ones that are searched too; without them what they describe is absent."""
+    bending_reach: Range = (1.6, 2.6)
+    """Lengths of bending springs, from and to, in node spacings of the rest shape; two spacings lie across one node between."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
@@ -196,6 +204,8 @@ class Search(Section):
     def __post_init__(self) -> None:
         if len(set(self.extra)) != len(self.extra):
             raise ValueError(f"extra: different ones are required, received {list(self.extra)}")
+        if not 0 < self.bending_reach[0] < self.bending_reach[1]:
+            raise ValueError(f"bending_reach: 0 < from < to is required, received {list(self.bending_reach)}")
         names = [spec.name for spec in dataclasses.fields(self.start)]
         unknown = [name for name in self.fixed if name not in names]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(names) - len(self.fixed) < 2:

@@ -116,7 +116,8 @@ class Fit(Section):
     global_stiffness: bool = False
     """Train one common factor of all stiffnesses beside springs or field, without a bound, in every epoch."""
     controller_factors: bool = False
-    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs."""
+    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs. Bending springs,
+    where there are any, always have their own."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous", "springs"] = "fixed"

@@ -276,6 +276,7 @@ class Topology(Artifact):
     )
     controller_rest: str = "rest_shape"
     """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
+    bending: np.ndarray = array("B", bool, "1", "which springs are bending springs; empty: none", optional=True)
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
@@ -291,6 +292,8 @@ class Topology(Artifact):
             raise InputError("topology.springs", "a spring may not join two controllers")
         if self.controller_rest not in ("rest_shape", "first_frame"):
             raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
+        if len(self.bending) not in (0, len(self.springs)):
+            raise InputError("topology.bending", f"one entry per spring ({len(self.springs)}), or none", len(self.bending))
         short = np.flatnonzero(~(self.rest_lengths > 0))
         if len(short):
             raise InputError(
@@ -304,6 +307,11 @@ class Topology(Artifact):
     def canonical(self) -> np.ndarray:
         """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
         return canonical_shape(self.nodes, self.controllers, self.rest_shape)
+
+    @property
+    def is_bending(self) -> np.ndarray:
+        """Which springs are bending springs [S]."""
+        return self.bending if len(self.bending) else np.zeros(len(self.springs), bool)
 
     @property
     def object_spring_count(self) -> int:

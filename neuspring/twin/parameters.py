@@ -9,7 +9,8 @@ rest lengths stay free per spring unless `rest_lengths_by` says otherwise). With
                  l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (unloaded.py)
 
 Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`, or a warm start),
-drag and dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
+drag and dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own;
+bending springs, where there are any, always do.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity",
 DAMPING_FACTORS = ("drag", "dashpot", "drag_quadratic")
 """Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
 SPRING_FACTORS = ("stiffness", "dashpot")
-"""Those that may have a factor of their own for controllers' springs."""
+"""Those that may have a factor of their own for controllers' springs and for bending springs."""
 UNTRAINED = ("contact_distance",)
 """It only selects pairs, so it has no gradient."""
 LOWEST_STIFFNESS = 1e-3
@@ -86,6 +87,7 @@ class TwinParameters(nn.Module):
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
+        self.is_bending = torch.tensor(topology.is_bending, device=device)
         self.covered = count if settings.field.controllers or kind == "springs" else topology.object_spring_count
         self.offsets, self.field, self.rest_offsets = None, None, None
         if settings.rest_length_bound and not shared_rest:
@@ -110,11 +112,13 @@ class TwinParameters(nn.Module):
         """The trained values before the first step."""
 
     def _factor_names(self) -> list[str]:
-        """Common factors that are trained: what they scale, or `controller_` and what they scale of controllers' springs."""
+        """Common factors that are trained: what they scale, `controller_` or `bending_` before it where of those springs."""
         s = self.settings
         names = ["stiffness"] if s.homogeneous_epochs or s.global_stiffness else []
         names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
-        return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
+        parts = ["controller"] if s.controller_factors else []
+        parts += ["bending"] if bool(self.is_bending.any()) else []
+        return names + [f"{part}_{name}" for part in parts for name in names if name in SPRING_FACTORS]
 
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later) and weight decay."""
@@ -167,10 +171,10 @@ class TwinParameters(nn.Module):
         if name not in self.factors:
             return 1.0
         factor: torch.Tensor = self.factors[name].exp()
-        if f"controller_{name}" not in self.factors:
-            return factor
-        of_controllers = self.factors[f"controller_{name}"].exp()
-        return torch.where(self.on_controller, of_controllers, factor)
+        for part, members in (("controller", self.on_controller), ("bending", self.is_bending)):
+            if f"{part}_{name}" in self.factors:
+                factor = torch.where(members, self.factors[f"{part}_{name}"].exp(), factor)
+        return factor
 
     def physical(self) -> dict[str, torch.Tensor]:
         """Every physical parameter, with the keyword names of `autograd.pack`."""

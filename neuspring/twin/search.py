@@ -121,6 +121,12 @@ class SearchProblem:
         """Names of what is searched: `names` without `search.fixed`."""
         return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
 
+    @property
+    def bending_reach(self) -> tuple[float, float]:
+        """Lengths of bending springs, from and to, m."""
+        low, high = self.search.bending_reach
+        return low * self.spacing, high * self.spacing
+
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
         """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
         searched = dict(zip(self.variables, normalized, strict=True))
@@ -208,14 +214,18 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         repair=isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
         controller_rest=problem.search.controller_rest,
+        bending=problem.bending_reach if "bending" in values else None,
     )
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
-    lonely = isolated(len(topology.nodes), topology.springs)
+    lonely = isolated(len(topology.nodes), topology.springs[~topology.is_bending])
     if isolated_nodes == "penalise" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
     material = replace(homogeneous(values, count), mass=problem.mass)
+    if "bending" in values:
+        factor = np.where(topology.is_bending, values["bending"], 1.0)
+        material = replace(material, stiffness=material.stiffness * factor, dashpot=material.dashpot * factor)
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
 
 

@@ -111,6 +111,8 @@ MISTAKES = {
     ),
     "unknown scale": ("search: {scales: {drag: cubic}}", "search.scales.drag", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
+    "bending reach": ("search: {bending_reach: [2.6, 1.6]}", "bending_reach: 0 < from < to is required, received [2.6, 1.6]"),
+    "no bending reach": ("search: {bending_reach: [0, 1.6]}", "bending_reach: 0 < from < to is required, received [0.0, 1.6]"),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
     "polish of springs": (
         "search: {polish: {variables: [object_radius]}}",

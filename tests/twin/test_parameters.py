@@ -228,6 +228,32 @@ def test_controllers_springs_may_have_factors_of_their_own():
     assert 0 < inner < len(start["stiffness"])
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_bending_springs_have_factors_of_their_own(apart):
+    """With and without those of controllers' springs; a twin without bending springs has none."""
+    start, settings = twin(), {"global_stiffness": True, "damping": "homogeneous", "controller_factors": apart}
+    inner, count = start.topology.object_spring_count, len(start.topology.springs)
+    marks = (np.arange(count) >= inner - 3) & (np.arange(count) < inner)
+    marked = replace(start, topology=replace(start.topology, bending=marks))
+    trained, without = parameters("springs", marked, **settings), parameters("springs", start, **settings)
+    assert set(trained.factors) - set(without.factors) == {"bending_stiffness", "bending_dashpot"}
+    assert not set(parameters("springs", marked).factors)
+    with torch.no_grad():
+        trained.factors["stiffness"].fill_(math.log(2.0))
+        trained.factors["bending_stiffness"].fill_(math.log(0.1))
+        trained.factors["bending_dashpot"].fill_(math.log(5.0))
+    physical = trained.physical()
+    of_controllers = np.arange(count) >= inner
+    stiffness = np.select([marks, of_controllers & apart], [0.1, 1.0], 2.0)
+    for name, factor in (("stiffness", stiffness), ("dashpot", np.where(marks, 5.0, 1.0))):
+        expected = trained.start[name].numpy() * factor
+        np.testing.assert_allclose(physical[name].detach().numpy(), expected, rtol=SINGLE)
+    # Each factor has the gradient of its own springs: d/dlog f of the sum of f Y is that sum.
+    physical["stiffness"].sum().backward()
+    gradient = float(trained.factors["bending_stiffness"].grad)
+    assert gradient == pytest.approx(float(physical["stiffness"].detach()[torch.tensor(marks)].sum()), rel=SINGLE)
+
+
 def test_the_common_factor_has_no_bound():
     trained = offsets(parameters("springs", global_stiffness=True, output_bound=0.1, stiffness_range=(0.0, 1e9)), 50.0)
     with torch.no_grad():
