@@ -46,6 +46,11 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     shapes do not fit, or no hand reaches a node.
     """
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
+    if old.is_bending.any():
+        rule = "a twin with bending springs moves to recordings with the same nodes only"
+        raise InputError(
+            name, rule, f"{len(observations.nodes)} nodes, the twin has {len(old.nodes)}", "Leave out search.extra: [bending]."
+        )
     nodes, count = len(old.nodes), len(observations.nodes)
     there = observations.canonical
     laid = register(old.canonical[:nodes], there[:count], there[count:])

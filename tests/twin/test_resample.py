@@ -217,3 +217,12 @@ def test_hands_out_of_reach_are_refused():
 def test_scale_is_the_ratio_of_spacings():
     twin = twin_of(recording(grid(BODIES["cloth"], 0.03), hands_of(BODIES["cloth"])), 0.03)
     assert scale_between(twin.topology, twin.topology.nodes * 0.4) == pytest.approx(0.4)
+
+
+def test_bending_springs_are_not_carried_to_other_nodes():
+    seen = recording(grid((0.1, 0.04, 0.0), 0.02), hands_of((0.1, 0.04, 0.0)))
+    twin = twin_of(seen, 0.02)
+    marks = np.zeros(len(twin.topology.springs), bool)
+    marks[0] = True
+    with pytest.raises(InputError, match="bending springs"):
+        resampled(replace(twin, topology=replace(twin.topology, bending=marks)), seen)
