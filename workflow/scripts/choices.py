@@ -18,14 +18,19 @@ import pandas as pd
 from scipy import stats
 
 from neuspring.core.records import StageRecord
+from neuspring.experiments.benchmark import read_methods
+
+METHODS = Path(__file__).resolve().parents[2] / "config/choices/methods.yaml"
 
 
 def losses(results: Path) -> pd.DataFrame:
     """One row per fit: recording, method, seed, best tail loss and lowest training loss, m^2; failed fits are left out."""
-    rows = []
+    rows, candidates = [], read_methods(METHODS)
     for path in sorted(results.glob("*/*/*/fit.json")):
-        record = StageRecord.load(path)
         recording, method, seed = path.parts[-4:-1]
+        if method not in candidates:
+            continue
+        record = StageRecord.load(path)
         if record.status != "ok":
             print(f"{path}: {record.reason}")
             continue
