@@ -18,6 +18,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark, read_scenarios
 from neuspring.experiments.tracking import log as tracking
+from neuspring.scores.metrics import TASKS
 from tests.support.project import (
     ROOT,
     SCENE,
@@ -47,7 +48,9 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert "| baseline " in output
     assert "neuspring ui --results results" in output
     scores = pd.read_parquet(results / "tables" / "scores.parquet")
-    assert len(scores) == 8
+    kinds = scores[["method", "task", "metric"]].drop_duplicates()
+    assert len(kinds) == len(scores) == 2 * len(TASKS) * 3
+    assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound"}
     assert np.isfinite(scores["value"]).all()
     assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
     # Everything is there already: sync finds two complete runs and sends nothing.

@@ -82,8 +82,8 @@ def test_scores_are_the_metrics_of_the_trajectory(finished):
     trajectory = Trajectory.load(run.with_name("trajectory.npz"))
     expected = metrics.score(trajectory, observations, "phystwin", 0)
     pd.testing.assert_frame_equal(pd.read_parquet(run.with_name("scores.parquet")), expected)
-    assert expected.groupby("metric")["task"].nunique().eq(2).all()
-    assert expected["metric"].nunique() == 3
+    pairs = [(task, metric) for task in metrics.TASKS for metric in ("chamfer", "track_error", "track_error_bound")]
+    assert sorted(zip(expected["task"], expected["metric"], strict=True)) == sorted(pairs)
 
 
 def test_the_tracking_module_accepts_the_run_record(finished):
