@@ -47,7 +47,7 @@ def test_the_tail_is_the_one_that_the_fit_holds_back(fraction, frames):
 
 @pytest.mark.parametrize(("method", "selection"), [("baseline", "training_loss"), ("baseline", "tail"), ("search_only", "tail")])
 def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, method, selection):
-    base = settings(fit={"selection": selection, "learning_rate": 0.3, "tail_fraction": 0.4, "epochs": 4})
+    base = settings(fit={"selection": selection, "learning_rate": 1.0, "tail_fraction": 0.4, "epochs": 4})
     tune = sweep(method=method, trials=1, space={"losses.acceleration": {"choices": [0.01, 0.02]}})
     work(folder, tune, base=base)
     value = slots(folder, tune, base)[0].trials[-1].value

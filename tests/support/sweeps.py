@@ -20,7 +20,7 @@ from neuspring.experiments.tuning.store import slots as slots_of
 from tests.support import small
 
 OBSERVATIONS = "observations.npz"
-BASE = {"scenarios": ["small"], "search": {"rollouts": 11}, "fit": {"epochs": 3, "checkpoint_every": 1}}
+BASE = {"scenarios": ["small"], "search": {"rollouts": 11}, "fit": {"epochs": 3, "checkpoint_every": 1, "learning_rate": 1e-4}}
 METHODS = {
     "search_only": {"search": "uniform", "fit": None, "description": "No second stage"},
     "baseline": {"search": "uniform", "fit": "springs", "description": "Springs"},
