@@ -42,12 +42,14 @@ def losses(results: Path) -> pd.DataFrame:
 
 def table(found: pd.DataFrame, reference: str) -> pd.DataFrame:
     """Ratios of every method to `reference`, on the recordings and seeds that both have."""
-    base = found[found["method"] == reference].set_index(["recording", "seed"])
+    names, places = ["tail", "training"], ["recording", "seed"]
+    base = found[found["method"] == reference].set_index(places)[names]
     rows = []
     for method, own in found.groupby("method", sort=False):
-        pairs = own.set_index(["recording", "seed"]).join(base, rsuffix="_base", how="inner")
-        logs = {name: np.log(pairs[name] / pairs[f"{name}_base"]).groupby("recording").mean() for name in ("tail", "training")}
-        tail, count = logs["tail"], len(logs["tail"])
+        ratios = np.log(own.set_index(places)[names] / base).dropna().groupby("recording").mean()
+        tail, count = ratios["tail"], len(ratios)
+        if not count:
+            continue
         half = stats.t.ppf(0.975, count - 1) * tail.std(ddof=1) / np.sqrt(count) if count > 1 else np.nan
         rows.append(
             {
@@ -57,10 +59,11 @@ def table(found: pd.DataFrame, reference: str) -> pd.DataFrame:
                 "low": np.exp(tail.mean() - half),
                 "high": np.exp(tail.mean() + half),
                 "better": int((tail < 0).sum()),
-                "training": np.exp(logs["training"].mean()),
+                "training": np.exp(ratios["training"].mean()),
             }
         )
-    return pd.DataFrame(rows).sort_values("tail", ignore_index=True)
+    columns = ["method", "recordings", "tail", "low", "high", "better", "training"]
+    return pd.DataFrame(rows, columns=columns).sort_values("tail", ignore_index=True)
 
 
 def main(results: Path, reference: str = "field") -> None:
