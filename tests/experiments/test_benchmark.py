@@ -440,7 +440,6 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "baselines"],
         ["mocap", "clusters"],
         ["mocap", "mocap_first_frame"],
-        ["mocap", "mocap_markers"],
         ["mocap", "mocap_free"],
         ["mocap", "mocap_fine"],
         ["mocap", "mocap_eval"],
