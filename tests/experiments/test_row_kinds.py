@@ -44,6 +44,7 @@ def test_records_name_oracles_and_tasks_and_leave_other_rows_as_they_were():
         "fit": "springs",
         "carry_over": False,
         "average_seeds": False,
+        **benchmark().methods["baseline"].settings,
     }
 
 
