@@ -1,6 +1,6 @@
 """Which settings fit the held-back tail of the training frames best, over development recordings.
 
-python workflow/scripts/choices.py RESULTS_FOLDER [REFERENCE]
+python workflow/scripts/choices.py RESULTS_FOLDER [FITS.CSV]
 
 RESULTS_FOLDER was made with config/choices/ (`--until fit` is enough). Every row there trains on the first four fifths of the
 training frames and keeps the epoch that is best on the last fifth; frames behind the split are read by nothing. The table has, per
@@ -20,6 +20,7 @@ from scipy import stats
 from neuspring.core.records import StageRecord
 from neuspring.experiments.benchmark import read_methods
 
+REFERENCE = "field"
 METHODS = Path(__file__).resolve().parents[2] / "config/choices/methods.yaml"
 
 
@@ -66,11 +67,13 @@ def table(found: pd.DataFrame, reference: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns).sort_values("tail", ignore_index=True)
 
 
-def main(results: Path, reference: str = "field") -> None:
-    """Print the table."""
+def main(results: Path, fits: Path | None = None) -> None:
+    """Print the table; write the losses of every fit."""
     found = losses(results)
-    print(table(found, reference).to_string(index=False, float_format=lambda value: f"{value:.2f}"))
+    if fits:
+        found.to_csv(fits, index=False, float_format="%.4e")
+    print(table(found, REFERENCE).to_string(index=False, float_format=lambda value: f"{value:.2f}"))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:])
+    main(*map(Path, sys.argv[1:]))
