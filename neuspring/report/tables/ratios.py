@@ -67,14 +67,14 @@ def ratio_lines(judged: Judged) -> list[str]:
     """The sections of the summary: spread over seeds, ratios with verdicts, aims."""
     lines = _seed_lines(judged.seeds)
     if len(judged.ratios):
-        lines += ["", f"{about_ratios(judged)}", "", *_table(judged.ratios, published(HEADINGS, judged.ratios), _ratio)]
+        lines += ["", f"{about_ratios(judged)}", "", *by_method(judged.ratios, published(HEADINGS, judged.ratios), _ratio)]
     return lines + aim_lines(judged.aims)
 
 
 def transfer_lines(judged: Judged) -> list[str]:
     """The same of twins on other recordings."""
     rows = judged.transferred
-    return ["", about_ratios(judged), "", *_table(rows, published(TRANSFER_HEADINGS, rows), _ratio)] if len(rows) else []
+    return ["", about_ratios(judged), "", *by_method(rows, published(TRANSFER_HEADINGS, rows), _ratio)] if len(rows) else []
 
 
 def aim_lines(aims: pd.DataFrame) -> list[str]:
@@ -95,10 +95,11 @@ def _seed_lines(seeds: pd.DataFrame) -> list[str]:
         return []
     about = "Spread over seeds: standard deviation of the log error, in per cent, mean over scenarios."
     cells = published(HEADINGS, seeds)
-    return ["", about, "", *_table(seeds, cells, lambda row: f"{100 * row.spread:.1f} %")]
+    return ["", about, "", *by_method(seeds, cells, lambda row: f"{100 * row.spread:.1f} %")]
 
 
-def _table(table: pd.DataFrame, headings: Headings, cell: Callable[[Any], str]) -> list[str]:
+def by_method(table: pd.DataFrame, headings: Headings, cell: Callable[[Any], str]) -> list[str]:
+    """A Markdown table with a line per method: `cell` of each task and metric in `headings`, a dash where it has no row."""
     rows = []
     for method, part in table.groupby("method", sort=False):
         values = {(row.task, row.metric): row for row in part.itertuples()}

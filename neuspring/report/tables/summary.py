@@ -18,7 +18,7 @@ from neuspring.report.figures.ratios import NAME as RATIOS
 from neuspring.report.figures.ratios import ratios_figure
 from neuspring.report.tables.cells import ORACLE_LINE
 from neuspring.report.tables.differing import differing, differing_markdown
-from neuspring.report.tables.ratios import Judged, Judging, judged, ratio_lines, transfer_lines
+from neuspring.report.tables.ratios import Judged, Judging, by_method, judged, ratio_lines, transfer_lines
 from neuspring.scores.failures import both_averages, failures_text, left_out_lines, removed_lines
 from neuspring.scores.metrics import (
     COLUMNS,
@@ -77,7 +77,7 @@ def summary_text(
     lines += [*floor_lines(runs), *ratio_lines(figures)]
     if len(differences):
         intro = f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios and seeds], same scenario and seed:"
-        lines += ["", intro, "", *_difference_table(differences, headings)]
+        lines += ["", intro, "", *by_method(differences, headings, _interval)]
     lines += image_lines(collected, scores, differences, baseline)
     runs = everything.runs
     footnote = differing_markdown(differing(everything.records.values(), {name: name for name in dict.fromkeys(runs["method"])}))
@@ -191,14 +191,6 @@ def _mean(row: Any, several: bool, absent: str) -> str:
     return f"{metric.text(row.equal)}{spread} ({metric.text(row.frames)})"
 
 
-def _difference_table(differences: pd.DataFrame, headings: Headings) -> list[str]:
-    rows = []
-    for method, part in differences.groupby("method", sort=False):
-        values = {(row.task, row.metric): row for row in part.itertuples()}
-        rows.append([str(method), *(_interval(values[key]) if key in values else DASH for key in headings)])
-    return markdown(["Method", *headings.values()], rows)
-
-
 def _interval(row: Any) -> str:
     """The difference and its interval, and for distances the relative difference."""
     metric = METRICS[row.metric]
@@ -236,7 +228,7 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
     if len(own):
         headings = {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed}
         lines += ["", f"Paired difference to {baseline} [95 % interval], same scenario and seed:", ""]
-        lines += _difference_table(own, headings)
+        lines += by_method(own, headings, _interval)
     return lines
 
 
@@ -320,7 +312,7 @@ def transfer_text(collected: Collected, baseline: str, figures: Judged) -> str:
     if len(differences):
         interval = "95 % bootstrap interval over sources and seeds; sources may share targets"
         lines += ["", f"Paired difference to {baseline}, mm [{interval}]:", ""]
-        lines += _difference_table(differences, headings)
+        lines += by_method(differences, headings, _interval)
     lines += transfer_lines(figures)
     return "\n".join(lines) + "\n"
 
