@@ -174,6 +174,24 @@ def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
     assert "x 8" in text and "y 9" in text and "runs.csv names them" in text
 
 
+def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
+    keys = [(f"s{i}", method, 0) for i in range(9) for method in ("x", "y")]
+    found = collected(dict.fromkeys(keys, 0.010))
+    of_x = found.runs["method"] == "x"
+    found.runs["notes"] = [
+        f"fit: {10 + i}% of the springs lie at the bound; search: at an end of its range: dashpot" if x else ""
+        for i, x in enumerate(of_x)
+    ]
+    few = tables.summary_text(found, "x")
+    assert "- s0 / x / seed 0: fit: 10% of the springs" in few
+    found.runs.loc[~of_x, "notes"] = "fit: no epoch was better than the search"
+    many = tables.summary_text(found, "x")
+    assert "- x, 9 of 9 runs: fit: 10 to 26% of the springs lie at the bound" in many
+    assert "- x, 9 of 9 runs: search: at an end of its range: dashpot" in many
+    assert "- y, 9 of 9 runs: fit: no epoch was better than the search" in many
+    assert "s0 / x / seed 0: fit" not in many
+
+
 def test_no_spread_is_shown_where_one_seed_of_several_has_finished():
     found = collected({("a", "x", 0): 0.010})
     rest = pd.DataFrame([{"scenario": "a", "method": "x", "seed": 1, "status": "missing", "reason": "", "notes": ""}])

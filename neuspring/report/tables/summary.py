@@ -38,7 +38,11 @@ from neuspring.scores.statistics import paired_differences
 
 NOT_COMPUTED = "not computed"
 LISTED = 12
-"""At most so many missing runs are listed one by one. If there are more, they are counted by method."""
+"""At most so many missing runs, or notes, are listed one by one. If there are more, they are counted by method."""
+NUMBER = r"(?<![\w.])\d+(?:\.\d+)?(?!\w)"
+"""A number of a note: notes that differ in numbers alone are of one kind."""
+HOLE = "\ufffc"
+"""Stands for a number in a kind of note."""
 
 
 def compared(collected: Collected, baseline: str) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -90,8 +94,28 @@ def summary_text(
     noted = runs[runs["notes"] != ""]
     if len(noted):
         lines += ["", "Notes:", ""]
-        lines += [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
+        lines += _note_lines(noted, runs["method"].value_counts())
     return "\n".join(lines) + "\n"
+
+
+def _note_lines(noted: pd.DataFrame, runs: pd.Series) -> list[str]:
+    """Notes one by one; where they are many, how many of a method's `runs` have each kind, numbers as least to largest."""
+    if len(noted) <= LISTED:
+        return [f"- {row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted.itertuples()]
+    single = noted.assign(note=noted["notes"].str.split("; ")).explode("note")
+    single["kind"] = single["note"].str.replace(NUMBER, HOLE, regex=True)
+    lines = []
+    for (method, kind), group in single.groupby(["method", "kind"], sort=False):
+        numbers = group["note"].str.findall(NUMBER).map(lambda found: [float(number) for number in found])
+        for least, most in _ranges(numbers):
+            kind = kind.replace(HOLE, f"{least:g}" if least == most else f"{least:g} to {most:g}", 1)
+        lines.append(f"- {method}, {len(group)} of {runs[method]} runs: {kind}")
+    return [*lines, "- runs.csv has the notes of every run."]
+
+
+def _ranges(numbers: pd.Series) -> list[tuple[float, float]]:
+    """Least and largest of each place in lists of equal length."""
+    return [(min(place), max(place)) for place in zip(*numbers, strict=True)]
 
 
 def _kept_line(scores: pd.DataFrame, runs: pd.DataFrame) -> str:
