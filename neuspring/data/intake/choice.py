@@ -34,7 +34,7 @@ class Choice:
 
     def text(self) -> str:
         """Which they are, in one line."""
-        stride = f", every {self.step}th" if self.step > 1 else ""
+        stride = f", one in {self.step}" if self.step > 1 else ""
         return f"{len(self.numbers)} frames, numbers {self.numbers[0]} to {self.numbers[-1]} of the source{stride}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.progress import Progress
 from neuspring.core.records import digest_file
-from neuspring.data.capture import Camera, Capture, Description, Writer
+from neuspring.data.capture import Camera, Capture, Description, Writer, description_departures
+from neuspring.data.departure import refuse
 from neuspring.data.intake.charuco import Board
 from neuspring.data.intake.choice import Choice, choose
 from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses, require_lens
@@ -25,6 +27,7 @@ from neuspring.data.intake.store import close, prepare, written
 from neuspring.data.intake.units import Unit, find_rate, find_unit
 from neuspring.data.intake.views import Lens, View
 
+NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 SAMPLED = 5
 """Frames per camera, evenly spaced, in which the unit of depth, the table and the board are looked for."""
 
@@ -73,6 +76,9 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
     or file, the rule, what was received and the next move.
     """
+    for option, name in (("--name", intake.name), *(("--cameras", view.name) for view in intake.views)):
+        if not NAMES.fullmatch(name):
+            raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
     choice = choose(intake.views, intake.frames)
     rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
     seen, unit = _look(intake, choice)
@@ -95,6 +101,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         }
     }
     made = parse(Description, description, "make-capture")
+    refuse(description_departures(Path("make-capture"), made))
     _write(intake, made, choice, unit, seen, placed)
     jumps = [f"warning: time jumps at {choice.jumps} places, where more frames are left out"] if choice.jumps else []
     remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]

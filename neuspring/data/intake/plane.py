@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-HYPOTHESES = 3000
-"""Triples of points per search: a plane with a tenth of the points is hit three times."""
-SCORED = 1500
+HYPOTHESES = 2000
+"""Triples of points per search: a plane with a tenth of the points is hit twice."""
+SCORED = 800
 """Points on which a hypothesis is scored."""
 POINTS = 20000
 """Points of all frames together."""

@@ -84,7 +84,7 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
     how = "given" if given is not None else "as the video says"
     if given is not None and told and abs(told[0] - given) > 0.02 * given:
         how = f"given; the video says {told[0]:.3g}"
-    thinned = f", every {step}th frame of {rate:g}" if step > 1 else ""
+    thinned = f", one in {step} of {rate:g}" if step > 1 else ""
     return rate / step, f"{rate / step:g} frames per second, {how}{thinned}"
 
 

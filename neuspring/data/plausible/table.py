@@ -66,7 +66,7 @@ def table_departures(
     table = min(candidates, key=lambda plane: _cost(stand(plane, pose, sign)))
     standing = stand(table, pose, sign)
     if standing.good:
-        found = [note(path, f"camera {name}: the table is z = 0 within {_text(standing)}; plane: {table.text()}")]
+        found = [note(path, f"camera {name}: the table is {_text(standing)}; plane: {table.text()}")]
         if table.height > HIGHEST:
             rule = f"{where}: a camera should be at most {HIGHEST:g} m above the table"
             next_move = f"{table.height:.2f} m. Check depth_unit: ten times too large makes all of the scene so"
@@ -90,7 +90,7 @@ def _cost(standing: Stand) -> float:
 
 def _text(standing: Stand) -> str:
     side = "above" if standing.off > 0 else "below"
-    return f"{1e3 * abs(standing.off):.0f} mm ({side} it) and {standing.tilt:.1f} degrees"
+    return f"{1e3 * abs(standing.off):.0f} mm {side} z = 0 and tilted by {standing.tilt:.1f} degrees"
 
 
 def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Departure | None:
