@@ -26,7 +26,7 @@ class Choice:
     step: int
     """Every so many frames of the source are kept; the rate falls by it."""
     jumps: int
-    """Places where more are left out: there time jumps."""
+    """Places where more numbers are left out: there time jumps."""
 
     def missing(self, camera: str) -> tuple[int, ...]:
         """Frames that the camera lacks."""
@@ -77,5 +77,7 @@ def choose(views: Sequence[View], wanted: str = "") -> Choice:
             remedy = "Name the images of all cameras by the same frame numbers, or give --frames."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
     of_first = [place for _, place in sorted(places[first.name].items())]
-    steps = [after - before for before, after in pairwise(of_first)]
-    return Choice(kept, places, min(steps), sum(step != min(steps) for step in steps))
+    # The rate is that of the files that are there; a number that is not there is a moment that is missing.
+    step = min(after - before for before, after in pairwise(of_first))
+    gaps = [after - before for before, after in pairwise(kept)]
+    return Choice(kept, places, step, sum(gap != min(gaps) for gap in gaps))

@@ -103,7 +103,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     made = parse(Description, description, "make-capture")
     refuse(description_departures(Path("make-capture"), made))
     _write(intake, made, choice, unit, seen, placed)
-    jumps = [f"warning: time jumps at {choice.jumps} places, where more frames are left out"] if choice.jumps else []
+    jumps = [f"warning: time jumps at {choice.jumps} places, where frame numbers are left out"] if choice.jumps else []
     remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
     lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {unit.text()}", f"poses: {how}, up {placed.up}"]

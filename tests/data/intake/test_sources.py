@@ -114,6 +114,9 @@ def test_a_stride_and_a_jump_are_known(tmp_path):
     views = pairs([root / "color_0"], [root / "depth_0"])
     assert (choose(views, "0-10/2").step, choose(views, "0-10/2").jumps) == (2, 0)
     assert choose(views, "0-3,8-11").jumps == 1
+    (root / "depth_0" / "frame_6.png").unlink()
+    views = pairs([root / "color_0"], [root / "depth_0"])
+    assert (choose(views).step, choose(views).jumps) == (1, 1)
     with pytest.raises(InputError, match="a capture needs at least 5 frames; received 3 of the numbers 0 to 11"):
         choose(views, "0-2")
 
