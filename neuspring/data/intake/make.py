@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import TypeAdapter
 
 from neuspring.config import parse
@@ -20,16 +19,17 @@ from neuspring.data.capture import Camera, Capture, Description, Writer, descrip
 from neuspring.data.departure import refuse
 from neuspring.data.intake.charuco import Board
 from neuspring.data.intake.choice import Choice, choose
-from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses, require_lens
-from neuspring.data.intake.poses import Placed, Seen, by_board, by_table, stand
+from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses
+from neuspring.data.intake.look import Seen, look, meters_of, plain, require_aligned, stored_as, straightened
+from neuspring.data.intake.poses import Placed, by_board, by_table, stand
 from neuspring.data.intake.raw import Raw
 from neuspring.data.intake.store import close, prepare, written
-from neuspring.data.intake.units import Unit, find_rate, find_unit
-from neuspring.data.intake.views import Lens, View
+from neuspring.data.intake.units import Unit, find_rate
+from neuspring.data.intake.views import View
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
-SAMPLED = 5
-"""Frames per camera, evenly spaced, in which the unit of depth, the table and the board are looked for."""
+FIRST = 5
+"""Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,8 +81,10 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
     choice = choose(intake.views, intake.frames)
     rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
-    seen, unit = _look(intake, choice)
-    placed, how = _place(intake, seen)
+    names = [view.name for view in intake.views]
+    listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
+    seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
+    placed, how = _place(intake, seen, unit)
     used = {name: [choice.places[name][f] for f in sorted(choice.places[name])] for name in seen}
     files = {view.name: view.files(used[view.name]) for view in intake.views}
     description = _describe(intake, choice, rate, unit, seen, placed) | {
@@ -117,60 +119,31 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     return Capture.load(intake.folder), lines
 
 
-def _look(intake: Intake, choice: Choice) -> tuple[dict[str, Seen], Unit]:
-    """A few frames of every camera, with intrinsics and the unit of depth, which is one for all. Raises InputError."""
-    names = [view.name for view in intake.views]
-    listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
-    samples: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    lenses: dict[str, Lens] = {}
-    for view in intake.views:
-        frames = sorted(choice.places[view.name])
-        picked = sorted({frames[k] for k in np.linspace(0, len(frames) - 1, SAMPLED).astype(int)})
-        samples[view.name] = list(view.read([choice.places[view.name][frame] for frame in picked]))
-        color, depth = samples[view.name][0]
-        _require_aligned(view.path, view.name, color, depth)
-        lens = listed.get(view.name) or view.lens
-        if lens is None:
-            raise InputError(
-                "--intrinsics", f"intrinsics of camera {view.name} are required", "none", "Give a JSON file with fx, fy, cx, cy."
-            )
-        lenses[view.name] = lens
-        require_lens(intake.intrinsics or view.path, view.name, lens, (color.shape[1], color.shape[0]))
-    kinds = {_stored(depth) for pairs in samples.values() for _, depth in pairs}
-    if len(kinds) > 1:
-        raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
-    known = {view.unit for view in intake.views}
-    depths = [depth for pairs in samples.values() for _, depth in pairs]
-    unit = find_unit(intake.views[0].path, depths, intake.depth_unit, known.pop() if len(known) == 1 else None)
-    seen = {}
-    for view in intake.views:
-        pairs, lens = samples[view.name], lenses[view.name]
-        size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
-        straight = Straightener(lens, size)
-        colors = [straight.color(color) for color, _ in pairs]
-        meters = [_meters(straight.depth(_plain(depth)), unit) for _, depth in pairs]
-        seen[view.name] = Seen(view.path, size, lens, colors, meters, unit.meters if _stored(depths[0]) == "png" else None)
-    return seen, unit
-
-
-def _place(intake: Intake, seen: Mapping[str, Seen]) -> tuple[Placed, str]:
+def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed, str]:
     """Poses of all cameras, and where they come from. Raises InputError."""
-    names = list(seen)
+    names, level, top_down = list(seen), intake.level, intake.top_down
     given = {view.name: view.pose for view in intake.views if view.pose is not None}
     if intake.poses is not None and intake.board is not None:
         raise InputError("--poses, --board", "one of the two is required", "both")
+    if intake.board_images and intake.board is None:
+        raise InputError("--board", "the board of --board-images must be described", "none")
     if intake.poses is not None:
-        return stand(read_poses(intake.poses, names), seen, level=intake.level), f"of {intake.poses.name}"
+        return stand(read_poses(intake.poses, names), seen, level=level, top_down=top_down), f"of {intake.poses.name}"
     if intake.board is not None:
-        poses, lines = by_board(intake.board, seen, intake.board_images)
-        placed = stand(poses, seen, level=intake.level, up="+z")
+        shown = dict(seen)
+        if not intake.board_images:
+            for view in intake.views:
+                pairs = list(view.read(range(min(FIRST, len(view.numbers)))))
+                shown[view.name] = straightened(view, pairs, seen[view.name].lens, unit)
+        poses, lines = by_board(intake.board, shown, intake.board_images)
+        placed = stand(poses, seen, level=level, top_down=top_down, up="+z")
         return replace(placed, lines=(*lines, *placed.lines)), f"by a ChArUco board of {intake.board}"
     if len(given) == len(names):
-        return stand(given, seen, level=intake.level, up="-z" if intake.raw else None), "of the source"
+        return stand(given, seen, level=level, top_down=top_down, up="-z" if intake.raw else None), "of the source"
     if len(names) > 1:
         remedy = "Give --poses FILE, or --board with an image of a ChArUco board for each camera."
         raise InputError("--poses", f"the poses of {len(names)} cameras are required", "none", remedy)
-    return by_table(names[0], seen[names[0]], top_down=intake.top_down, at=intake.table_at), "by the table's plane"
+    return by_table(names[0], seen[names[0]], top_down=top_down, at=intake.table_at), "by the table's plane"
 
 
 def _describe(intake: Intake, choice: Choice, rate: float, unit: Unit, seen: Mapping[str, Seen], placed: Placed) -> dict[str, Any]:
@@ -210,13 +183,13 @@ def _write(intake: Intake, made: Description, choice: Choice, unit: Unit, seen: 
         left = [frame for frame in frames if frame not in kept]
         done += len(kept)
         for frame, (color, depth) in zip(left, view.read([choice.places[view.name][f] for f in left]), strict=True):
-            _require_aligned(view.path, view.name, color, depth, size)
-            kind = _stored(depth)
+            require_aligned(view.path, view.name, color, depth, size)
+            kind = stored_as(depth)
             if kind != made.depth_format:
                 raise InputError(view.path, f"depth of camera {view.name} must be of one kind", f"another in frame {frame}")
-            stored = straight.depth(_plain(depth))
+            stored = straight.depth(plain(depth))
             mask = intake.raw.labels(view.name, choice.numbers[frame]) if intake.raw and intake.raw.ids else None
-            writer.frame(view.name, frame, straight.color(color), stored if kind == "png" else _meters(stored, unit), mask)
+            writer.frame(view.name, frame, straight.color(color), stored if kind == "png" else meters_of(stored, unit), mask)
             done += 1
             progress.update(done)
     tracks = None
@@ -224,30 +197,6 @@ def _write(intake: Intake, made: Description, choice: Choice, unit: Unit, seen: 
         tracks = intake.raw.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
     writer.finish(tracks)
     close(intake.folder)
-
-
-def _require_aligned(where: Path, name: str, color: np.ndarray, depth: np.ndarray, size: tuple[int, int] | None = None) -> None:
-    """Raise InputError unless depth has the size of color, which is `size`."""
-    if color.shape[:2] != depth.shape:
-        received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
-        remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
-        raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)
-    if size is not None and color.shape[1::-1] != size:
-        raise InputError(where, f"camera {name}: all images must be {size[0]} x {size[1]}", f"{color.shape[1]} x {color.shape[0]}")
-
-
-def _stored(depth: np.ndarray) -> str:
-    """How the capture stores it: 16-bit counts as png, anything else as npy in meters."""
-    return "png" if depth.dtype == np.uint16 else "npy"
-
-
-def _plain(depth: np.ndarray) -> np.ndarray:
-    """Counts, or floating point without what is no depth."""
-    return depth if depth.dtype == np.uint16 else np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(0)
-
-
-def _meters(depth: np.ndarray, unit: Unit) -> np.ndarray:
-    return (depth * unit.meters).astype(np.float32)
 
 
 def _digest(files: Sequence[Path]) -> str:

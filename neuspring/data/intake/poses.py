@@ -13,29 +13,13 @@ from neuspring.data.departure import refuse
 from neuspring.data.intake.charuco import Board, Sighting, depth_ratio, sight
 from neuspring.data.intake.images import open_images
 from neuspring.data.intake.lenses import Straightener
+from neuspring.data.intake.look import Seen
 from neuspring.data.intake.plane import Plane, cloud, planes
-from neuspring.data.intake.views import Lens
 from neuspring.data.intake.world import center_of, common_plane, find_table, levelling, pose_on
 from neuspring.data.plausible.table import table_departures
 
 RATIO = 0.04
 """Depth may differ by this part from the distance of the board by its printed size."""
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a camera saw in a few frames."""
-
-    path: Path
-    size: tuple[int, int]
-    """(width, height)."""
-    lens: Lens
-    colors: list[np.ndarray]
-    """[H, W, 3] uint8 RGB, without distortion."""
-    depths: list[np.ndarray]
-    """[H, W], m, without distortion."""
-    unit: float | None
-    """m per count of its images; None where they are floating point."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,17 +65,21 @@ def by_board(board: Board, seen: Mapping[str, Seen], images: Sequence[Path]) -> 
     return poses, lines
 
 
-def stand(poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], *, level: bool, up: str | None = None) -> Placed:
+def stand(
+    poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], *, level: bool, top_down: bool = False, up: str | None = None
+) -> Placed:
     """Given poses against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
-    `up` is that of the source; None: the side on which the cameras are. Raises InputError where the table is elsewhere, with what
-    explains it; see `plausible.table`.
+    `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
+    the table is elsewhere, with what explains it; see `plausible.table`.
     """
     clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
     moved, motion, lines, tables = dict(poses), np.eye(4), list[str](), dict[str, Plane]()
     for name, view in seen.items():
         try:
-            tables[name] = find_table(view.path, clouds[name], pose=poses[name]).plane
+            # A world that is to be moved may have any axes: up is then that of the image.
+            upright = None if level else poses[name]
+            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down).plane
             lines.append(f"table, camera {name}: {tables[name].text()}")
         except InputError as error:
             if level:
@@ -99,7 +87,7 @@ def stand(poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], *, level: b
             lines.append(f"warning: {error}")
     if level:
         normal, point, rms = common_plane(tables, poses)
-        up = up or ("+z" if normal[2] >= 0 else "-z")
+        up = up or "+z"
         motion = levelling(normal, point, 1.0 if up == "+z" else -1.0)
         moved = {name: motion @ pose for name, pose in poses.items()}
         turn = float(np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))))

@@ -6,8 +6,9 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.intake.charuco import Board, depth_ratio, sight
-from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses, require_lens, rigid_inverse
+from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses, require_lens
 from neuspring.data.intake.views import Lens
+from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.desk import camera, looking, write_json, write_poses
 
 PLAIN = {"fx": 70, "fy": 71, "cx": 39.5, "cy": 29.5}
@@ -106,22 +107,6 @@ def test_poses_that_cannot_be(tmp_path, content, message):
     assert message in str(caught.value)
 
 
-BOARD = "5x7:0.04:0.03:DICT_5X5_100"
-LENS = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])
-
-
-def board_image(pose, text=BOARD):
-    """What a camera sees of a board that lies on z = 0, its corner at the origin, its rows along x, its columns along minus y."""
-    board = Board.of(text)
-    print_ = board.opencv().generateImage((board.across * 100, board.down * 100))
-    scale = board.square / 100
-    # The print's pixel (0, 0) is the middle of a pixel, half of one inside the corner.
-    to_world = np.array([[scale, 0, scale / 2], [0, -scale, -scale / 2], [0, 0, 1]])
-    homography = LENS @ rigid_inverse(pose)[:3][:, [0, 1, 3]] @ to_world
-    view = cv2.warpPerspective(print_, homography, (640, 480), borderValue=200, flags=cv2.INTER_AREA)
-    return np.repeat(cv2.GaussianBlur(view, (3, 3), 0)[..., None], 3, axis=2)
-
-
 def test_a_board_gives_the_pose():
     pose = looking(np.array([0.1, -0.5, 0.5]), np.array([0.1, -0.14, 0]))
     sighting = sight("image", Board.of(BOARD), [board_image(pose)], LENS)
@@ -129,11 +114,7 @@ def test_a_board_gives_the_pose():
     np.testing.assert_allclose(sighting.camera_to_world[:3, 3], pose[:3, 3], atol=2e-3)
     np.testing.assert_allclose(sighting.camera_to_world[:3, :3], pose[:3, :3], atol=4e-3)
     assert sighting.corners >= 20 and sighting.error < 0.5
-    eye, rays = (
-        pose[:3, 3],
-        np.stack([*np.mgrid[:480, :640][::-1], np.ones((480, 640))], axis=-1) @ np.linalg.inv(LENS).T @ pose[:3, :3].T,
-    )
-    depth = -eye[2] / rays[..., 2]
+    depth = depth_of_table(pose)
     assert depth_ratio(sighting, depth) == pytest.approx(1.0, abs=0.01)
     assert depth_ratio(sighting, 10 * depth) == pytest.approx(10.0, abs=0.1)
     assert depth_ratio(sighting, 0 * depth) is None

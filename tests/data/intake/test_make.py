@@ -12,10 +12,12 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
+from neuspring.data.intake.charuco import Board
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.intake.store import RECIPE
 from neuspring.data.intake.views import pairs
 from tests.support import realsense
+from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.departures import serious
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
 
@@ -215,27 +217,40 @@ def test_without_pyrealsense2_the_command_names_it(tmp_path, monkeypatch, capsys
     assert "Run `pip install pyrealsense2`" in capsys.readouterr().err
 
 
-def test_a_capture_by_a_board_in_the_frames(tmp_path, monkeypatch):
-    """Detection itself is tested beside `charuco`; here: its poses become the world, and its size is held against depth."""
-    from neuspring.data.intake.charuco import Board, Sighting
+BOARD_POSES = [looking(np.array(eye), np.array([0.1, -0.14, 0])) for eye in ((0.1, -0.55, 0.45), (0.5, -0.1, 0.5))]
 
-    root = write_folders(tmp_path, cameras=2)
-    pixels = np.array([[10 + 5 * k, 35 + k] for k in range(8)], dtype=float)
-    board, scale = Board.of("5x7:0.04:0.03:DICT_5X5_100"), 1.0
 
-    def sight(where, _, images, intrinsics):
-        index = int(str(where)[-1])
-        pose, depth = camera(index).camera_to_world, seen(camera(index), noise=0.0)[1]
-        at = pixels.astype(int)
-        return Sighting(pose, len(pixels), 0.2, pixels, depth[at[:, 1], at[:, 0]] / scale)
+def board_folders(root, unit=0.001):
+    """Two cameras that see a board in the first of their frames, and a bare table later."""
+    for index, pose in enumerate(BOARD_POSES):
+        for frame in range(7):
+            color = board_image(pose) if frame < 2 else np.full((480, 640, 3), 128, np.uint8)
+            for kind, image in (("color", color), ("depth", counts(depth_of_table(pose), unit))):
+                (root / f"{kind}_{index}").mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(root / f"{kind}_{index}" / f"{frame}.png"), image)
+    write_json(root / "intrinsics.json", {"K": LENS.tolist()})
+    return root
 
-    monkeypatch.setattr("neuspring.data.intake.poses.sight", sight)
-    capture, report = make_capture(intake(root, 2, board=board))
-    np.testing.assert_allclose(capture.cameras["1"].camera_to_world, camera(1).camera_to_world)
-    assert any("board, camera 1: 8 corners, 0.20 pixels rms, depth 1.0" in line or "depth 0.99" in line for line in report)
-    scale = 1.25
-    with pytest.raises(InputError, match=r"depth must place the board where its size does.*the square is 1.25 times as long"):
-        make_capture(intake(root, 2, board=board, folder=tmp_path / "second"))
+
+def test_a_board_in_the_first_frames_or_in_images_gives_the_poses(tmp_path):
+    root, board = board_folders(tmp_path), Board.of(BOARD)
+    images = [root / f"color_{index}" / "0.png" for index in range(2)]
+    for name, pictures, frames in (("frames", (), "2-6"), ("images", images, "")):
+        capture, report = make_capture(intake(root, 2, folder=tmp_path / name, board=board, board_images=pictures, frames=frames))
+        for view, pose in zip(capture.cameras.values(), BOARD_POSES, strict=True):
+            np.testing.assert_allclose(view.camera_to_world, pose, atol=4e-3)
+        assert sum("corners, 0." in line and "pixels rms" in line for line in report) == 2
+        assert any("of its distance" in line for line in report) == (name == "frames")
+        assert capture.description.up == "+z"
+
+
+def test_a_board_of_another_size_contradicts_depth(tmp_path):
+    root = board_folders(tmp_path)
+    board = Board.of(BOARD.replace("0.04:0.03", "0.032:0.024"))
+    with pytest.raises(InputError, match=r"depth must place the board where its size does.*the square is 1\.25 times as long"):
+        make_capture(intake(root, 2, board=board))
+    with pytest.raises(InputError, match="the board of --board-images must be described"):
+        make_capture(intake(root, 2, board_images=[root, root]))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The commands of the page's section run as they stand, on a film written out as plain folders; so does the recipe for ROS, as code."""
+"""The commands of the page's section run as they stand, on a film written out as plain folders; the recipe for ROS is code."""
 
 import ast
 import re
