@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
@@ -15,16 +14,13 @@ from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, description_
 from neuspring.data.departure import Departure, Inspection, broken, note, unusual
 from neuspring.data.intake.plane import cloud, planes
 from neuspring.data.intake.units import FAR, FASTEST, NEAR, SLOWEST
+from neuspring.data.plausible.pieces import objects
 from neuspring.data.plausible.table import table_departures
 from neuspring.data.plausible.things import Sample, at_border, thing_departures
 from neuspring.data.plausible.views import view_departures
 
 SAMPLED = 5
 """Frames per camera, evenly spaced, that are compared with the world."""
-APART = 0.1
-"""Distance between two pieces of one label, as a fraction of the image, from which they count as two objects."""
-SECOND = 0.3
-"""A piece with at least this fraction of the largest piece's area counts as an object."""
 LEAVES = 0.1
 """Fraction of its area in frame 0 below which an object has left the view."""
 LEAST_AROUND = 0.1
@@ -144,13 +140,3 @@ def mask_departures(capture: Capture, name: str, areas: np.ndarray) -> list[Depa
             rule = f"camera {name} should show the object throughout"
             departures.append(unusual(path, "", rule, f"almost nothing of it in {len(gone)} frames, first in frame {gone[0]}"))
     return departures
-
-
-def objects(labels: np.ndarray) -> int:
-    """Number of objects with label 1: pieces of the mask that stay apart when it is grown by half of APART."""
-    own = (labels == OBJECT).astype(np.uint8)
-    reach = max(int(0.5 * APART * max(labels.shape)), 1)
-    grown = cv2.dilate(own, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2))
-    count, pieces = cv2.connectedComponents(grown)
-    sizes = np.array([(own[pieces == k] > 0).sum() for k in range(1, count)])
-    return int((sizes >= SECOND * sizes.max()).sum()) if len(sizes) else 0

@@ -125,6 +125,8 @@ def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed
     given = {view.name: view.pose for view in intake.views if view.pose is not None}
     if intake.poses is not None and intake.board is not None:
         raise InputError("--poses, --board", "one of the two is required", "both")
+    if intake.table_at is not None and (len(names) > 1 or intake.poses or intake.board or given):
+        raise InputError("--table-at", "is for one camera without poses: others have their world", f"{len(names)} cameras")
     if intake.board_images and intake.board is None:
         raise InputError("--board", "the board of --board-images must be described", "none")
     if intake.poses is not None:

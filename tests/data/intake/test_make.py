@@ -251,6 +251,8 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
         make_capture(intake(root, 2, board=board))
     with pytest.raises(InputError, match="the board of --board-images must be described"):
         make_capture(intake(root, 2, board_images=[root, root]))
+    with pytest.raises(InputError, match="--table-at: is for one camera without poses"):
+        make_capture(intake(root, 2, board=board, table_at=(3, 4)))
 
 
 @pytest.mark.parametrize(
