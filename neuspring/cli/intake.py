@@ -35,7 +35,7 @@ def make_capture_options(parser: ArgumentParser) -> None:
     world.add_argument("--poses", type=Path, metavar="JSON", help="camera_to_world or world_to_camera matrices")
     form = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
     world.add_argument("--board", metavar=form, help="a ChArUco board that every camera sees, like 5x7:0.04:0.03:DICT_5X5_100")
-    board_help = "per camera: an image of the board, or a folder of them (default: the frames)"
+    board_help = "per camera: an image of the board, or a folder of them (default: the first frames)"
     world.add_argument("--board-images", type=Path, nargs="+", default=[], metavar="PATH", help=board_help)
     world.add_argument("--level", action="store_true", help="move the world of given poses so that the table is z = 0")
     world.add_argument("--top-down", action="store_true", help="the camera looks straight down: the plane it faces is the table")

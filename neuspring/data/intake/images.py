@@ -21,6 +21,8 @@ PICTURES = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png"
 VIDEOS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
 DEEP = ("gray16le", "gray16be")
 """Pixel formats of a video that holds depth. Those of 10 and 12 bits would be scaled when they are read."""
+GAP = 1.5
+"""Pictures this many times farther apart than usual have others missing between them."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
 
@@ -149,14 +151,14 @@ class Film:
 
     @property
     def rate(self) -> float | None:
-        """The middle distance of pictures decides: a few that were dropped do not count."""
-        times = self._times
-        return float(1 / np.median(np.diff([float(time) for time in times]))) if len(times) > 1 else None
+        """The mean distance of pictures decides, as time stamps may be whole milliseconds; gaps of dropped ones do not count."""
+        steps = np.diff([float(time) for time in self._times])
+        return float(1 / steps[steps <= GAP * np.median(steps)].mean()) if len(steps) else None
 
     def dropped(self) -> int:
-        """Pictures that are missing in between: gaps of more than one and a half distances."""
+        """Pictures that are missing in between."""
         steps = np.diff([float(time) for time in self._times])
-        return int(np.round(steps[steps > 1.5 * np.median(steps)] / np.median(steps) - 1).sum()) if len(steps) else 0
+        return int(np.round(steps[steps > GAP * np.median(steps)] / np.median(steps) - 1).sum()) if len(steps) else 0
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """See `Images`. The video is decoded from its beginning. Raises InputError where it ends early."""

@@ -76,8 +76,7 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
         raise InputError("--rate", "the frames per second of the camera are required: folders do not have them", "none")
     if given is None and max(told) > 1.02 * min(told):
         raise InputError("--rate", "all cameras must film at one rate", " and ".join(f"{rate:.3g}" for rate in told))
-    # What time stamps in milliseconds leave open is rounded away.
-    rate = given if given is not None else float(f"{told[0]:.3g}") if abs(told[0] - round(told[0], 1)) < 0.01 * told[0] else told[0]
+    rate = given if given is not None else round(told[0], 2)
     if not (np.isfinite(rate) and SLOWEST <= rate <= FASTEST):
         rule = f"frames per second of a depth camera lie between {SLOWEST:g} and {FASTEST:g}"
         raise InputError("--rate", rule, f"{rate:g}", "Give the rate at which it was filmed, not a time step.")

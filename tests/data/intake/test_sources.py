@@ -60,6 +60,7 @@ def test_a_depth_video_keeps_every_count(tmp_path):
     for found, depth in zip(film.read([1, 3]), [depths[1], depths[3]], strict=True):
         np.testing.assert_array_equal(found, depth)
     assert film.rate == pytest.approx(15, rel=0.01)
+    assert film.dropped() == 0
 
 
 @pytest.mark.parametrize(
@@ -72,6 +73,15 @@ def test_a_depth_video_that_loses_depth_is_refused(tmp_path, codec, stored, mess
     with pytest.raises(InputError, match="a depth video must be") as caught:
         list(Film(path, "depth").numbers)
     assert message in str(caught.value)
+
+
+def test_a_video_in_whole_milliseconds_knows_its_rate(tmp_path):
+    frames = [np.full((16, 16, 3), 8 * k, np.uint8) for k in range(31)]
+    film = Film(write_video(tmp_path / "color.mkv", frames, "mpeg4", "yuv420p", rate=30), "color")
+    assert film.rate == pytest.approx(30, rel=1e-3)
+    assert len(film.numbers) == 31 and film.dropped() == 0
+    dark, light = film.read([2, 30])
+    assert dark.mean() < light.mean() - 100
 
 
 def test_a_damaged_video_is_refused(tmp_path):
