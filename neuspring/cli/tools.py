@@ -3,6 +3,7 @@
 TOOLS = {
     "draw": ("neuspring.stages.draw", "splats and trajectory -> RGBA pictures of any camera"),
     "fetch": ("neuspring.cli.data", "released archives -> the folders that the readers expect"),
+    "make-capture": ("neuspring.cli.intake", "color and depth of a camera -> a capture folder"),
     "check-data": ("neuspring.cli.data", "report how a data folder departs from the expected layout"),
     "verify-released": ("neuspring.cli.data", "PhysTwin's released results, checked against ours"),
     "tables": ("neuspring.cli.results", "run records -> tables"),

@@ -1,24 +1,30 @@
-"""Departures of a capture folder from its format, image by image, and conditions under which perception would fail."""
+"""Departures of a capture folder from its format, image by image, and from what a scene on a table looks like.
+
+What cannot work is an error, what is only unusual a warning with the next move; see `plausible`.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, description_departures, read_description
 from neuspring.data.departure import Departure, Inspection, broken, note, unusual
+from neuspring.data.intake.plane import cloud, planes
+from neuspring.data.intake.units import FAR, FASTEST, NEAR, SLOWEST
+from neuspring.data.plausible.pieces import objects
+from neuspring.data.plausible.table import table_departures
+from neuspring.data.plausible.things import Sample, at_border, thing_departures
+from neuspring.data.plausible.views import view_departures
 
-NEAR, FAR = 0.1, 10.0
-"""m. A median depth outside this range means that the unit is wrong."""
-APART = 0.1
-"""Distance between two pieces of one label, as a fraction of the image, from which they count as two objects."""
-SECOND = 0.3
-"""A piece with at least this fraction of the largest piece's area counts as an object."""
+SAMPLED = 5
+"""Frames per camera, evenly spaced, that are compared with the world."""
 LEAVES = 0.1
 """Fraction of its area in frame 0 below which an object has left the view."""
+LEAST_AROUND = 0.1
+"""Share of the image that must have depth, beside object and hands, before the table is looked for."""
 
 
 def is_capture(folder: Path) -> bool:
@@ -33,9 +39,13 @@ def check_capture(folder: Path) -> list[Departure]:
     if description is None:
         return case.departures
     case.departures += description_departures(path, description)
+    case.departures += rate_departures(path, description.frame_rate)
     capture = Capture(folder, description)
-    for name in capture.cameras:
-        _check_camera(case, capture, name)
+    calibrated = not any(d.level == "error" for d in case.departures)
+    samples = {name: _check_camera(case, capture, name, calibrated) for name in capture.cameras}
+    if calibrated and len(samples) > 1:
+        first = {name: found[0].depth for name, found in samples.items() if 0 in found}
+        case.departures += view_departures(path, capture.cameras, first, description.up)
     case.load(folder / "tracks.json", lambda _: capture.tracks())
     if not description.masks:
         message = "masks: false: masks are not checked; perception.segment needs another backend than given"
@@ -43,8 +53,20 @@ def check_capture(folder: Path) -> list[Departure]:
     return case.departures
 
 
-def _check_camera(case: Inspection, capture: Capture, name: str) -> None:
+def rate_departures(path: Path, rate: float) -> list[Departure]:
+    """A departure of a frame rate that no depth camera has. Speeds and forces of the twin scale with it."""
+    if SLOWEST <= rate <= FASTEST:
+        return []
+    rule = f"frames per second at which it was filmed are required, {SLOWEST:g} to {FASTEST:g}"
+    return [broken(path, "frame_rate", rule, f"{rate:g}")]
+
+
+def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: bool) -> dict[int, Sample]:
+    """Check every image of a camera, and a few frames against the world; returns these."""
     depths, areas = [], np.zeros((3, capture.frame_count))
+    touching = np.full(capture.frame_count, np.nan)
+    samples: dict[int, Sample] = {}
+    sampled = set(np.linspace(0, capture.frame_count - 1, SAMPLED).astype(int).tolist())
     for frame in range(capture.frame_count):
         if not capture.has(name, frame):
             areas[:, frame] = np.nan
@@ -53,13 +75,37 @@ def _check_camera(case: Inspection, capture: Capture, name: str) -> None:
             capture.colour(name, frame)
             depth = capture.depth(name, frame)
             depths.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)
+            mask = np.zeros(depth.shape, np.uint8)
             if capture.description.masks:
-                areas[:, frame] = np.bincount(capture.mask(name, frame).ravel(), minlength=3)[:3]
+                mask = capture.mask(name, frame)
+                areas[:, frame] = np.bincount(mask.ravel(), minlength=3)[:3]
+                touching[frame] = at_border(mask)
+            if frame in sampled:
+                samples[frame] = Sample(depth, mask)
         except InputError as error:
             case.departures.append(Departure.of_error(error))
-    case.departures += depth_departures(capture, name, depths)
+    wrong = depth_departures(capture, name, depths)
+    case.departures += wrong
+    if calibrated and not wrong:
+        case.departures += _world_departures(capture, name, samples, touching)
     if capture.description.masks:
         case.departures += mask_departures(capture, name, areas)
+    return samples
+
+
+def _world_departures(capture: Capture, name: str, samples: dict[int, Sample], touching: np.ndarray) -> list[Departure]:
+    """The table, and object and hands in the masks, of one camera."""
+    path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
+    is_counted = capture.description.depth_format == "png"
+    unit = capture.description.depth_unit if is_counted else None
+    # Object and hands are no table; what is left must be enough of the image to tell one.
+    around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
+    enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
+    found = planes(cloud(around, camera.intrinsics)) if enough else []
+    departures = table_departures(path, name, found, camera.camera_to_world, up, unit)
+    if capture.description.masks:
+        departures += thing_departures(path, camera, samples, up, touching)
+    return departures
 
 
 def depth_departures(capture: Capture, name: str, medians: list[float]) -> list[Departure]:
@@ -94,13 +140,3 @@ def mask_departures(capture: Capture, name: str, areas: np.ndarray) -> list[Depa
             rule = f"camera {name} should show the object throughout"
             departures.append(unusual(path, "", rule, f"almost nothing of it in {len(gone)} frames, first in frame {gone[0]}"))
     return departures
-
-
-def objects(labels: np.ndarray) -> int:
-    """Number of objects with label 1: pieces of the mask that stay apart when it is grown by half of APART."""
-    own = (labels == OBJECT).astype(np.uint8)
-    reach = max(int(0.5 * APART * max(labels.shape)), 1)
-    grown = cv2.dilate(own, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2))
-    count, pieces = cv2.connectedComponents(grown)
-    sizes = np.array([(own[pieces == k] > 0).sum() for k in range(1, count)])
-    return int((sizes >= SECOND * sizes.max()).sum()) if len(sizes) else 0

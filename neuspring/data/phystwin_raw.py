@@ -53,20 +53,20 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         depth_unit=0.001,
         depth_format="npy",
         up="-z",
-        train_end=_train_end(case, frames),
+        train_end=train_end_of(case, frames),
         masks=has_masks,
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (phystwin.METADATA, CALIBRATION)},
     )
     writer = Writer(folder, description)
     capture = writer.capture
     for name, camera in capture.cameras.items():
-        ids = _detections(case, name) if has_masks else {}
+        ids = detections(case, name) if has_masks else {}
         for frame in range(frames):
             _link(case / "color" / name / f"{frame}.png", capture.path("color", name, frame))
             _link(case / "depth" / name / f"{frame}.npy", capture.path("depth", name, frame))
             if has_masks:
-                writer.mask(name, frame, _labels(case, camera, frame, ids))
-    return writer.finish(_tracks(case, frames))
+                writer.mask(name, frame, labels_of(case, camera, frame, ids))
+    return writer.finish(annotated(case, frames))
 
 
 def camera_count(case: Path) -> int:
@@ -102,7 +102,7 @@ def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera
     ]
 
 
-def _detections(case: Path, camera: str) -> dict[int, list[str]]:
+def detections(case: Path, camera: str) -> dict[int, list[str]]:
     """Label -> ids of its detections. Exactly one detection is not a hand."""
     path = case / "mask" / f"mask_info_{camera}.json"
     info = load_json(path)
@@ -115,7 +115,8 @@ def _detections(case: Path, camera: str) -> dict[int, list[str]]:
     return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
 
 
-def _labels(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
+def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
+    """Mask [H, W] uint8 of one frame, put together from the images of its detections. Raises InputError."""
     labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
     for label, names in sorted(ids.items()):
         for name in names:
@@ -124,7 +125,8 @@ def _labels(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -
     return labels
 
 
-def _tracks(case: Path, frames: int) -> np.ndarray | None:
+def annotated(case: Path, frames: int) -> np.ndarray | None:
+    """Annotated tracks [T, K, 3], m, if there are any. Raises InputError."""
     path = case / phystwin.TRACKS
     if not path.exists():
         return None
@@ -133,7 +135,8 @@ def _tracks(case: Path, frames: int) -> np.ndarray | None:
     return np.asarray(tracks, dtype=float)
 
 
-def _train_end(case: Path, frames: int) -> int | None:
+def train_end_of(case: Path, frames: int) -> int | None:
+    """Training frames are [0, this), if split.json says so. Raises InputError."""
     path = case / phystwin.SPLIT
     if not path.exists():
         return None

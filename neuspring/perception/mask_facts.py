@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.check_capture import objects
+from neuspring.data.plausible.pieces import objects
 
 
 def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:

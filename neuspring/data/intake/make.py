@@ -1,0 +1,209 @@
+"""From what cameras gave to a capture folder."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from neuspring.config import parse
+from neuspring.core.errors import InputError
+from neuspring.core.progress import Progress
+from neuspring.core.records import digest_file
+from neuspring.data.capture import Camera, Capture, Description, Writer, description_departures
+from neuspring.data.departure import refuse
+from neuspring.data.intake.charuco import Board
+from neuspring.data.intake.choice import Choice, choose
+from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses
+from neuspring.data.intake.look import Seen, look, meters_of, plain, require_aligned, stored_as, straightened
+from neuspring.data.intake.poses import Placed, by_board, by_table, stand
+from neuspring.data.intake.raw import Raw
+from neuspring.data.intake.store import close, prepare, written
+from neuspring.data.intake.units import Unit, find_rate
+from neuspring.data.intake.views import View
+
+NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
+FIRST = 5
+"""Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Intake:
+    """What a capture is made of."""
+
+    folder: Path
+    """Where it is written."""
+    name: str
+    category: str
+    """Kind of object: cloth, rope, package, ..."""
+    views: Sequence[View]
+    """One per camera: `views.pairs`, `bag.Bag`, `raw.Raw.views`."""
+    rate: float | None = None
+    """Frames per second at which it was filmed; None: that of the video."""
+    frames: str = ""
+    """Which are kept, see `choice.chosen`; all by default."""
+    depth_unit: float | None = None
+    """m per count; None: that of the source, or guessed."""
+    intrinsics: Path | None = None
+    """JSON, see `lenses`; None: those of the source."""
+    poses: Path | None = None
+    """JSON, see `lenses`."""
+    board: Board | None = None
+    board_images: Sequence[Path] = ()
+    """An image or a folder of them per camera; none: the frames themselves show the board."""
+    level: bool = False
+    """Move the world of given poses so that the table is z = 0."""
+    top_down: bool = False
+    """The plane that faces the camera is the table."""
+    table_at: tuple[float, float] | None = None
+    """A pixel (x, y) of the table, with one camera."""
+    train_end: int | None = None
+    """Training frames are [0, train_end); None: the first 70 %."""
+    raw: Raw | None = None
+    """PhysTwin's case of which the views are: its masks, tracks and split come along."""
+    force: bool = False
+    """Replace the images of a capture that is there."""
+
+
+def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
+    """Write the capture; returns it with a report of what was found.
+
+    All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
+    or file, the rule, what was received and the next move.
+    """
+    for option, name in (("--name", intake.name), *(("--cameras", view.name) for view in intake.views)):
+        if not NAMES.fullmatch(name):
+            raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
+    choice = choose(intake.views, intake.frames)
+    rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
+    names = [view.name for view in intake.views]
+    listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
+    seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
+    placed, how = _place(intake, seen, unit)
+    used = {name: [choice.places[name][f] for f in sorted(choice.places[name])] for name in seen}
+    files = {view.name: view.files(used[view.name]) for view in intake.views}
+    description = _describe(intake, choice, rate, unit, seen, placed) | {
+        "provenance": {
+            "source": "make-capture",
+            "files": _digest([file for listed in files.values() for file in listed]),
+            "frames": choice.text(),
+            "depth unit": unit.text(),
+            "poses": how,
+            "table": placed.table,
+            **{
+                option: f"sha256:{digest_file(path)}"
+                for option, path in (("intrinsics", intake.intrinsics), ("poses file", intake.poses))
+                if path is not None
+            },
+        }
+    }
+    made = parse(Description, description, "make-capture")
+    refuse(description_departures(Path("make-capture"), made))
+    _write(intake, made, choice, unit, seen, placed)
+    jumps = [f"warning: time jumps at {choice.jumps} places, where frame numbers are left out"] if choice.jumps else []
+    remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]
+    sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
+    lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {unit.text()}", f"poses: {how}, up {placed.up}"]
+    training = made.train_end or int(0.7 * made.frame_count)
+    lines += [
+        *placed.lines,
+        *jumps,
+        *remarks,
+        f"training frames: 0 to {training - 1}; future frames: {training} to {made.frame_count - 1}",
+    ]
+    return Capture.load(intake.folder), lines
+
+
+def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed, str]:
+    """Poses of all cameras, and where they come from. Raises InputError."""
+    names, level, top_down = list(seen), intake.level, intake.top_down
+    given = {view.name: view.pose for view in intake.views if view.pose is not None}
+    if intake.poses is not None and intake.board is not None:
+        raise InputError("--poses, --board", "one of the two is required", "both")
+    if intake.table_at is not None and (len(names) > 1 or intake.poses or intake.board or given):
+        raise InputError("--table-at", "is for one camera without poses: others have their world", f"{len(names)} cameras")
+    if intake.board_images and intake.board is None:
+        raise InputError("--board", "the board of --board-images must be described", "none")
+    if intake.poses is not None:
+        return stand(read_poses(intake.poses, names), seen, level=level, top_down=top_down), f"of {intake.poses.name}"
+    if intake.board is not None:
+        shown = dict(seen)
+        if not intake.board_images:
+            for view in intake.views:
+                pairs = list(view.read(range(min(FIRST, len(view.numbers)))))
+                shown[view.name] = straightened(view, pairs, seen[view.name].lens, unit)
+        poses, lines = by_board(intake.board, shown, intake.board_images)
+        placed = stand(poses, seen, level=level, top_down=top_down, up="+z")
+        return replace(placed, lines=(*lines, *placed.lines)), f"by a ChArUco board of {intake.board}"
+    if len(given) == len(names):
+        return stand(given, seen, level=level, top_down=top_down, up="-z" if intake.raw else None), "of the source"
+    if len(names) > 1:
+        remedy = "Give --poses FILE, or --board with an image of a ChArUco board for each camera."
+        raise InputError("--poses", f"the poses of {len(names)} cameras are required", "none", remedy)
+    return by_table(names[0], seen[names[0]], top_down=top_down, at=intake.table_at), "by the table's plane"
+
+
+def _describe(intake: Intake, choice: Choice, rate: float, unit: Unit, seen: Mapping[str, Seen], placed: Placed) -> dict[str, Any]:
+    """The entries of capture.json."""
+    entries = []
+    for name, view in seen.items():
+        entry = Camera(name, *view.size, view.lens.matrix, placed.poses[name]).entry()
+        entries.append(TypeAdapter(type(entry)).dump_python(replace(entry, missing=choice.missing(name))))
+    is_counted = next(iter(seen.values())).unit is not None
+    whole = intake.raw is not None and not intake.frames
+    return {
+        "format": 1,
+        "name": intake.name,
+        "category": intake.category,
+        "frame_count": len(choice.numbers),
+        "frame_rate": rate,
+        "cameras": tuple(entries),
+        "depth_unit": unit.meters if is_counted else 0.001,
+        "depth_format": "png" if is_counted else "npy",
+        "up": placed.up,
+        "train_end": intake.train_end if intake.train_end is not None else intake.raw.train_end if intake.raw and whole else None,
+        "masks": bool(intake.raw and intake.raw.ids),
+    }
+
+
+def _write(intake: Intake, made: Description, choice: Choice, unit: Unit, seen: Mapping[str, Seen], placed: Placed) -> None:
+    recipe = TypeAdapter(Description).dump_python(made, mode="json")
+    recipe["distortion"] = {name: view.lens.distortion.tolist() for name, view in seen.items()}
+    begun = prepare(intake.folder, recipe, intake.force)
+    writer, done = Writer(intake.folder, made), 0
+    total = sum(len(places) for places in choice.places.values())
+    progress = Progress(f"make-capture {intake.name}", total)
+    for view in intake.views:
+        straight, size = Straightener(seen[view.name].lens, seen[view.name].size), seen[view.name].size
+        frames = sorted(choice.places[view.name])
+        kept = written(writer, view.name, frames) if begun else set()
+        left = [frame for frame in frames if frame not in kept]
+        done += len(kept)
+        for frame, (color, depth) in zip(left, view.read([choice.places[view.name][f] for f in left]), strict=True):
+            require_aligned(view.path, view.name, color, depth, size)
+            kind = stored_as(depth)
+            if kind != made.depth_format:
+                raise InputError(view.path, f"depth of camera {view.name} must be of one kind", f"another in frame {frame}")
+            stored = straight.depth(plain(depth))
+            mask = intake.raw.labels(view.name, choice.numbers[frame]) if intake.raw and intake.raw.ids else None
+            writer.frame(view.name, frame, straight.color(color), stored if kind == "png" else meters_of(stored, unit), mask)
+            done += 1
+            progress.update(done)
+    tracks = None
+    if intake.raw is not None and intake.raw.tracks is not None:
+        tracks = intake.raw.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
+    writer.finish(tracks)
+    close(intake.folder)
+
+
+def _digest(files: Sequence[Path]) -> str:
+    """SHA-256 over names and contents."""
+    digest = hashlib.sha256()
+    for path in dict.fromkeys(files):
+        digest.update(f"{path.name} {digest_file(path)}\n".encode())
+    return f"sha256:{digest.hexdigest()}"

@@ -1,0 +1,11 @@
+"""Recordings that are not part of the repository. Tests on them skip where they are absent."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+FOLDER = Path(os.environ.get("NEUSPRING_TEST_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
+"""Where they are looked for: beside the repository, or where the environment says."""
+PLUSH = FOLDER / "rgbd_plush"
+"""Color and depth of a plush animal on a cluttered table, one camera, 320 x 240, frames 160 to 349."""
