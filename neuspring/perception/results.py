@@ -59,6 +59,9 @@ class ShapePrior(_Result):
     kind: ClassVar[str] = "shape_prior"
     vertices: np.ndarray = array("V,3", np.float32, "m", "world")
     faces: np.ndarray = array("F,3", np.int32, "1", "outward")
+    seen: np.ndarray = array(
+        "W", np.bool_, "1", "whether some camera saw each vertex; the rest is invented; empty: unknown", optional=True
+    )
 
 
 def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:
