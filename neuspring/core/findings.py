@@ -1,4 +1,4 @@
-"""What a step noticed about its own result: implausible, but no reason to stop. Kept in the record, printed, shown in the report."""
+"""What a step noticed about its own result: implausible, but no reason to stop. It is kept in the record, printed, and reported."""
 
 from __future__ import annotations
 

@@ -65,8 +65,8 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
             if frame == 0 and prior is not None and len(prior.vertices):
                 for part, color, label in _parts(prior):
                     axis.plot(part[:, across], part[:, up], ",", color=color, zorder=0)
-                    axis.plot([], [], "s", color=color, label=label)
-                axis.legend(fontsize=7, loc="upper right", framealpha=0.9)
+                    if name == "side":
+                        axis.plot([], [], "s", color=color, label=label)
             points = lifted.object_points[frame, seen]
             axis.scatter(points[:, across], points[:, up], s=2, c=lifted.object_colours[seen], linewidths=0)
             hands = lifted.controller_points[frame]
@@ -75,6 +75,8 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
             axis.set_aspect("equal")
             axis.set_xlabel("x [m]")
             axis.set_ylabel("z [m]" if up == 2 else "y [m]")
+    if prior is not None and len(prior.vertices):
+        figure.legend(fontsize=8, loc="outside lower center", ncols=2)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
     plt.close(figure)
     return path

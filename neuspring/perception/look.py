@@ -1,10 +1,11 @@
 """What masks and tracks of one camera say about themselves: findings after segmentation and tracking.
 
-Limits were chosen so that the synthetic scenes pass, whose perception is known to be good; each is the least that a person would stop
-at.
+Limits were chosen so that the synthetic scenes pass, whose perception is known to be good.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray) -> list[Fin
     if ratio > HAND_AREA:
         value, rule = f"the hands are {ratio:.1f} times as large as the object", f"at most {HAND_AREA:g} times is expected"
         warn("hand larger than the object", value, rule, f"Are sleeves or parts of the object taken for hands? {remedy}")
-    pairs = [(a, b) for a, b in zip(shown, shown[1:], strict=False) if b == a + 1]
+    pairs = [(a, b) for a, b in pairwise(shown) if b == a + 1]
     jumps = [(b, max(area[a], area[b]) / min(area[a], area[b])) for a, b in pairs]
     if wild := [(frame, ratio) for frame, ratio in jumps if ratio > JUMP]:
         frame, ratio = wild[0]

@@ -70,16 +70,10 @@ def _object(lifted: LiftedTracks, up: float) -> list[Finding]:
     where, found = "object in frame 0", []
     heights, size = up * lifted.cloud[:, 2], np.ptp(np.quantile(lifted.cloud, (0.01, 0.99), axis=0), axis=0)
     lowest, highest = np.quantile(heights, (0.01, 0.99))
-    found.append(
-        finding(
-            "size of the object",
-            "note",
-            where,
-            f"{' x '.join(f'{100 * side:.0f}' for side in size)} cm, from {100 * lowest:.1f} to {100 * highest:.1f} cm above the table",
-            "as its tracked pixels show it",
-            "Is that what was filmed?",
-        )
-    )
+    sides = " x ".join(f"{100 * side:.0f}" for side in size)
+    value = f"{sides} cm, from {100 * lowest:.1f} to {100 * highest:.1f} cm above the table"
+    rule = "as its pixels with depth show it"
+    found.append(finding("size of the object", "note", where, value, rule, "Is that what was filmed?"))
     if not SIZE[0] <= size.max() <= SIZE[1]:
         rule = f"{100 * SIZE[0]:g} to {100 * SIZE[1]:g} cm are expected"
         remedy = f"Masks may show more or less than the object. {TABLE}"
@@ -130,7 +124,8 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
         return [finding("hand far from the object", "error", where, value, rule, remedy)]
     holding, count = int((apart[0] <= GRIP).sum()), apart.shape[1]
     if not holding:
-        value = f"in frame 0 none of {count} has a point of the object within {100 * GRIP:g} cm; the nearest is {100 * nearest[0]:.0f} cm away"
+        near = f"{100 * GRIP:g} cm; the nearest is {100 * nearest[0]:.0f} cm away"
+        value = f"in frame 0 none of {count} has a point of the object within {near}"
         rule = "springs of hands are made in frame 0, and would span the air"
         found.append(finding("controllers hold nothing", "warning", where, value, rule, "Begin the capture at the grip."))
     elif 2 * holding < count:

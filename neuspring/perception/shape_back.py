@@ -1,11 +1,11 @@
 """Where one camera alone shows the object: its seen surface without holes, and a stated guess of where its back is.
 
-Depths are along the optical axis, m, over the pixels of the object's mask. The local width of a silhouette at a pixel is the diameter
-2 r of the largest disc inside it that covers the pixel; at a distance d from the edge a round body of that width is
+Depths are along the optical axis, m, over the pixels of the object's mask. The local width of a silhouette at a pixel is the
+diameter 2 r of the largest disc inside it that covers the pixel; at a distance d from the edge a round body of that width is
 c(d) = 2 sqrt(r^2 - (r - d)^2) thick.
 
-fraction: back = seen + f c. symmetry: back = 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (least
-bending of a grid whose rim is held at seen + c / 2). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
+fraction: back = seen + f c. symmetry: back = 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (a
+harmonic one, held at seen + c / 2 on the rim). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
 """
 
 from __future__ import annotations

@@ -30,8 +30,10 @@ SEEN_WITHIN = 4.0
 
 
 def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
-    """The prior of the backend that `settings` names, with the share of its surface that no camera saw; `cloud` [P, 3], m, is what was
-    seen of the object in frame 0."""
+    """The prior of the backend that `settings` names, with the share of its surface that no camera saw.
+
+    `cloud` [P, 3], m, is what was seen of the object in frame 0.
+    """
     prior = _prior(capture, masks, cloud, settings)
     if not len(prior.faces):
         return prior

@@ -198,7 +198,7 @@ def test_a_good_grip_has_no_findings():
     ("observations", "text"),
     [
         (
-            observed(ABOVE + [0, 0, 0.06], SLOW),
+            observed(ABOVE + np.array([0, 0, 0.06]), SLOW),
             "controllers hold nothing: in frame 0 none of 3 has a point of the object within 4 cm",
         ),
         (observed(ABOVE, 0.0 * SLOW), "controllers stand still: they move 0.0 mm; at least 5 mm"),
@@ -211,7 +211,7 @@ def test_implausible_hands_are_said(observations, text):
 
 
 def test_a_hand_that_never_comes_near_is_refused():
-    found = look_at_observations(observed(ABOVE + [0, 0, 0.5], SLOW))
+    found = look_at_observations(observed(ABOVE + np.array([0, 0, 0.5]), SLOW))
     with pytest.raises(InputError, match=r"hand far from the object: the hand is never nearer to the object than 5\d cm"):
         refuse_errors(found)
 

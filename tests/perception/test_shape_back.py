@@ -69,7 +69,7 @@ def volume(prior: ShapePrior) -> float:
     return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
 
 
-@pytest.mark.parametrize(("changes", "least"), [({"back": "symmetry"}, 0.8), ({"back_fraction": 1.0}, 0.8)])
+@pytest.mark.parametrize(("changes", "least"), [({"back": "symmetry"}, 0.8), ({"back": "fraction", "back_fraction": 1.0}, 0.8)])
 def test_one_camera_and_a_prior_find_a_ball(tmp_path, changes, least):
     capture, masks, cloud, truth = ball(tmp_path)
     without = visual_hull(capture, masks, cloud, replace(SETTINGS, back="none"))
@@ -80,7 +80,9 @@ def test_one_camera_and_a_prior_find_a_ball(tmp_path, changes, least):
 
 def test_thickness_goes_with_the_fraction(tmp_path):
     capture, masks, cloud, _ = ball(tmp_path)
-    thin, thick = (visual_hull(capture, masks, cloud, replace(SETTINGS, back_fraction=share)) for share in (0.5, 1.0))
+    thin, thick = (
+        visual_hull(capture, masks, cloud, replace(SETTINGS, back="fraction", back_fraction=share)) for share in (0.5, 1.0)
+    )
     assert volume(thick) == pytest.approx(2.0 * volume(thin), rel=0.2)
 
 
@@ -134,7 +136,7 @@ def test_the_chord_of_a_bar_is_its_width_in_the_middle_and_falls_to_its_edge():
 def test_record_and_picture_say_what_is_invented(tmp_path):
     capture, masks, cloud, _ = ball(tmp_path)
     prior = shape_prior(capture, masks, cloud, SETTINGS)
-    assert prior.backend == "visual_hull, back: fraction"
+    assert prior.backend == "visual_hull, back: symmetry"
     # Half of a ball faces a camera that is far away.
     assert prior.facts["invented_share"] == pytest.approx(0.5, abs=0.12)
     assert len(prior.seen) == len(prior.vertices)
