@@ -134,6 +134,11 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
         found.append(
             finding("most controllers hold nothing", "note", where, value, rule, "perception.lift.grip: patch takes near ones.")
         )
+    holds = observations.controller_valid
+    if len(holds) and (gone := int((~holds[-1]).sum())):
+        value = f"{gone} of {count} let go, first in frame {int(np.flatnonzero(~holds.all(axis=1))[0])}"
+        rule = "from then on their springs do not act (perception.lift.release)"
+        found.append(finding("hands let go", "note", where, value, rule, "Is that what was filmed?"))
     if (moved := float(np.linalg.norm(controllers - controllers[0], axis=2).max())) < STILL:
         value, rule = f"they move {1e3 * moved:.1f} mm", f"at least {1e3 * STILL:g} mm are expected of hands that move an object"
         found.append(finding("controllers stand still", "warning", where, value, rule, remedy))
