@@ -18,8 +18,8 @@ BELOW = 0.02
 """m that a body on a table may reach below it, noise included."""
 VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
-INVENTED = 0.7
-"""Share of the surface that no camera saw; of a body seen from one side it is about half."""
+INVENTED = 0.8
+"""Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
 TRUSTED = 0.2
 """Share of motions that agree with their neighbors."""
 ALIVE = 0.05

@@ -37,7 +37,7 @@ def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     prior = _prior(capture, masks, cloud, settings)
     if not len(prior.faces):
         return prior
-    was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * settings.voxel)
+    was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * settings.voxel, prior.faces)
     share = invented_share(prior.vertices, prior.faces, was_seen)
     return replace(prior, seen=was_seen, facts={**prior.facts, "invented_share": share})
 

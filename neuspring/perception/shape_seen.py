@@ -5,16 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import trimesh
 
 from neuspring.data.capture import OBJECT, Camera, Capture
 from neuspring.perception.results import Masks
 
 
-def seen(vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float) -> np.ndarray:
-    """Whether some camera shows the object within `reach`, m, of each vertex [V] along its optical axis."""
+def seen(
+    vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float, faces: np.ndarray | None = None
+) -> np.ndarray:
+    """Whether some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
+
+    With `faces` [F, 3], outward, a vertex must face that camera too: the back of a rope lies within any reach of its front.
+    """
     result = np.zeros(len(vertices), dtype=bool)
+    normals = None if faces is None else trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     for name, camera in capture.cameras.items():
-        result |= visible(vertices, camera, masks[name].labels[0] == OBJECT, capture.depth(name, 0), reach)
+        shown = visible(vertices, camera, masks[name].labels[0] == OBJECT, capture.depth(name, 0), reach)
+        if normals is not None:
+            shown &= ((camera.camera_to_world[:3, 3] - vertices) * normals).sum(axis=1) > 0
+        result |= shown
     return result
 
 

@@ -152,7 +152,7 @@ def test_volume_and_invented_surface_are_said():
     prior = ShapePrior(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]), backend="visual_hull, back: none", facts=facts)
     said = texts(look_at_lifted(lifted(), prior, 1.0))
     assert "warning: shape: volume of the hull: 28.6 liters; at most 12 liters are expected of a thing that hands hold" in said
-    assert "warning: shape: invented surface: no camera saw 93% of the surface (visual_hull, back: none); at most 70%" in said
+    assert "warning: shape: invented surface: no camera saw 93% of the surface (visual_hull, back: none); at most 80%" in said
     half = replace(prior, facts={"volume": 0.002, "invented_share": 0.5, "cameras": 1.0}, backend="visual_hull, back: fraction")
     said = texts(look_at_lifted(lifted(), half, 1.0))
     assert "note: shape: invented surface: no camera saw 50% of the surface (visual_hull, back: fraction)" in said
