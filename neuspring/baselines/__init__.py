@@ -97,6 +97,8 @@ def _vgg16(section: Any) -> str:
     return "absent" if isinstance(find(section.vgg16), str) else "found"
 
 
+REFERENCES = ("static", "controller_lbs")
+"""Methods that learn nothing: what others must be better than."""
 BASELINES = {
     "spring_gaus": Baseline(
         module="neuspring.baselines.spring_gaus.entry",

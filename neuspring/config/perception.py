@@ -107,6 +107,11 @@ class Lift(Section):
     part of each hand that is near the object in frame 0, and moving rigidly with the hand: a grip keeps direction and roll."""
     grip_reach: Positive = 0.03
     """With `grip: patch`: how much farther from the object than a hand's nearest point its controllers may be in frame 0, m."""
+    release: Positive | None = None
+    """Distance, m, between hand and object beyond which a hand has let go, if it does not come near again: its springs act no
+    more. null: hands hold to the end, as released."""
+    release_after: Count = 10
+    """With `release`: frames without any hand in view after which hands have let go too."""
     sequential_motion_filter: bool = False
     """Judge motions in the order of the points, each by the motions that were not dropped before it, as released."""
     coordinate_outliers: bool = False
@@ -128,6 +133,13 @@ class ShapePriorSettings(Section):
     """Side of a voxel of the visual hull, m."""
     margin: Positive = 0.02
     """Margin around the cloud of frame 0 within which voxels are carved, m."""
+    back: Literal["none", "symmetry", "fraction"] = "symmetry"
+    """Where the hull ends if one camera alone shows the object in frame 0, so that its back is invented (with several cameras it is
+    carved, and this is not used). fraction: behind the seen surface by `back_fraction` of the silhouette's local width, rounded to
+    its edge. symmetry: where the seen surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or
+    `margin` behind what was seen."""
+    back_fraction: Positive = 1.2
+    """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
     tolerance: Positive = 0.004
     """Distance, m, by which measured depth may lie behind a voxel before the voxel is carved."""
     smoothing: Positive = 1.0

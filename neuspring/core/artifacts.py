@@ -30,14 +30,14 @@ NO_REST_SHAPE = np.zeros((0, 3))
 """The rest shape that stands for: as in frame 0."""
 
 
-def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False) -> Any:
+def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False, omitted: bool = False) -> Any:
     """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
 
-    An optional one is empty where it is not given.
+    An optional one is empty where it is not given; an omitted one is optional, and not in the file where it is empty.
     """
     sizes = tuple(shape.split(","))
-    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan}
-    if not optional:
+    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan, "omitted": omitted}
+    if not (optional or omitted):
         return field(metadata=metadata)
     empty = tuple(int(size) if size.isdigit() else 0 for size in sizes)
     return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
@@ -66,7 +66,8 @@ class Artifact:
         declared = f"[{', '.join(shape)}] {dtype.name}"
         if value.ndim != len(shape):
             raise InputError(where, f"the shape must be {declared}", f"{value.shape}")
-        for axis, (symbol, size) in enumerate(zip(shape, value.shape, strict=True)):
+        absent = spec.metadata["omitted"] and not value.size
+        for axis, (symbol, size) in enumerate(() if absent else zip(shape, value.shape, strict=True)):
             wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
             if size != wanted:
                 raise InputError(where, f"the shape must be {declared}, so axis {axis} must have {wanted} entries", value.shape)
@@ -97,7 +98,8 @@ class Artifact:
         for spec in dataclasses.fields(self):
             value = getattr(self, spec.name)
             if "shape" in spec.metadata:
-                arrays[prefix + spec.name] = value
+                if value.size or not spec.metadata["omitted"]:
+                    arrays[prefix + spec.name] = value
             elif isinstance(value, Artifact):
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -212,6 +214,9 @@ class Observations(Artifact):
     object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is seen in each frame")
     object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from frame t to t+1 may be trusted")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "points that move the object (hands, grippers)")
+    controller_valid: np.ndarray = array(
+        "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: all do in all frames", omitted=True
+    )
     surface_points: np.ndarray = array("Ns,3", np.float32, "m", "further surface nodes of frame 0")
     interior_points: np.ndarray = array("Ni,3", np.float32, "m", "interior nodes of frame 0")
     tracks: np.ndarray = array("T,K,3", np.float32, "m", "annotated tracks for scoring only; NaN where not annotated", nan=True)

@@ -42,6 +42,8 @@ class Source:
     """Whether it lies under data_root."""
     has_truth: bool = False
     """Its captures have the truth beside them."""
+    own: bool = False
+    """What users film: methods that learn nothing always stand beside the others, and tables say what to be careful with."""
     files: tuple[str, ...] = ()
     """Files of its folder that observations are read from; none: the path itself."""
     capture_files: tuple[str, ...] = ()
@@ -180,7 +182,7 @@ SOURCES = {
         cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
     ),
     "capture": Source(
-        module="neuspring.data.capture", reads=("data_root",), films=True, frames=_released_frames, cameras=_described
+        module="neuspring.data.capture", reads=("data_root",), films=True, own=True, frames=_released_frames, cameras=_described
     ),
     "phystwin_raw": Source(
         module="neuspring.data.phystwin_raw",

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from neuspring.baselines import BASELINES
+from neuspring.baselines import BASELINES, REFERENCES
 from neuspring.config import (
     Config,
     Fit,
@@ -199,6 +199,7 @@ class Benchmark:
             if not getattr(whole, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
         _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
+        whole = _with_references(whole, scenarios, methods)
         config = chosen_part(whole, scenarios)
         searches = read_searches(root / config.search_table)
         wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
@@ -381,6 +382,14 @@ def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], metho
         return config
     union = implied | set(config.methods)
     return dataclasses.replace(config, methods=tuple(name for name in methods if name in union))
+
+
+def _with_references(config: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method]) -> Config:
+    """The configuration with the methods that learn nothing first, if it has scenarios that users filmed."""
+    if not any(SOURCES[scenarios[name].source].own for name in config.scenarios):
+        return config
+    beside = tuple(name for name in REFERENCES if name in methods and name not in config.methods)
+    return dataclasses.replace(config, methods=beside + config.methods) if beside else config
 
 
 def _tuned(whole: Config) -> tuple[str, ...]:

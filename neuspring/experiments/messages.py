@@ -10,12 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuspring.config import plain
+from neuspring.core.findings import findings_of
 from neuspring.core.job_records import FOLDER, RUN, failure_lines, read_jobs, this_run
 from neuspring.experiments.arguments import Arguments
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.plan import report as plan
 
 __all__ = ["failed", "finished", "plan"]
+MOST_FINDINGS = 20
+"""Warnings that are printed at the end of a run."""
 
 
 def failed(benchmark: Benchmark, arguments: Arguments) -> None:
@@ -51,11 +54,23 @@ def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str], 
     if not summary.exists():
         return
     print(f"\n{first_table(summary.read_text())}\n")
+    _tell_findings(results=Path(config.results), scenarios=config.scenarios)
     print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (videos of every method)")
     if config.tracking.enabled:
         _tell_tracking(benchmark, results, logged)
     print(f"It took {seconds / 60:.1f} minutes." if seconds >= 60 else f"It took {seconds:.0f} s.", flush=True)
+
+
+def _tell_findings(results: Path, scenarios: Sequence[str]) -> None:
+    """What the steps of perception noticed: warnings of all scenarios; notes are in the report."""
+    found = [(name, one) for name in scenarios for one in findings_of(results, name) if one.level != "note"]
+    if found:
+        print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
+        print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
+        if len(found) > MOST_FINDINGS:
+            print(f"  {len(found) - MOST_FINDINGS} more are in the report.")
+        print()
 
 
 def first_table(summary: str) -> str:

@@ -21,6 +21,8 @@ from neuspring.experiments.size import Size
 
 SHIPPED = Path(__file__).parents[1] / "data" / "tables" / "timings.csv"
 Kind = Literal["cpu", "gpu"]
+IN_MINUTES = 2.0
+"""Hours below which a time is told in minutes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +115,7 @@ def rate(job: Planned, history: History, shipped: Mapping[tuple[str, str], Rate]
 
 
 def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int]) -> str:
-    """How many jobs, CPU- and GPU-hours are expected, by rule and in all, and what that rests on."""
+    """How many jobs, CPU- and GPU-time are expected, by rule and in all, and what that rests on."""
     shipped = shipped_rates()
     hours: dict[tuple[str, Kind], float] = defaultdict(float)
     counts: dict[tuple[str, Kind], int] = defaultdict(int)
@@ -134,14 +136,16 @@ def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int])
     if not counts:
         return ""
     totals: dict[Kind, float] = {kind: sum(v for (_, k), v in hours.items() if k == kind) for kind in ("gpu", "cpu")}
-    parts = [f"{totals[kind]:.{1 if totals[kind] < 100 else 0}f} {kind.upper()}-hours" for kind in totals if totals[kind]]
+    parts = [duration(totals[kind], f"{kind.upper()}-", 1 if totals[kind] < 100 else 0) for kind in totals if totals[kind]]
     lines = [f"Expected: {sum(counts.values())} jobs, {' and '.join(parts) or 'no time on record'}."]
-    largest = sorted(hours, key=lambda key: -hours[key])[:5]
-    lines += [f"  {rule}: {counts[rule, kind]} jobs, {hours[rule, kind]:.2f} {kind.upper()}-hours" for rule, kind in largest]
+    largest = sorted(hours, key=lambda key: -hours[key])[: 5 if sum(totals.values()) >= IN_MINUTES else None]
+    lines += [
+        f"  {rule}: {counts[rule, kind]} jobs, {duration(hours[rule, kind], f'{kind.upper()}-', 2)}" for rule, kind in largest
+    ]
     least = max([totals[kind] / slots[kind] for kind in totals if slots.get(kind)], default=0.0)
     places = " and ".join(f"{slots[kind]} {'GPU slots' if kind == 'gpu' else 'cores'}" for kind in totals if slots.get(kind))
     if least:
-        lines.append(f"  with {places}: at least {least:.1f} h")
+        lines.append(f"  with {places}: at least {duration(least, '', 1)}")
     lines += [f"  times of {', '.join(sorted(rules))}: {source}" for source, rules in sorted(sources.items())]
     lines += [f"  {what} from {source}: {_scenarios(names)}" for (what, source), names in sorted(bases.items())]
     if history.uncounted:
@@ -150,6 +154,14 @@ def report(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int])
     if unknown:
         lines.append(f"  no time on record, not counted: {', '.join(sorted(unknown))}")
     return "\n".join(lines)
+
+
+def duration(hours: float, of: str, digits: int) -> str:
+    """Hours in words, below two of them in minutes; `of` stands before the unit (GPU-, CPU-)."""
+    if hours >= IN_MINUTES:
+        return f"{hours:.{digits}f} {of}hours"
+    minutes = 60.0 * hours
+    return f"{minutes:.0f} {of}minutes" if minutes >= 1.0 else f"less than 1 {of}minute"
 
 
 def _scenarios(names: set[str]) -> str:

@@ -43,6 +43,7 @@ def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: Sh
         object_visibility=visible,
         object_motion_valid=lifted.object_motion_valid[:, indices],
         controller_points=lifted.controller_points,
+        controller_valid=lifted.controller_valid,
         surface_points=surface,
         interior_points=interior,
         tracks=capture.tracks(),

@@ -53,7 +53,8 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
 
 
 def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) -> Path:
-    """Frame 0 and the last frame from the side and from above: object points in their colors, controllers red, the prior gray."""
+    """Frame 0 and the last frame from the side and from above: object points in their colors, controllers red, the prior gray where
+    a camera saw it and orange where it is invented."""
     from matplotlib import pyplot as plt
 
     last = len(lifted.object_points) - 1
@@ -62,7 +63,10 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
         for axis, frame in zip(row, (0, last), strict=True):
             seen = lifted.object_visibility[frame]
             if frame == 0 and prior is not None and len(prior.vertices):
-                axis.plot(prior.vertices[:, across], prior.vertices[:, up], ",", color="0.8", zorder=0)
+                for part, color, label in _parts(prior):
+                    axis.plot(part[:, across], part[:, up], ",", color=color, zorder=0)
+                    if name == "side":
+                        axis.plot([], [], "s", color=color, label=label)
             points = lifted.object_points[frame, seen]
             axis.scatter(points[:, across], points[:, up], s=2, c=lifted.object_colours[seen], linewidths=0)
             hands = lifted.controller_points[frame]
@@ -71,9 +75,20 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
             axis.set_aspect("equal")
             axis.set_xlabel("x [m]")
             axis.set_ylabel("z [m]" if up == 2 else "y [m]")
+    if prior is not None and len(prior.vertices):
+        figure.legend(fontsize=8, loc="outside lower center", ncols=2)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
     plt.close(figure)
     return path
+
+
+def _parts(prior: ShapePrior) -> list[tuple[np.ndarray, str, str]]:
+    """Vertices of the prior by how they are known: points, color, words for the legend."""
+    if not len(prior.seen):
+        return [(prior.vertices, "0.8", f"shape: {prior.backend}")]
+    share = prior.facts.get("invented_share", float((~prior.seen).mean()))
+    words = f"invented ({prior.backend}): {share:.0%} of the surface"
+    return [(prior.vertices[prior.seen], "0.8", "seen by a camera"), (prior.vertices[~prior.seen], "#f0b070", words)]
 
 
 def _frames(capture: Capture, camera: str) -> list[int]:

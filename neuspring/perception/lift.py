@@ -16,6 +16,7 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.controllers import choose_controllers
+from neuspring.perception.release import holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
@@ -62,6 +63,10 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
+    in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
+    holds = holding(controllers, (hands.points, hands.visible), (objects.points, objects.visible), in_view, settings)
+    if len(holds):
+        facts |= {"controllers_let_go": float((~holds[-1]).sum()), "first_let_go": float(np.flatnonzero(~holds.all(axis=1))[0])}
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),
@@ -74,6 +79,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_motion_valid=valid,
         object_colours=objects.colours,
         controller_points=controllers,
+        controller_valid=holds,
         cloud=cloud,
         cloud_colours=colors,
         backend="released" if settings.sequential_motion_filter else "vectorised",

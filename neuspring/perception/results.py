@@ -48,6 +48,9 @@ class LiftedTracks(_Result):
     object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from t to t + 1 agrees with its neighbors")
     object_colours: np.ndarray = array("No,3", np.float32, "1", "RGB in frame 0")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "chosen points of the hands")
+    controller_valid: np.ndarray = array(
+        "T,C", np.bool_, "1", "whether each controller holds in each frame; empty: all do in all frames", omitted=True
+    )
     cloud: np.ndarray = array("P,3", np.float32, "m", "all object points of frame 0")
     cloud_colours: np.ndarray = array("P,3", np.float32, "1", "their RGB")
 
@@ -59,6 +62,9 @@ class ShapePrior(_Result):
     kind: ClassVar[str] = "shape_prior"
     vertices: np.ndarray = array("V,3", np.float32, "m", "world")
     faces: np.ndarray = array("F,3", np.int32, "1", "outward")
+    seen: np.ndarray = array(
+        "W", np.bool_, "1", "whether some camera saw each vertex; the rest is invented; empty: unknown", optional=True
+    )
 
 
 def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:

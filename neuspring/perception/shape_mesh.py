@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
-from neuspring.data.capture import OBJECT, Camera, Capture
+from neuspring.data.capture import Capture
 from neuspring.data.mesh_file import read_mesh
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
+from neuspring.perception.shape_seen import seen
 
 POSES = 24 * 8
 REFINED = 6
@@ -97,9 +98,7 @@ def bend(
     point of the cloud, within `settings.bend_reach`. L is the uniform graph Laplacian, k the stiffness. (`nricp_amberg` of trimesh
     is no substitute: it pulls hidden vertices as well and fails where no point of the cloud is near enough.)
     """
-    visible = np.zeros(len(vertices), dtype=bool)
-    for name, camera in capture.cameras.items():
-        visible |= _visible(vertices, camera, masks[name].labels[0] == OBJECT, capture.depth(name, 0), settings.bend_reach)
+    visible = seen(vertices, capture, masks, settings.bend_reach)
     distance, nearest = cKDTree(cloud).query(vertices)
     pulled = visible & (distance < settings.bend_reach)
     target = np.where(pulled[:, None], cloud[nearest] - vertices, 0.0)
@@ -108,12 +107,3 @@ def bend(
     data = diags(pulled.astype(float))
     system = (data + STIFFNESS * laplacian.T @ laplacian + 1e-6 * identity(len(vertices))).tocsc()
     return np.asarray(vertices + np.stack([spsolve(system, data @ target[:, k]) for k in range(3)], axis=1))
-
-
-def _visible(vertices: np.ndarray, camera: Camera, mask: np.ndarray, depth: np.ndarray, reach: float) -> np.ndarray:
-    """Whether the camera shows the object within `reach`, m, of each vertex [V]."""
-    pixels, distance = camera.project(vertices)
-    visible = camera.sees(pixels) & (distance > 0)
-    x, y = np.round(pixels[visible]).astype(int).T
-    visible[visible] = mask[y, x] & (np.abs(depth[y, x] - distance[visible]) < reach)
-    return visible

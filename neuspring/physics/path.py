@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
 import torch
 
 
@@ -24,14 +25,19 @@ class ChosenPath(Protocol):
         """linear or cubic."""
 
 
-def waypoints(hands: torch.Tensor, simulation: ChosenPath) -> torch.Tensor:
+def waypoints(hands: torch.Tensor, simulation: ChosenPath, valid: np.ndarray | None = None) -> torch.Tensor:
     """What a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m, or with their tangents [T, C, 6].
+
+    Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0.
+    The springs of a controller act in a frame if it holds at both ends of the frame.
 
     A row depends on the frames next to it, so make them for all known frames before taking some.
     """
-    if simulation.controller_path == "linear":
-        return hands
-    return torch.cat([hands, tangents(hands)], dim=-1)
+    rows = hands if simulation.controller_path == "linear" else torch.cat([hands, tangents(hands)], dim=-1)
+    if valid is None or valid.all():
+        return rows
+    holds = torch.tensor(valid[: len(hands)], dtype=hands.dtype, device=hands.device)
+    return torch.cat([rows, holds[..., None]], dim=-1)
 
 
 def tangents(hands: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,7 @@ Everything is written one equation a line, forward only; gradients are checked a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -53,16 +53,29 @@ class Scene:
         )
 
 
-def rollout(scene: Scene, x: np.ndarray, v: np.ndarray, controllers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3]."""
+def rollout(
+    scene: Scene, x: np.ndarray, v: np.ndarray, controllers: np.ndarray, valid: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3].
+
+    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it.
+    """
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
     hands = controllers.astype(np.float64)
     for k in range(len(hands) - 1):
         slopes = (tangent(hands, k), tangent(hands, k + 1)) if scene.simulation.controller_path == "cubic" else None
-        x, v = frame(scene, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
+        held = scene if valid is None else holding(scene, valid[k] & valid[k + 1])
+        x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
         xs.append(x)
         vs.append(v)
     return np.stack(xs), np.stack(vs)
+
+
+def holding(scene: Scene, holds: np.ndarray) -> Scene:
+    """The scene in which only controllers with `holds` [C] pull."""
+    led = np.concatenate([np.ones(scene.nodes, bool), holds])
+    acts = led[scene.springs].all(axis=1)
+    return replace(scene, stiffness=scene.stiffness * acts, dashpot=scene.dashpot * acts)
 
 
 def tangent(hands: np.ndarray, k: int) -> np.ndarray:

@@ -88,6 +88,15 @@ class FrameSolver:
             term.allocate(self.buffers)
         self._kernels = frame.kernels(self.buffers.real, self.buffers.width)
         self._graphs = Graphs(device)
+        ends = np.asarray(spring_pairs).reshape(-1, 2).max(axis=1)
+        self._led = torch.tensor(np.flatnonzero(ends >= nodes), device=device)
+        """Springs of controllers."""
+        self._leader = torch.tensor(ends[ends >= nodes] - nodes, device=device, dtype=torch.long)
+        """The controller of each of them."""
+        self._plain: torch.Tensor | None = None
+        """Springs as they were set [B, S, 3]."""
+        self._factor: torch.Tensor | None = None
+        """What springs are multiplied with in this frame [B, S, 3], where some controller does not hold."""
         self._reach = 0.0
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
@@ -96,6 +105,7 @@ class FrameSolver:
         """Copy packed parameters into the solver's buffers."""
         b, values = self.buffers, Parameters(*map(self._stacked, parameters))
         springs.fill(b, values.springs)
+        self._plain, self._factor = values.springs.detach(), None
         velocity.fill(b, values.decay)
         for kind in ("ground", "contact"):
             contact.fill(b, kind, getattr(values, kind))
@@ -132,6 +142,11 @@ class FrameSolver:
         """Take the controllers' path from begin to end: positions [B, C, 3], or with tangents [B, C, 6]."""
         b, path = self.buffers, self.simulation.controller_path
         columns = 3 if path == "linear" else 6
+        if begin.shape[-1] == end.shape[-1] == columns + 1:
+            self._hold(begin[..., -1] * end[..., -1])
+            begin, end = begin[..., :-1], end[..., :-1]
+        elif self._factor is not None:
+            self._hold(None)
         if {begin.shape[-1], end.shape[-1]} != {columns}:
             rule = f"{columns} numbers per controller are required with simulation.controller_path: {path}"
             raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Make them with neuspring.physics.path.")
@@ -142,6 +157,17 @@ class FrameSolver:
             travel = places["end"] - places["begin"]
             for name, values in (("bend_begin", begin), ("bend_end", end)):
                 b.set_vectors(name, values[..., 3:] - travel)
+
+    def _hold(self, holds: torch.Tensor | None) -> None:
+        """Let the springs of controllers act whose `holds` [B, C] is 1, and not those where it is 0; None: all act."""
+        assert self._plain is not None, "set_parameters comes first"
+        self._factor = None
+        if holds is not None:
+            self._factor = torch.ones_like(self._plain)
+            acting = holds.to(self.dtype)[:, self._leader]
+            self._factor[:, self._led, 0] = acting  # Y
+            self._factor[:, self._led, 2] = acting  # gamma
+        springs.fill(self.buffers, self._plain if self._factor is None else self._plain * self._factor)
 
     def go_on(self) -> None:
         """Take the end of the last frame for the start of the next."""
@@ -169,7 +195,10 @@ class FrameSolver:
         b.set_vectors("adj_v", self._stacked(adj_v))
         self._run("backward", self.launch_backward)
         state = (b.get_vectors("adj_x", count=self.nodes), b.get_vectors("adj_v", count=self.nodes))
-        own = (springs.gradient(b), velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
+        of_springs = springs.gradient(b)
+        if self._factor is not None:
+            of_springs = of_springs * self._factor
+        own = (of_springs, velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
         return *map(self._one, (*state, *own)), None, None
 
     def clear_adjoints(self) -> None:

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from neuspring import config
 from neuspring.config import Config
+from neuspring.core.findings import told
 from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.lift import lift
+from neuspring.perception.look_world import look_at_lifted
 from neuspring.perception.results import masks_of_cameras, tracks_of_cameras
 from neuspring.perception.shape_prior import shape_prior
 from neuspring.stages import options as shared
@@ -49,4 +51,6 @@ def run(folder: Path, masks_records: Sequence[Path], tracks_records: Sequence[Pa
     lifted.save(files["lifted"])
     prior.save(files["shape"])
     figures.lifted_figure(lifted, prior, files["picture"])
-    record.save(files, lifted.facts | {f"shape_{name}": value for name, value in prior.facts.items()})
+    up = 1.0 if capture.description.up == "+z" else -1.0
+    facts = lifted.facts | {"shape": prior.backend} | {f"shape_{name}": value for name, value in prior.facts.items()}
+    record.save(files, facts | told(look_at_lifted(lifted, prior, up)))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.core.records import StageRecord
+from neuspring.core.findings import refuse_errors, told
+from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.sources import SOURCES, read_observations
 from neuspring.stages import options as shared
 
@@ -30,7 +31,8 @@ def command(a: Namespace) -> None:
 def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None = None, lifted_record: Path | None = None) -> None:
     """Write observations.npz; of a toy scene also truth.npz beside it, which no method reads.
 
-    Raw video has been perceived before: `capture` is its folder, `lifted_record` its lifted.json.
+    Raw video has been perceived before: `capture` is its folder, `lifted_record` its lifted.json. Then a record with what was
+    noticed lies beside the observations. Raises InputError for observations that no method can work with.
     """
     if not SOURCES[row.source].films:
         read_observations(row, settings, output).save(output)
@@ -41,9 +43,17 @@ def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None =
     # Imported here: processed data need nothing of perception, whose code must not start their jobs again.
     from neuspring.data.capture import Capture
     from neuspring.perception.assemble import assemble
+    from neuspring.perception.look_world import look_at_observations
     from neuspring.perception.results import LiftedTracks, ShapePrior
 
     record = StageRecord.load(lifted_record)
     lifted = LiftedTracks.load(record.file("lifted", lifted_record))
     prior = ShapePrior.load(record.file("shape", lifted_record))
-    assemble(row, Capture.load(capture), lifted, prior, settings.perception).save(output)
+    recorder = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted_record})
+    observations = assemble(row, Capture.load(capture), lifted, prior, settings.perception)
+    findings = look_at_observations(observations)
+    facts = told(findings)
+    # Before the observations are there: what no method can work with starts no search.
+    refuse_errors(findings)
+    observations.save(output)
+    recorder.save({"observations": output}, {"nodes": len(observations.nodes), **facts})

@@ -77,7 +77,7 @@ def run(
     for path, stage in before.items():
         twin = Twin.load(stage.file("twin", path))
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
-        trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity)
+        trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
         updates += (len(trajectory.positions) - 1) * twin.counts["springs"] * twin.counts["substeps"]
         if carry:
             trajectory, correction = carry_over(trajectory, twin, observations, velocity, device, carry, settings.last_frame)

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from neuspring import config
 from neuspring.config import Config
+from neuspring.core.findings import told
 from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
+from neuspring.perception.look import look_at_masks
 from neuspring.perception.mask_facts import mask_facts
 from neuspring.perception.results import Masks
 from neuspring.stages import options as shared
@@ -46,4 +48,4 @@ def run(folder: Path, camera: str, settings: Config, device: str, output: Path) 
     files = record.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])
-    record.save(files, masks.facts)
+    record.save(files, masks.facts | told(look_at_masks(capture, camera, labels)))

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from neuspring import config
 from neuspring.config import Config
+from neuspring.core.findings import told
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
+from neuspring.perception.look import look_at_tracks
 from neuspring.perception.results import Masks, PixelTracks
 from neuspring.stages import options as shared
 
@@ -48,4 +50,4 @@ def run(folder: Path, camera: str, masks_record: Path, settings: Config, device:
     files = record.beside(tracks="tracks.npz", picture="tracks.png")
     tracks.save(files["tracks"])
     figures.tracks_strip(capture, camera, tracks, files["picture"])
-    record.save(files, tracks.facts)
+    record.save(files, tracks.facts | told(look_at_tracks(camera, masks.labels, tracks.pixels, tracks.visible)))

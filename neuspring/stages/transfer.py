@@ -94,7 +94,7 @@ def _twin_predictor(record: StageRecord, path: Path, settings: Config, device: s
         result = move(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
         moved = result.twin
         velocity = initial_velocity(observations, moved.simulation.initial_velocity)
-        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity)
+        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
         return trajectory, moved.counts["springs"] * moved.counts["substeps"], result.facts
 
     return predict

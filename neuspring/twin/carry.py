@@ -87,7 +87,7 @@ def training_states(twin: Twin, observations: Observations, velocity: np.ndarray
     """The states of all training frames, from frame 0 on; the twin does not diverge there."""
     solver = solver_for(twin, device, differentiable=False)
     known = torch.tensor(observations.controller_points, device=device)
-    hands = waypoints(known, twin.simulation)[: observations.scenario.train_end]
+    hands = waypoints(known, twin.simulation, observations.controller_valid)[: observations.scenario.train_end]
     rest: State = (twin.topology.nodes, velocity)
     return [rest] + [(x.cpu().numpy(), v.cpu().numpy()) for _, x, v in frames(twin, solver, hands, velocity)]
 
@@ -100,7 +100,8 @@ class Residuals:
     def __init__(self, twin: Twin, observations: Observations, device: str) -> None:
         self.twin, self.observations = twin, observations
         self._solver = solver_for(twin, device, differentiable=False)
-        self._hands = waypoints(torch.tensor(observations.controller_points, device=device), twin.simulation)
+        hands = torch.tensor(observations.controller_points, device=device)
+        self._hands = waypoints(hands, twin.simulation, observations.controller_valid)
         nodes, points = len(observations.nodes), observations.object_points.shape[1]
         self._nodes, self._points = observations.canonical[:nodes], observations.canonical[:points]
         self._controllers = observations.canonical[nodes:]

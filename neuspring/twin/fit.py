@@ -155,7 +155,7 @@ class TwinFit:
         )
         end = problem.frame_end
         hands = torch.tensor(observations.controller_points[:end], device=problem.device)
-        self.hands = waypoints(hands, problem.twin.simulation)
+        self.hands = waypoints(hands, problem.twin.simulation, observations.controller_valid)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end

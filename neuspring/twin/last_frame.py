@@ -102,7 +102,7 @@ class StateEstimator:
         self._lanes = WIDTHS[-1] if device == "cpu" else max(unknowns + 1, len(DAMPINGS))
         self._solver = solver_of([twin] * self._lanes, device, differentiable=False)
         hands = torch.tensor(observations.controller_points, dtype=torch.float32, device=device)
-        self._hands = waypoints(hands, twin.simulation)
+        self._hands = waypoints(hands, twin.simulation, observations.controller_valid)
 
     @property
     def variants(self) -> tuple[float, ...]:

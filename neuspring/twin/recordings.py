@@ -43,7 +43,7 @@ class Recording:
         velocity = initial_velocity(observations, simulation.initial_velocity)
         return cls(
             observations,
-            waypoints(hands, simulation),
+            waypoints(hands, simulation, observations.controller_valid),
             torch.tensor(velocity, dtype=torch.float32, device=device),
             FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators),
         )

@@ -54,13 +54,14 @@ def roll_out(
     device: str = "cpu",
     progress: Callable[[int], None] | None = None,
     velocity: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
 ) -> Trajectory:
     """Simulate over controller_points [T, C, 3], m, from velocity [N, 3], m/s (none: at rest). Divergence is a named result.
 
-    Raises Unstable if the substep is beyond the stability bound.
+    `valid` [T, C]: when each controller holds; empty or none: always. Raises Unstable if the substep is beyond the stability bound.
     """
     stability.check(twin)
-    return simulate(twin, controller_points, device, progress, velocity)
+    return simulate(twin, controller_points, device, progress, velocity, valid)
 
 
 def simulate(
@@ -69,6 +70,7 @@ def simulate(
     device: str = "cpu",
     progress: Callable[[int], None] | None = None,
     velocity: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
 ) -> Trajectory:
     """As `roll_out`, without the check of the substep: the released simulator has none."""
     solver = solver_for(twin, device, differentiable=False)
@@ -76,7 +78,7 @@ def simulate(
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
     try:
-        for frame, x, _ in frames(twin, solver, waypoints(hands, twin.simulation), velocity):
+        for frame, x, _ in frames(twin, solver, waypoints(hands, twin.simulation, valid), velocity):
             positions.append(x.cpu())
             if progress is not None:
                 progress(frame)

@@ -245,7 +245,7 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 def _motion(problem: SearchProblem) -> tuple[torch.Tensor, torch.Tensor]:
     """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
     hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    hands = waypoints(hands, simulation_of(problem, 1))
+    hands = waypoints(hands, simulation_of(problem, 1), problem.observations.controller_valid)
     return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
 
 

@@ -6,6 +6,7 @@ What the steps compute is tested in tests/stages, without the workflow; here onl
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -14,7 +15,7 @@ import pytest
 from tests.support.filmed import film, write_raw
 from tests.support.perceived import final_data, perceived
 from tests.support.phystwin_case import dump
-from tests.support.project import add_scenario, copy_project, copy_workflow, jobs_in, plan, run
+from tests.support.project import add_scenario, copy_project, copy_workflow, jobs_in, output_of, plan, run, start
 
 PACKAGE = "synthetic_weird_package"
 PERCEPTION = {
@@ -175,6 +176,19 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(project):
     # Without its images the case has no pictures, and the rest runs.
     shutil.rmtree(case / "color")
     assert "appearance" not in plan(project, changes | {"results": "other"})
+
+
+def test_own_yaml_plans_minutes_and_lets_methods_that_learn_nothing_stand_beside(project):
+    film(project / "mine" / "film", cameras=1)
+    add_scenario(project, "film", "capture")
+    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2", "--dry-run"]
+    command += ["--configfile", "config/data/own.yaml", "--config", f"data_root={project / 'mine'}", "scenarios=[film]"]
+    output = output_of(start(command, project))
+    jobs = jobs_in(output)
+    assert (jobs["segment"], jobs["lift"], jobs["predict"], jobs["fit"], jobs["score"]) == (1, 1, 2, 2, 5)
+    assert re.search(r"Expected: \d+ jobs, \d+ CPU-minutes", output)
+    assert re.search(r"with 2 cores: at least (\d+ minutes|less than 1 minute)", output)
+    assert not re.search(r"not counted: .*(segment|track|lift|observe|search|fit|rollout|predict|appearance|render|score)", output)
 
 
 def test_a_capture_that_is_not_there_is_named_before_any_job(project):

@@ -588,3 +588,19 @@ def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
     write(tmp_path / "odd.yaml", SEARCHES.replace("uniform: {", "uniform: {released_quirks: {no_such: true}, ", 1))
     with pytest.raises(InputError, match=r"search uniform, released_quirks:(?s:.*)no_such: unknown key"):
         benchmark(tmp_path, search_table="odd.yaml")
+
+
+# Own recordings -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "methods"), [("capture", ("static", "controller_lbs", "ours")), ("synthetic", ("ours",)), ("toy", ("ours",))]
+)
+def test_methods_that_learn_nothing_stand_beside_on_own_recordings(source, methods):
+    row = config.ScenarioRow(scenario="rope", source=source, category="rope", path="x", self_collision=False, ground=True)
+    known = {name: Method(description="x", model="static") for name in ("static", "controller_lbs", "ours")}
+    assert tables._with_references(load(""), {"rope": row}, known).methods == methods
+    # A table without them has none, and none comes twice.
+    assert tables._with_references(load(""), {"rope": row}, {"ours": known["ours"]}).methods == ("ours",)
+    every = replace(load(""), methods=("ours", "static", "controller_lbs"))
+    assert tables._with_references(every, {"rope": row}, known).methods == every.methods

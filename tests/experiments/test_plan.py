@@ -87,13 +87,24 @@ def test_a_transfer_of_a_baseline_has_no_springs_and_is_not_counted(benchmark):
     assert "not counted: transfer" in text and "no time on record." in text
 
 
+def test_a_small_plan_is_told_in_minutes_rule_by_rule():
+    rules = ("segment", "track", "lift", "observe", "search", "fit", "score")
+    history = plan.History.of_records([record(rule, "rope", 30.0 if rule == "fit" else 1.0, 1.0) for rule in rules])
+    text = plan.report([job(rule, work=10.0) for rule in rules], history, {"gpu": 0, "cpu": 2})
+    assert "Expected: 7 jobs, 6 CPU-minutes." in text
+    assert "  fit: 1 jobs, 5 CPU-minutes" in text
+    assert "with 2 cores: at least 3 minutes" in text
+    assert "  observe: 1 jobs, less than 1 CPU-minute" in text
+    assert all(f"  {rule}: 1 jobs, " in text for rule in rules)
+
+
 def test_the_plan_counts_hours_slots_and_what_is_unknown():
     history = plan.History.of_records([record("fit", "rope", 36, 10, devices=["0"]), record("observe", "rope", 36)])
     jobs = [job("fit", kind="gpu", work=1000.0)] * 80 + [job("observe")] * 10 + [job("unheard_of")]
     text = plan.report(jobs, history, {"gpu": 8, "cpu": 0})
-    assert "Expected: 91 jobs, 80.0 GPU-hours and 0.1 CPU-hours." in text
+    assert "Expected: 91 jobs, 80.0 GPU-hours and 6 CPU-minutes." in text
     assert "fit: 80 jobs, 80.00 GPU-hours" in text
-    assert "with 8 GPU slots: at least 10.0 h" in text
+    assert "with 8 GPU slots: at least 10.0 hours" in text
     assert "not counted: unheard_of" in text
     assert plan.report([], history, {}) == ""
 

@@ -15,7 +15,7 @@ from neuspring.core.files import write_text
 from neuspring.core.records import now
 from neuspring.core.run_record import RUN_RECORD
 from neuspring.report.blocks import Block, Facts, Grid, Picture, Section, Text
-from neuspring.report.page import curves, failures, pictures, prose, scores, setup, studies, work
+from neuspring.report.page import curves, failures, findings, pictures, prose, scores, setup, studies, work
 from neuspring.report.page.media import Media, embedded_png
 from neuspring.report.page.sources import Choice, Material, Run, damaged_records, job_records, on_disk
 from neuspring.report.page.words import hours, listed, several
@@ -152,6 +152,7 @@ def _sections(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str
         _with_figures(material, scores.section(material, usable, differences, figures), usable, figures),
         curves.section(material),
         _empty("pictures"),
+        findings.section(material),
         prose.perception(material),
         prose.tuning(material),
         work.section(material),

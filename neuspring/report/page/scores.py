@@ -13,6 +13,7 @@ from neuspring.report.page import frozen
 from neuspring.report.page.sources import Material
 from neuspring.report.page.words import listed, number, several, signed
 from neuspring.report.tables.cells import LEAST_SCENARIOS, ORACLE_LINE
+from neuspring.report.tables.honest import honest_notes
 from neuspring.report.tables.ratios import Judged, about_ratios, aim_lines
 from neuspring.report.tables.summary import compared, floor_lines, image_lines
 from neuspring.scores import ratios
@@ -239,6 +240,8 @@ def _conditions(collected: Collected, usable: pd.DataFrame, differences: pd.Data
     lines = image_lines(collected, usable, differences, baseline)
     words = [line for line in lines if line and not line.startswith(("|", "Paired"))]
     blocks: list[Block] = [Items(items=words)] if words else []
+    if honest := honest_notes(collected):
+        blocks += [Text(text="Of your own recordings:", tone="warn"), Items(items=honest)]
     noted: list[Any] = list(collected.runs[collected.runs["notes"] != ""].itertuples())
     if noted:
         notes = [f"{row.scenario} / {row.method} / seed {row.seed}: {row.notes}" for row in noted[:MOST_NOTES]]

@@ -18,6 +18,7 @@ from neuspring.report.figures.ratios import NAME as RATIOS
 from neuspring.report.figures.ratios import ratios_figure
 from neuspring.report.tables.cells import ORACLE_LINE
 from neuspring.report.tables.differing import differing, differing_markdown
+from neuspring.report.tables.honest import honest_notes
 from neuspring.report.tables.ratios import Judged, Judging, by_method, judged, ratio_lines, transfer_lines
 from neuspring.scores.failures import both_averages, failures_text, left_out_lines, removed_lines
 from neuspring.scores.metrics import (
@@ -91,6 +92,8 @@ def summary_text(
         lines += ["", "Not in the averages:", "", *_not_counted(bad)]
     lines += [line for text in left_out_lines(collected.left_out) for line in ("", text)]
     lines += _averaged_notes(runs)
+    if honest := honest_notes(everything):
+        lines += ["", "Of your own recordings:", "", *(f"- {note}" for note in honest)]
     noted = runs[runs["notes"] != ""]
     if len(noted):
         lines += ["", "Notes:", ""]

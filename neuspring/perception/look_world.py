@@ -1,0 +1,160 @@
+"""What lifted points, the shape and the observations say about themselves: findings after lifting and observing.
+
+Limits were chosen so that the synthetic scenes pass; lengths in m, of things that hands hold on a table.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from neuspring.core.artifacts import Observations
+from neuspring.core.findings import Finding, finding
+from neuspring.perception.results import LiftedTracks, ShapePrior
+
+SIZE = (0.03, 1.0)
+"""m: longest side of the object."""
+BELOW = 0.02
+"""m that a body on a table may reach below it, noise included."""
+VOLUME = 0.012
+"""m^3 of a hull: a large plush animal has 5 liters."""
+INVENTED = 0.8
+"""Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
+TRUSTED = 0.2
+"""Share of motions that agree with their neighbors."""
+ALIVE = 0.05
+"""Share of the object's points that are seen in a frame."""
+GRIP = 0.04
+"""m from the object within which a controller can hold it."""
+APART = 0.15
+"""m between hand and object, at their nearest, from which there is no interaction to learn from."""
+STILL = 0.005
+"""m: motions smaller than this are noise."""
+FASTEST = 5.0
+"""m/s: no hand that manipulates is faster."""
+NODES = (30, 5000)
+"""Structure points that can deform, and that a search can pay for."""
+TABLE = "Table, extrinsics or depth unit may be wrong: `neuspring check-data` looks at them."
+
+
+def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
+    """Findings about points in the world and the shape; `up` is +1 or -1."""
+    return [*_object(lifted, up), *_shape(prior), *_motion(lifted)]
+
+
+def look_at_observations(observations: Observations) -> list[Finding]:
+    """Findings about what every method reads. Errors are what no method can work with."""
+    where, nodes, scenario = "observations", observations.nodes, observations.scenario
+    found = [*_hands(observations.controller_points, observations)]
+    if len(nodes) < NODES[0]:
+        value, rule = f"{len(nodes)} structure points", f"at least {NODES[0]} are needed to deform"
+        remedy = "Lower perception.sample.voxel, or give the object more pixels."
+        found.append(finding("too few nodes", "error" if len(nodes) < 4 else "warning", where, value, rule, remedy))
+    if len(nodes) > NODES[1]:
+        value, rule = f"{len(nodes):,} structure points", f"more than {NODES[1]:,} make searches take hours"
+        found.append(finding("many nodes", "note", where, value, rule, "perception.sample.nodes limits them."))
+    seen = observations.object_visibility[: scenario.train_end]
+    moved = np.linalg.norm(observations.object_points[: scenario.train_end] - observations.object_points[0], axis=2)
+    # Of the points that are seen in a frame, a tenth moves farther than this; the farthest frame counts.
+    farthest = max(
+        (float(np.quantile(row[shown], 0.9)) for row, shown in zip(moved, seen, strict=True) if shown.any()), default=0.0
+    )
+    if farthest < STILL:
+        value = f"the object moves {1e3 * farthest:.1f} mm in the training frames"
+        rule = f"at least {1e3 * STILL:g} mm are needed to learn from; `static` cannot be beaten"
+        found.append(finding("object stands still", "warning", where, value, rule, "Film an interaction, or move the split."))
+    return found
+
+
+def _object(lifted: LiftedTracks, up: float) -> list[Finding]:
+    where, found = "object in frame 0", []
+    heights, size = up * lifted.cloud[:, 2], np.ptp(np.quantile(lifted.cloud, (0.01, 0.99), axis=0), axis=0)
+    lowest, highest = np.quantile(heights, (0.01, 0.99))
+    sides = " x ".join(f"{100 * side:.0f}" for side in size)
+    value = f"{sides} cm, from {100 * lowest:.1f} to {100 * highest:.1f} cm above the table"
+    rule = "as its pixels with depth show it"
+    found.append(finding("size of the object", "note", where, value, rule, "Is that what was filmed?"))
+    if not SIZE[0] <= size.max() <= SIZE[1]:
+        rule = f"{100 * SIZE[0]:g} to {100 * SIZE[1]:g} cm are expected"
+        remedy = f"Masks may show more or less than the object. {TABLE}"
+        found.append(finding("implausible size", "warning", where, f"{100 * size.max():.0f} cm long", rule, remedy))
+    if lowest < -BELOW:
+        value, rule = f"it reaches {-100 * lowest:.1f} cm below the table", f"at most {100 * BELOW:g} cm are noise"
+        found.append(finding("object below the table", "warning", where, value, rule, TABLE))
+    return found
+
+
+def _shape(prior: ShapePrior) -> list[Finding]:
+    found, volume, share = [], prior.facts.get("volume", 0.0), prior.facts.get("invented_share", 0.0)
+    if volume > VOLUME:
+        value, rule = f"{1e3 * volume:.1f} liters", f"at most {1e3 * VOLUME:g} liters are expected of a thing that hands hold"
+        remedy = "Masks that show sleeves, table or other things make it large: look at masks.png and lifted.png."
+        found.append(finding("volume of the hull", "warning", "shape", value, rule, remedy))
+    if share > INVENTED or prior.facts.get("cameras") == 1:
+        level, rule = ("warning", f"at most {INVENTED:.0%} are expected") if share > INVENTED else ("note", "the rest was measured")
+        value = f"no camera saw {share:.0%} of the surface ({prior.backend})"
+        remedy = "Add a camera from the other side, or a mesh (perception.shape.backend: mesh)."
+        found.append(finding("invented surface", level, "shape", value, rule, remedy))  # type: ignore[arg-type]
+    return found
+
+
+def _motion(lifted: LiftedTracks) -> list[Finding]:
+    found, where, share = [], "lifted tracks", float(lifted.object_motion_valid[:-1].mean())
+    remedy = "Look at tracks.png and lifted.png; perception.lift has neighbourhood and agreement."
+    if share < TRUSTED:
+        value, rule = f"{share:.0%} of the object's motions are trusted", f"at least {TRUSTED:.0%} are expected"
+        found.append(finding("motion not trusted", "warning", where, value, rule, remedy))
+    alive = lifted.object_visibility.mean(axis=1)
+    if (low := np.flatnonzero(alive < ALIVE)).size:
+        value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
+        rule = f"at least {ALIVE:.0%} are expected in every frame"
+        found.append(finding("points lost", "warning", where, value, rule, f"End the capture before frame {low[0]}. {remedy}"))
+    return found
+
+
+def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]:
+    """Controllers [T, C, 3] that hold nothing, never come near, stand still, or are faster than hands are."""
+    where, found, rate = "controllers", [], observations.scenario.frame_rate
+    remedy = "Masks may take something else for a hand: look at masks.png; perception.lift has grip and grip_reach."
+    apart = np.array([_nearest(observations, controllers, frame) for frame in range(len(controllers))])
+    nearest = apart.min(axis=1)
+    if nearest.min() > APART:
+        value = f"the hand is never nearer to the object than {100 * nearest.min():.0f} cm"
+        rule = f"it must come within {100 * APART:g} cm to move it"
+        return [finding("hand far from the object", "error", where, value, rule, remedy)]
+    holding, count = int((apart[0] <= GRIP).sum()), apart.shape[1]
+    if not holding:
+        near = f"{100 * GRIP:g} cm; the nearest is {100 * nearest[0]:.0f} cm away"
+        value = f"in frame 0 none of {count} has a point of the object within {near}"
+        rule = "springs of hands are made in frame 0, and would span the air"
+        found.append(finding("controllers hold nothing", "warning", where, value, rule, "Begin the capture at the grip."))
+    elif 2 * holding < count:
+        value = f"{count - holding} of {count} have no point of the object within {100 * GRIP:g} cm in frame 0"
+        rule = "only those that are near hold it"
+        found.append(
+            finding("most controllers hold nothing", "note", where, value, rule, "perception.lift.grip: patch takes near ones.")
+        )
+    holds = observations.controller_valid
+    if len(holds) and (gone := int((~holds[-1]).sum())):
+        value = f"{gone} of {count} let go, first in frame {int(np.flatnonzero(~holds.all(axis=1))[0])}"
+        rule = "from then on their springs do not act (perception.lift.release)"
+        found.append(finding("hands let go", "note", where, value, rule, "Is that what was filmed?"))
+    if (moved := float(np.linalg.norm(controllers - controllers[0], axis=2).max())) < STILL:
+        value, rule = f"they move {1e3 * moved:.1f} mm", f"at least {1e3 * STILL:g} mm are expected of hands that move an object"
+        found.append(finding("controllers stand still", "warning", where, value, rule, remedy))
+    speed = rate * np.median(np.linalg.norm(np.diff(controllers, axis=0), axis=2), axis=1)
+    if speed.max(initial=0.0) > FASTEST:
+        value = f"{speed.max():.0f} m/s between frames {int(speed.argmax())} and {int(speed.argmax()) + 1}"
+        rule = f"hands are slower than {FASTEST:g} m/s"
+        remedy = f"frame_rate ({rate:g}/s) or depth_unit of capture.json may be wrong, or a hand's tracks jump."
+        found.append(finding("controllers too fast", "warning", where, value, rule, remedy))
+    return found
+
+
+def _nearest(observations: Observations, controllers: np.ndarray, frame: int) -> np.ndarray:
+    """Distance of each controller [C] from the nearest point of the object in a frame; from all nodes in frame 0."""
+    shown = observations.object_points[frame, observations.object_visibility[frame]]
+    points = observations.nodes if frame == 0 else shown
+    if not len(points):
+        return np.full(controllers.shape[1], np.inf)
+    return np.asarray(cKDTree(points).query(controllers[frame])[0])

@@ -1,0 +1,89 @@
+"""Hands that let go: seen going away, out of view, or back again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.config.perception import Lift
+from neuspring.core.artifacts import Observations
+from neuspring.core.errors import InputError
+from neuspring.perception.look_world import look_at_observations
+from neuspring.perception.release import ALWAYS, holding
+from tests.support.small import observations
+
+FRAMES = 30
+SETTINGS = Lift(release=0.05, release_after=5)
+
+
+def scene(away: np.ndarray):
+    """A body at the origin and two hands of four points, the second far to the side and always near it; the first `away` [T], m,
+    from where it holds."""
+    body = np.random.default_rng(0).uniform(-0.05, 0.05, (60, 3))
+    aside = np.array([0.5, 0.0, 0.0])
+    body = np.concatenate([body, body + aside])
+    hand = np.array([[0, 0, 0.06], [0.01, 0, 0.06], [0, 0.01, 0.06], [0.01, 0.01, 0.06]])
+    first = hand + away[:, None, None] * np.array([0, 0, 1.0])
+    second = np.repeat((hand + aside)[None], FRAMES, axis=0)
+    points = np.concatenate([first, second], axis=1)
+    seen = np.ones(points.shape[:2], bool)
+    bodies = np.repeat(body[None], FRAMES, axis=0)
+    return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
+
+
+def held(away: np.ndarray, settings: Lift = SETTINGS, **changes: np.ndarray) -> np.ndarray:
+    points, seen, bodies, shown, in_view = scene(away)
+    seen, in_view = changes.get("seen", seen), changes.get("in_view", in_view)
+    return holding(points[:, [0, 3, 4]], (points, seen), (bodies, shown), in_view, settings)
+
+
+def leaving(at: int) -> np.ndarray:
+    return 0.03 * np.maximum(np.arange(FRAMES) - at, 0)
+
+
+def test_a_hand_that_stays_or_no_setting_holds_always():
+    assert held(np.zeros(FRAMES)) is ALWAYS
+    assert held(leaving(10), Lift()) is ALWAYS
+
+
+def test_a_hand_that_goes_away_lets_go_and_the_other_holds_on():
+    valid = held(leaving(10))
+    first = np.flatnonzero(~valid[:, 0])[0]
+    assert first in (11, 12)
+    assert not valid[first:, :2].any()
+    assert valid[:first].all()
+    assert valid[:, 2].all()
+
+
+def test_a_hand_that_comes_back_has_not_let_go():
+    away = leaving(10)
+    away[20:] = 0.0
+    assert held(away) is ALWAYS
+
+
+def test_a_hand_out_of_view_lets_go_after_some_frames():
+    seen = np.ones((FRAMES, 8), bool)
+    seen[12:] = False
+    in_view = np.arange(FRAMES) < 12
+    valid = held(np.zeros(FRAMES), seen=seen, in_view=in_view)
+    # Five frames: 12 to 16.
+    assert valid[:16].all()
+    assert not valid[16:].any()
+    # Tracks that are lost while masks still show a hand say nothing.
+    assert held(np.zeros(FRAMES), seen=seen) is ALWAYS
+
+
+def test_observations_keep_when_controllers_hold_and_older_files_load(tmp_path):
+    plain = observations()
+    plain.save(tmp_path / "plain.npz")
+    assert "controller_valid" not in np.load(tmp_path / "plain.npz").files
+    assert Observations.load(tmp_path / "plain.npz").controller_valid.size == 0
+    valid = np.ones(plain.controller_points.shape[:2], bool)
+    valid[-1] = False
+    some = replace(plain, controller_valid=valid)
+    some.save(tmp_path / "some.npz")
+    np.testing.assert_array_equal(Observations.load(tmp_path / "some.npz").controller_valid, valid)
+    found = "\n".join(map(str, look_at_observations(some)))
+    assert f"hands let go: {valid.shape[1]} of {valid.shape[1]} let go, first in frame {len(valid) - 1}" in found
+    with pytest.raises(InputError, match=r"controller_valid: the shape must be \[T, C\] bool"):
+        replace(plain, controller_valid=np.ones((3, 99), bool))
