@@ -1,0 +1,1 @@
+"""Masks and ground-truth tracks by hand, in a browser: `neuspring annotate`."""
