@@ -69,8 +69,7 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        limits = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-        self.call("Network.emulateNetworkConditions", offline=not self._served, **limits)
+        self.online(self._served)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -109,6 +108,11 @@ class Browser:
         if "method" in message:
             self.events.append(message)
         return message
+
+    def online(self, yes: bool) -> None:
+        """Give pages the network, or take it."""
+        limits = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        self.call("Network.emulateNetworkConditions", offline=not yes, **limits)
 
     def open(self, page: Path | str, width: int, height: int = 900, *, dark: bool = False, print_view: bool = False) -> None:
         """Show a file or an address in a window of a size in CSS pixels; below 600 as a phone does."""

@@ -1,4 +1,4 @@
-"""A capture with exactly known motion in the image: a textured square moves before a wall, at a known depth, seen by two cameras."""
+"""A capture with exactly known motion: a textured square moves before a wall, at a known depth, seen by two cameras."""
 
 from __future__ import annotations
 

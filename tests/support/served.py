@@ -18,7 +18,7 @@ from neuspring.perception.annotate.guard import TOKEN_HEADER
 from neuspring.perception.annotate.masks import Method
 from neuspring.perception.annotate.server import Server
 
-TOKEN = "the token"
+TOKEN = "the-token"
 
 
 class Client:

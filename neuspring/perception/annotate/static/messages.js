@@ -20,7 +20,7 @@ export function say(text, kind = "bad", actions = {}) {
     line.append(button);
   }
   place.append(line);
-  if (kind === "good") setTimeout(() => line.remove(), 6000);
+  if (kind === "good") setTimeout(() => line.remove(), 12000);
   return line;
 }
 
