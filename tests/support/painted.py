@@ -62,5 +62,8 @@ class Painted:
             assert self.gate.wait(30)
         return np.repeat(labels[None], capture.frame_count, axis=0), np.linspace(0, 1, capture.frame_count)
 
-    def save_masks(self, capture: Capture, camera: str, labels: np.ndarray) -> None:
+    def save_masks(self, capture: Capture, camera: str, labels: np.ndarray, doubt: np.ndarray, marks: Any) -> None:
         self.written[camera] = labels
+
+    def doubt(self, capture: Capture) -> dict[str, list[float]]:
+        return {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any, Protocol
 
@@ -45,8 +45,11 @@ class Method(Protocol):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Labels [T, H, W] and doubt [T] of every frame. Raises InputError."""
 
-    def save_masks(self, capture: Capture, camera: str, labels: np.ndarray) -> None:
-        """Write mask/<camera>/."""
+    def save_masks(self, capture: Capture, camera: str, labels: np.ndarray, doubt: np.ndarray, marks: Any) -> None:
+        """Write mask/<camera>/, and how the masks were made."""
+
+    def doubt(self, capture: Capture) -> dict[str, list[float]]:
+        """Doubt [T] of masks that the capture has, by camera, where it is known. Raises InputError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +60,10 @@ class Result:
     """A gray PNG per frame."""
     doubt: np.ndarray
     """[T], 0 sure, 1 doubtful."""
-    marks: str
-    """Digest of the marks that they came from."""
+    marks: Any
+    """What they came from."""
+    source: str
+    """Digest of the camera's marks."""
     saved: bool = False
 
     def labels(self) -> np.ndarray:
@@ -86,11 +91,13 @@ class Masks:
                 camera: {
                     "doubt": [round(float(value), 3) for value in result.doubt],
                     "saved": result.saved,
-                    "stale": result.marks != digest(values, camera),
+                    "stale": result.source != digest(values, camera),
                 }
                 for camera, result in self._results.items()
             }
-        return {"revision": revision, "marks": values, "job": self.job.plain(), "carried": carried, "saved": self.saved_cameras()}
+        doubt = self.method.doubt(self.capture)
+        saved = {camera: doubt.get(camera, []) for camera in self.saved_cameras()}
+        return {"revision": revision, "marks": values, "job": self.job.plain(), "carried": carried, "saved": saved}
 
     def write(self, revision: Any, values: Any) -> str:
         """Replace the marks; returns the new revision. Raises Stale, InputError."""
@@ -125,7 +132,7 @@ class Masks:
             progress(0, self.capture.frame_count)
             labels, doubt = self.method.carry(self.capture, camera, marks, progress)
             doubtful += int((doubt > 0.5).sum())
-            result = Result([encode(image) for image in labels], doubt, digest(values, camera))
+            result = Result([encode(image) for image in labels], doubt, marks, digest(values, camera))
             with self._lock:
                 self._results[camera] = result
         names = ", ".join(cameras)
@@ -149,10 +156,10 @@ class Masks:
         if not results:
             raise InputError("masks", "there must be masks to save", "none", "Carry the marks through the video first.")
         for camera, result in results.items():
-            self.method.save_masks(self.capture, camera, result.labels())
+            self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
             with self._lock:
                 if self._results.get(camera) is result:
-                    self._results[camera] = Result(result.images, result.doubt, result.marks, saved=True)
+                    self._results[camera] = replace(result, saved=True)
         return list(results)
 
     def saved_cameras(self) -> list[str]:

@@ -55,7 +55,7 @@ def test_the_state_describes_the_capture(client, capture):
     assert state["cameras"][0] == {"name": "0", "width": 128, "height": 96, "missing": [4]}
     assert state["masks"]["marks"] == {"format": 1, "cameras": {}}
     assert state["tracks"]["annotations"] == {"format": 1, "points": []}
-    assert state["masks"]["saved"] == []
+    assert state["masks"]["saved"] == {}
 
 
 def test_frames_come_as_they_are(client, capture):

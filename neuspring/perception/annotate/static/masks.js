@@ -24,7 +24,7 @@ export class MasksMode {
     for (const name of ["down", "move", "up", "hover", "double"]) this[name] = (...values) => this.pen[name](...values);
     this.chosen = -1;
     this.preview = null;
-    this.results = { job: { state: "idle" }, carried: {}, saved: [] };
+    this.results = { job: { state: "idle" }, carried: {}, saved: {} };
     this.version = 0;
     this.edits = new Edits({
       key: "marks",
@@ -135,7 +135,7 @@ export class MasksMode {
   source(camera, frame) {
     if (this.preview?.camera === camera && this.preview.frame === frame) return "previewed";
     if (this.results.carried[camera]) return "carried";
-    return this.results.saved.includes(camera) ? "saved" : null;
+    return this.results.saved[camera] ? "saved" : null;
   }
 
   async carry(cameras) {
@@ -219,13 +219,13 @@ export class MasksMode {
     find("stale").hidden = !carried?.stale || running;
     find("doubtful").replaceChildren(...this.doubtful().map(({ frame, doubt }) =>
       app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > 0.5 ? "high" : "mid")));
-    find("doubtful").dataset.empty = carried ? "none: all frames are sure" : "known once masks are carried";
+    find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
     find("save-masks").disabled = running || !unsaved.length;
     const list = (names) => names.join(", ");
     find("masks-note").textContent =
       (unsaved.length ? `Not saved yet: camera ${list(unsaved)}. ` : "") +
-      (results.saved.length ? `The capture has masks of camera ${list(results.saved)}.` : "The capture has no masks.");
+      (Object.keys(results.saved).length ? `The capture has masks of camera ${list(Object.keys(results.saved))}.` : "The capture has no masks.");
     app.timeline.draw();
     app.view.draw();
   }
@@ -260,9 +260,14 @@ export class MasksMode {
     find("progress-text").textContent = `${job.what}: ${Math.floor(100 * share)} % in ${Math.floor(job.seconds)} s`;
   }
 
+  // Doubt of every frame, of the masks that are shown.
+  doubt() {
+    return this.results.carried[this.app.camera]?.doubt ?? this.results.saved[this.app.camera] ?? [];
+  }
+
   // The worst frames, a few frames apart from each other.
   doubtful(most = 12, apart = 4, least = 0.25) {
-    const doubt = this.results.carried[this.app.camera]?.doubt ?? [];
+    const doubt = this.doubt();
     const order = doubt.map((value, frame) => ({ frame, doubt: value })).filter((one) => one.doubt >= least)
       .sort((a, b) => b.doubt - a.doubt);
     const chosen = [];
@@ -274,7 +279,7 @@ export class MasksMode {
   }
 
   bars() {
-    const bars = (this.results.carried[this.app.camera]?.doubt ?? []).map((doubt, frame) =>
+    const bars = this.doubt().map((doubt, frame) =>
       ({ frame, height: Math.max(0.8 * doubt, 0.06), color: doubt > 0.5 ? "#ff6b5e" : doubt > 0.25 ? "#e0b03c" : "#3d6b5f" }));
     for (const mark of this.marksOf()) bars.push({ frame: mark.frame, height: 1, color: COLORS[mark.label] });
     return bars;
