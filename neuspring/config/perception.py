@@ -27,6 +27,20 @@ class OpenCvSegmentation(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MarksSegmentation(Section):
+    """Segmentation from the marks of a user (`marks.json` of the capture), carried through the video."""
+
+    smoothness: NonNegative = 1.5
+    """Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
+    reach: Positive = 4.0
+    """How far the border may be from where the flow carries it, pixels at a width of 848."""
+    background: bool = True
+    """Learn the color of every pixel of the background; for a camera that stands still."""
+    scale: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """Size of the images that are worked on, as a multiple of the camera's; 2 helps ropes of a few pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class OpenCvTracking(Section):
     """Lucas-Kanade or DIS flow with a forward-backward check."""
 
@@ -159,8 +173,10 @@ class Sampling(Section):
 class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
-    backend: Literal["given", "opencv", "grounded_sam2"] = "given"
-    """given: the capture's masks. opencv: height and color. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
+    """given: the capture's masks. opencv: height and color. marks: the capture's marks.json, carried through the video.
+    grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    marks: MarksSegmentation = field(default_factory=MarksSegmentation)
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
 
