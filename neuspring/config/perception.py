@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import Count, NonNegative, Positive, Range, Section
+from neuspring.config.types import Count, Finite, Name, NonNegative, Positive, Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +24,19 @@ class OpenCvSegmentation(Section):
     """Width, pixels, over which the decision between hand and object is averaged."""
     smallest: NonNegative = 0.0004
     """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
+    boxes: dict[Name, tuple[Finite, Finite, Finite, Finite]] = field(default_factory=dict)
+    """Region of interest: by camera, left, top, right and bottom, pixels. Cameras that are not named have none."""
+    table: tuple[Range, Range] | None = None
+    """Region of interest: ranges of x and y on the table, m in the world; null: everywhere."""
+    sleeves: bool = False
+    """What moves, touches a hand and reaches the border of the image is hand too, whatever its color."""
+    clutter: Literal["keep", "drop"] = "keep"
+    """drop: what never moves and is not held is not the object."""
+    object: Literal["all", "largest", "moving", "nearest_hand"] = "all"
+    """Which of several pieces of frame 0, and what overlaps with it later. all: every one. moving: the one with most pixels that
+    change during the video."""
+    thin: bool = False
+    """For ropes of a few pixels: nothing is opened, and neighbors decide the border less than in GrabCut."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +192,8 @@ class Segmentation(Section):
     marks: MarksSegmentation = field(default_factory=MarksSegmentation)
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
+    verdict: Literal["warn", "error"] = "warn"
+    """What happens where masks made here cannot be right: it is printed and recorded (warn), or the step fails (error)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@
 2. Per frame, the log ratio of both and the height make seeds, and GrabCut draws the border.
 3. Foreground is divided into hands and object by the same kind of ratio. The hands' histogram starts from skin tones and is made
    again from the hands that these show. Only pieces of some size are hands.
+4. Where settings ask for it, pieces are judged over the whole video (`segment_pieces`): sleeves, clutter, which object.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from scipy.ndimage import gaussian_filter
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.marks.field import solve
+from neuspring.perception.segment_pieces import sort_pieces
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""
@@ -43,6 +46,8 @@ HAND_PIECE = 0.15
 LARGEST_HOLE = 0.0015
 """Holes in the foreground up to this part of the image are filled: print that has the table's color."""
 SPECK = np.ones((3, 3), np.uint8)
+THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
+"""Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.n
     for frame in range(capture.frame_count):
         if capture.has(camera, frame):
             labels[frame] = _frame(capture, camera, frame, palette, settings)
-    return labels
+    return sort_pieces(capture, camera, labels, settings)
 
 
 def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palette:
@@ -81,7 +86,7 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
     views = []
     for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
         image, height = capture.colour(camera, frames[index]), _heights(capture, camera, frames[index])
-        risen = height > settings.height
+        risen = (height > settings.height) & _region(capture, camera, frames[index], settings)
         views.append((image, risen))
         above += _count(_bins(image)[risen])
         edge = _border(risen.shape) & ~(height > settings.height / 2)
@@ -125,8 +130,13 @@ def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings
     flat = np.nan_to_num(height, nan=0.0) < settings.height
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
-    seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
-    foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) if seeds.any() else seeds
+    region = _region(capture, camera, frame, settings)
+    seeds &= region
+    if settings.thin:
+        foreground = _thin(image, palette.rise[bins], height, settings) & region
+    else:
+        seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
+        foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) & region if seeds.any() else seeds
     foreground |= _holes(foreground)
     hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), settings.smoothing) > 0
     labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
@@ -153,6 +163,44 @@ def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndar
     mask = np.zeros_like(seeds)
     mask[window] = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return mask
+
+
+def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+    """Foreground [H, W] bool by color and height, each pixel nearly for itself: a rope of three pixels is all border.
+
+    A pixel's log odds are those of its color, and 2 for being as high as `height` or -1 for lying lower; none without depth.
+    """
+    rise = np.where(
+        np.isnan(height), 0.0, np.clip(2 * height / settings.height, -1.0, 2.0) - np.where(height < settings.height, 1, 0)
+    )
+    odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
+    high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
+    logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
+    return solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5
+
+
+def _region(capture: Capture, camera: str, frame: int, settings: OpenCvSegmentation) -> np.ndarray:
+    """The region of interest [H, W] bool. Pixels without depth are judged by the point of the table behind them."""
+    view = capture.cameras[camera]
+    region = np.ones((view.height, view.width), dtype=bool)
+    if camera in settings.boxes:
+        left, top, right, bottom = settings.boxes[camera]
+        rows, columns = np.indices(region.shape)
+        region &= (columns >= left) & (columns <= right) & (rows >= top) & (rows <= bottom)
+        if not region.any():
+            rule = f"must hold a pixel of the image of {view.width} x {view.height}"
+            raise InputError(f"perception.segment.opencv.boxes.{camera}", rule, settings.boxes[camera])
+    if settings.table is not None:
+        pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
+        depth, eye = capture.depth(camera, frame), view.camera_to_world[:3, 3]
+        one = view.lift(pixels, np.ones_like(depth))
+        fall = eye[2] - one[..., 2]
+        behind = np.where(np.abs(fall) > 1e-9, eye[2] / np.where(np.abs(fall) > 1e-9, fall, 1.0), np.inf)
+        points = view.lift(pixels, np.where(depth > 0, depth, np.clip(behind, 0.0, 100.0)))
+        (least_x, most_x), (least_y, most_y) = settings.table
+        x, y = points[..., 0], points[..., 1]
+        region &= (least_x <= x) & (x <= most_x) & (least_y <= y) & (y <= most_y)
+    return region
 
 
 def _holes(foreground: np.ndarray) -> np.ndarray:

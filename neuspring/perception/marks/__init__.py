@@ -1,8 +1,8 @@
 """Masks from a few marks.
 
-    marks     the file marks.json: boxes, clicks, scribbles, polygons
-    carry     marks on a few frames -> labels and doubt of every frame
-    store     mask/ of a capture
+marks     the file marks.json: boxes, clicks, scribbles, polygons
+carry     marks on a few frames -> labels and doubt of every frame
+store     mask/ of a capture
 """
 
 from neuspring.perception.marks.carry import Carried, Images, carry, frame_mask

@@ -24,7 +24,7 @@ from neuspring.perception.marks.colors import lab_of, mixed
 from neuspring.perception.marks.doubt import Cues, doubt_of
 from neuspring.perception.marks.marks import Mark, require_marks
 from neuspring.perception.marks.seeds import Seeds
-from neuspring.perception.marks.start import Start, start
+from neuspring.perception.marks.start import LABELS, Start, start
 from neuspring.perception.marks.step import Pass
 
 WIDTH = 848
@@ -61,6 +61,7 @@ class Carried:
     doubt: np.ndarray
     """[T] float, 0 (sure) to 1."""
 
+
 @dataclass(eq=False)
 class _Film:
     """Frames at the size that is worked on, and the marks of each."""
@@ -93,6 +94,18 @@ class _Film:
     def seeds(self, frame: int, *, carried: bool = False) -> Seeds:
         return Seeds.of(self.marks[frame], self.size, self.scale, carried=carried)
 
+    def depth(self, frame: int) -> np.ndarray | None:
+        return self._resized(self.images.depth(frame))
+
+    def height(self, frame: int) -> np.ndarray | None:
+        return self._resized(self.images.height(frame))
+
+    def _resized(self, values: np.ndarray | None) -> np.ndarray | None:
+        """Depth and height are not averaged over borders."""
+        if values is None or self.scale == 1.0:
+            return values
+        return cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST)
+
     def labels(self, probability: np.ndarray) -> np.ndarray:
         """Labels [H, W] at the camera's size."""
         if self.scale != 1.0:
@@ -107,7 +120,7 @@ def frame_mask(images: Images, frame: int, marks: Sequence[Mark], settings: Mark
     if not any(mark.label != "ignore" for mark in own):
         raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
     film = _Film.of(images, own, settings)
-    return film.labels(start(film.lab(frame), film.seeds(frame), settings.smoothness).probability)
+    return film.labels(start(film.lab(frame), film.seeds(frame), settings.smoothness, film.height(frame)).probability)
 
 
 def carry(
@@ -149,14 +162,14 @@ class _Walker:
         film, count = self.film, self.film.images.count
         begin = min(frame for frame, own in film.marks.items() if any(mark.label == "object" for mark in own))
         labels = np.zeros((count, *film.size), np.uint8)
-        self.starts[begin] = start(film.lab(begin), film.seeds(begin), self.settings.smoothness)
+        self.starts[begin] = start(film.lab(begin), film.seeds(begin), self.settings.smoothness, film.height(begin))
         labels[begin] = self.starts[begin].labels
         self.background = Background.empty(film.size) if self.settings.background else None
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
             walk = self._pass(begin, learns=True)
             for frame in frames:
                 seeds = film.seeds(frame, carried=True) if frame in film.marks else None
-                probability = walk.step(film.lab(frame), seeds).probability
+                probability = walk.step(film.lab(frame), film.depth(frame), seeds).probability
                 if seeds is not None:
                     self.starts[frame] = Start.of(walk.lab, probability, seeds)
                     walk.first = self._colors()
@@ -176,7 +189,7 @@ class _Walker:
         for frames in (range(keys[-1] + 1, count), range(keys[0] - 1, -1, -1)):
             walk = self._pass(keys[-1] if frames.step > 0 else keys[0], learns=False)
             for frame in frames:
-                step = walk.step(film.lab(frame))
+                step = walk.step(film.lab(frame), film.depth(frame))
                 labels[frame] = film.labels(step.probability)
                 cues[frame] = Cues.of(step, first[frame])
                 self._tick(2 * count)
@@ -189,10 +202,10 @@ class _Walker:
         forward, walk = {}, self._pass(left, learns=False)
         for frame in range(left + 1, right):
             # A byte is enough, and a long film fits into memory.
-            forward[frame] = np.round(255 * walk.step(self.film.lab(frame)).probability).astype(np.uint8)
+            forward[frame] = np.round(255 * walk.step(self.film.lab(frame), self.film.depth(frame)).probability).astype(np.uint8)
         walk = self._pass(right, learns=False)
         for frame in range(right - 1, left, -1):
-            step = walk.step(self.film.lab(frame))
+            step = walk.step(self.film.lab(frame), self.film.depth(frame))
             there, weight = forward.pop(frame) / np.float32(255), (frame - left) / (right - left)
             cues[frame] = Cues.of(step, there.argmax(axis=0))
             labels[frame] = self.film.labels((1 - weight) * there + weight * step.probability)
@@ -214,15 +227,14 @@ class _Walker:
     def _colors(self) -> tuple[np.ndarray, ...]:
         """Colors of nothing, object and hands in all marked frames so far."""
         starts = list(self.starts.values())
-        parts = [mixed([(1.0, own.counts[label]) for own in starts]) for label in range(3)]
-        return tuple(part if np.ndim(part) else np.zeros_like(starts[0].counts[0]) for part in parts)
+        return tuple(mixed([(1.0, own.counts[label]) for own in starts]) for label in LABELS)
 
     def _whole_background(self, labels: np.ndarray) -> Background:
         """The background from frames of the whole film, where their labels say nothing."""
         background = Background.empty(self.film.size)
         frames = np.unique(np.linspace(0, len(labels) - 1, BACKGROUND_FRAMES).astype(int)).tolist()
         for frame in frames:
-            background.learn(self.film.lab(frame), apart(labels[frame], APART))
+            background.learn(self.film.lab(frame), apart(labels[frame], APART), self.film.depth(frame))
         return background
 
     def _tick(self, total: int) -> None:

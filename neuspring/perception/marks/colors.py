@@ -54,4 +54,8 @@ def count(bins: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 def mixed(parts: list[tuple[float, np.ndarray]]) -> np.ndarray:
     """Counts with given weights, each part first scaled to a sum of 1; parts without counts are left out."""
-    return np.asarray(sum(weight * counts / counts.sum() for weight, counts in parts if counts.sum() > 0))
+    total = np.zeros_like(parts[0][1])
+    for weight, counts in parts:
+        if counts.sum() > 0:
+            total += weight * counts / counts.sum()
+    return total

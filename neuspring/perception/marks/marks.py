@@ -4,10 +4,10 @@
 
 | kind | points | what it says |
 |---|---|---|
-| `box` | two opposite corners | all of the label's pixels of this frame lie in boxes of this label; `ignore`: everything inside is neither |
+| `box` | two opposite corners | the label's pixels of this frame lie in its boxes; `ignore`: what is inside is neither |
 | `click` | one | the disk of `radius` has this label |
 | `scribble` | one or more | the line of half width `radius` has this label |
-| `polygon` | three or more | the label fills the polygon, up to `radius` at its border; `ignore`: everything inside is neither |
+| `polygon` | three or more | the label fills it, up to `radius` at its border; `ignore`: what is inside is neither |
 
 Points are pixels (x, y), pixel centers at whole coordinates, as in data/capture.py.
 """

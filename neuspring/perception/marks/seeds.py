@@ -71,6 +71,15 @@ class Seeds:
             possible[label, certain == label] = True
         return cls(certain, possible, prior)
 
+    @property
+    def marked(self) -> np.ndarray:
+        """Where something is certain or inside of a polygon [H, W] bool."""
+        return np.asarray((self.certain != UNKNOWN) | (self.prior[1:] > 0).any(axis=0))
+
+    def part(self, window: tuple[slice, slice]) -> Seeds:
+        """A window of it."""
+        return Seeds(self.certain[window], self.possible[(slice(None), *window)], self.prior[(slice(None), *window)])
+
 
 def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
     """The pixels [H, W] bool that a mark covers: a polygon without its uncertain border (-1), as it is (0), or grown by it (1)."""

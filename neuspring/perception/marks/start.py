@@ -27,6 +27,8 @@ LOCAL = 0.8
 """Probability that the background looks like the background around it."""
 AROUND = 0.03
 """How far around, as part of the image."""
+RISEN, RISEN_LOGS = 0.012, 2.0
+"""Height above the table, m, from which a pixel is probably object or hand, where marks let it be, and by which log odds."""
 COARSE = 6
 """Factor by which images are made smaller to be blurred."""
 LOCAL_NOISE = 2.0
@@ -58,10 +60,12 @@ class Start:
         return np.asarray(self.probability.argmax(axis=0), dtype=np.uint8)
 
 
-def start(lab: np.ndarray, seeds: Seeds, smoothness: float) -> Start:
-    """Labels and colors of a frame, Lab [H, W, 3], from its marks."""
+def start(lab: np.ndarray, seeds: Seeds, smoothness: float, height: np.ndarray | None = None) -> Start:
+    """Labels and colors of a frame, Lab [H, W, 3], from its marks, and from the height above the table [H, W], m."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
+    if height is not None:
+        place[NOTHING] -= np.where(np.nan_to_num(height) > RISEN, RISEN_LOGS, 0.0)
     for _ in range(TURNS):
         counts = counts_of(lab, bins, labels, seeds.certain)
         logs = np.stack([Colors.of(own).logs[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
@@ -91,8 +95,7 @@ def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np
                 parts.append((SHADED, count(bins_of(darker), near)))
         else:
             parts.append((CERTAIN_WEIGHT, count(bins, certain == label)))
-        total = mixed(parts)
-        counts.append(total if total.shape else np.zeros_like(parts[0][1]))
+        counts.append(mixed(parts))
     return counts
 
 

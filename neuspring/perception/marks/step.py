@@ -11,7 +11,7 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT
 from neuspring.perception.marks.background import Background, apart
 from neuspring.perception.marks.colors import Colors, bins_of, count, mixed
 from neuspring.perception.marks.field import solve
-from neuspring.perception.marks.seeds import Seeds
+from neuspring.perception.marks.seeds import FAR, Seeds
 from neuspring.perception.marks.start import LABELS, NEVER
 
 COLOR = 0.5
@@ -24,17 +24,24 @@ CHANGED = 12.0
 """Difference of L, a, b, from which the flow is doubted."""
 CONFIDENT = 0.95
 """Probability from which a pixel teaches colors."""
-LEARN = 0.08
-"""Weight of a frame in the running colors."""
+LEARN, EVERY = 0.2, 4
+"""Weight of a frame in the running colors, which are learned from each fourth frame."""
 TRUST_START = 0.6
-"""Weight of the marked frame's colors, against the running ones."""
+"""Weight of the marked frames' colors, against the running ones."""
+SHOWN = 0.5
+"""Weight of the colors beneath the marks of a frame on the way, against those of the frames before."""
 USUAL = 0.9
 """Probability that a background pixel has its usual color."""
 SURE_AFTER = 3.0
 """Looks after which the usual color of a pixel is known."""
-
 CORRECTION, CORRECTED = 6.0, 5.0
 """Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
+MOVES = 12.0
+"""How far things move in a frame at most, as a multiple of `reach`: the margin of the part of the image that is worked on."""
+BROUGHT = 0.2
+"""Probability by place from which a piece counts as brought by the flow."""
+LEAST_ENTERING = 0.0005
+"""Smallest part of the image that a hand covers when it comes in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +63,7 @@ class Pass:
     lab: np.ndarray
     """The last frame, Lab [H, W, 3]."""
     probability: np.ndarray
-    """[3, H, W]."""
+    """Of the last frame [3, H, W]."""
     first: tuple[np.ndarray, ...]
     """Colors of the marked frames: counts [bins] of nothing, object, hands."""
     background: Background | None
@@ -64,100 +71,155 @@ class Pass:
     """Whether the background is learned on the way."""
     smoothness: float
     reach: float
-    running: list[np.ndarray] = field(default_factory=list)
-    colors: list[Colors] = field(default_factory=list)
+    running: list[np.ndarray] = field(init=False)
+    colors: list[Colors] = field(init=False)
+    steps: int = 0
 
     def __post_init__(self) -> None:
         self.running = [np.zeros_like(own) for own in self.first]
-        self._learn(bins_of(self.lab))
+        self._learn(None)
 
-    def step(self, lab: np.ndarray, seeds: Seeds | None = None) -> Step:
-        """The next frame, Lab [H, W, 3], which becomes the last one; with its marks, if there are any."""
-        place, flow_doubt = self.place(lab)
-        color = self.color_logs(lab)
+    def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> Step:
+        """The next frame, Lab [H, W, 3], which becomes the last one; with its depth, m, and its marks, if there are any."""
+        window = self.window(lab, seeds)
+        near, before = lab[window], self.probability[(slice(None), *window)]
+        place, doubted = self.place(near, self.lab[window], before)
+        part = None if seeds is None else seeds.part(window)
+        if part is not None:
+            self._show(near, part)
+            place = self._appear(place, part)
+        color = self.color_logs(near, before, window, None if depth is None else depth[window])
         logs = np.log(place) + color
-        if seeds is not None:
-            logs += corrections(place, seeds, self.reach)
-        probability = solve(logs.astype(np.float32), lab, self.smoothness)
-        self.probability = self.tidy(probability, place, seeds)
-        self.lab = lab
-        self._learn(bins_of(lab))
-        chosen = np.take_along_axis(color, self.probability.argmax(axis=0)[None], axis=0)[0]
-        return Step(self.probability, flow_doubt, color.max(axis=0) - chosen)
+        if part is not None:
+            logs += corrections(place, part, self.reach)
+        solved = self.tidy(solve(logs.astype(np.float32), near, self.smoothness), place, window, part)
+        self.probability = np.zeros_like(self.probability)
+        self.probability[NOTHING] = 1.0
+        self.probability[(slice(None), *window)] = solved
+        self.lab, self.steps = lab, self.steps + 1
+        self._learn(depth)
+        chosen = np.take_along_axis(color, solved.argmax(axis=0)[None], axis=0)[0]
+        flow_doubt, misfit = np.zeros(lab.shape[:2], np.float32), np.zeros(lab.shape[:2], np.float32)
+        flow_doubt[window], misfit[window] = doubted, color.max(axis=0) - chosen
+        return Step(self.probability, flow_doubt, misfit)
 
-    def place(self, lab: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities [3, H, W] by what the flow brings, and how far the flow [H, W] is doubted, 0 to 1."""
-        flow = flow_between(lab[..., 0], self.lab[..., 0])
+    def window(self, lab: np.ndarray, seeds: Seeds | None) -> tuple[slice, slice]:
+        """The part of the image that is worked on: around what was there, what comes in from the border, and marks."""
+        busy = self.probability[NOTHING] < 0.9
+        if seeds is not None:
+            busy |= seeds.marked
+            if self._new(seeds):
+                return slice(None), slice(None)
+        if self.background is not None:
+            busy |= _entering(self.background.changed(lab))
+        margin = round(MOVES * self.reach)
+        places = []
+        for axis in (1, 0):
+            found = np.flatnonzero(busy.any(axis=axis))
+            places.append(slice(max(found[0] - margin, 0), found[-1] + margin + 1) if len(found) else slice(None))
+        return places[0], places[1]
+
+    def place(self, lab: np.ndarray, last: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Probabilities [3, h, w] by what the flow brings, and how far the flow [h, w] is doubted, 0 to 1."""
+        flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
         came = grid + flow
-        brought = [cv2.remap(q, came, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for q in self.probability]
-        before = cv2.remap(self.lab, came, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        change = np.abs(lab.astype(np.float32) - before).max(axis=-1)
+
+        def brought(values: np.ndarray) -> np.ndarray:
+            return cv2.remap(np.ascontiguousarray(values), came, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+        change = cv2.absdiff(np.ascontiguousarray(lab), brought(last)).max(axis=-1).astype(np.float32)
         doubt = np.clip(cv2.GaussianBlur(change, (0, 0), 1.5) / CHANGED, 0.05, 1.0)
-        narrow = [cv2.GaussianBlur(q, (0, 0), 0.35 * self.reach) for q in brought]
-        wide = [cv2.GaussianBlur(q, (0, 0), 2 * self.reach) for q in brought]
-        place = np.stack([(1 - doubt) * near + doubt * far for near, far in zip(narrow, wide, strict=True)])
+        moved = np.stack([brought(part) for part in probability], axis=-1)
+        narrow, wide = (cv2.GaussianBlur(moved, (0, 0), width * self.reach) for width in (0.35, 2.0))
+        place = ((1 - doubt)[..., None] * narrow + doubt[..., None] * wide).transpose(2, 0, 1)
         for label in (OBJECT, HANDS):
             if self.first[label].sum():
                 place[label] += ANYWHERE[label]
-        place += 1e-6
+        place = place + np.float32(1e-6)
         return place / place.sum(axis=0), doubt
 
-    def color_logs(self, lab: np.ndarray) -> np.ndarray:
-        """Weighted log densities [3, H, W] of a frame's colors."""
+    def _new(self, seeds: Seeds) -> list[int]:
+        """Labels that are marked on a frame and were on none before."""
+        return [label for label in (OBJECT, HANDS) if not self.first[label].any() and (seeds.certain == label).any()]
+
+    def _show(self, lab: np.ndarray, seeds: Seeds) -> None:
+        """Take the colors beneath the marks of a frame at once: they say what was not known before."""
+        bins = bins_of(lab)
+        for label in LABELS:
+            shown = count(bins, seeds.certain == label)
+            if shown.any():
+                self.colors[label] = Colors.of(mixed([(1.0, self.first[label]), (SHOWN, shown)]))
+
+    def _appear(self, place: np.ndarray, seeds: Seeds) -> np.ndarray:
+        """Probabilities by place [3, h, w], with new labels around their marks."""
+        for label in self._new(seeds):
+            away = cv2.distanceTransform((seeds.certain != label).astype(np.uint8), cv2.DIST_L2, 5)
+            place[label] += np.exp(-away / (FAR * max(self.lab.shape)))
+        return np.asarray(place / place.sum(axis=0))
+
+    def color_logs(
+        self, lab: np.ndarray, probability: np.ndarray, window: tuple[slice, slice], depth: np.ndarray | None
+    ) -> np.ndarray:
+        """Weighted log densities [3, h, w] of a frame's colors, and of its depth against the background's."""
         bins = bins_of(lab)
         logs = np.stack([own.logs[bins] for own in self.colors])
+        nearer = np.float32(0)
         if self.background is not None:
-            still = (self.probability[NOTHING] > CONFIDENT).astype(bool)
-            usual = self.background.log_density(lab, self.background.gain(lab, still))
-            known = np.clip(self.background.seen / SURE_AFTER, 0, 1) * USUAL
+            background = self.background.part(window)
+            usual = background.log_density(lab, background.gain(lab, probability[NOTHING] > CONFIDENT))
+            known = np.clip(background.seen / SURE_AFTER, 0, 1) * USUAL
             mixture = np.logaddexp(np.log(known + 1e-9) + usual, np.log(1 - known) + logs[NOTHING])
             logs[NOTHING] = np.where(known > 0, mixture, logs[NOTHING])
-        top = logs.max(axis=0)
-        return COLOR * np.maximum(logs - top, -MOST_COLOR / COLOR)
+            if depth is not None:
+                nearer = background.depth_log_ratio(depth)
+        logs = COLOR * np.maximum(logs - logs.max(axis=0), -MOST_COLOR / COLOR)
+        logs[NOTHING] += nearer
+        return np.asarray(logs, dtype=np.float32)
 
-    def tidy(self, probability: np.ndarray, place: np.ndarray, seeds: Seeds | None) -> np.ndarray:
-        """Pieces of object that nothing brought are nothing; hands may come in from the image's border."""
+    def tidy(self, probability: np.ndarray, place: np.ndarray, window: tuple[slice, slice], seeds: Seeds | None) -> np.ndarray:
+        """Pieces that nothing brought are nothing, unless they are marked; hands may come in from the image's border."""
         labels = probability.argmax(axis=0)
+        rows, columns = self.lab.shape[:2]
         for label in (OBJECT, HANDS):
             number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
-            if number == 1:
-                continue
-            support = np.bincount(pieces.ravel(), place[label].ravel() > 0.2, minlength=number)
-            areas = boxes[:, cv2.CC_STAT_AREA]
-            drop = support < 0.05 * areas
+            support = np.bincount(pieces.ravel(), place[label].ravel() > BROUGHT, minlength=number)
+            left, top, width, height, areas = boxes.T
+            drop = (support < 0.05 * areas) | (areas < 4)
             if label == HANDS:
-                left, top, width, height = (boxes[:, k] for k in range(4))
-                rows, columns = labels.shape
+                left, top = left + (window[1].start or 0), top + (window[0].start or 0)
                 entering = (left == 0) | (top == 0) | (left + width == columns) | (top + height == rows)
-                drop &= ~(entering & (areas > 0.0005 * labels.size))
-            drop |= areas < 4
+                drop &= ~(entering & (areas > LEAST_ENTERING * rows * columns))
             if seeds is not None:
                 drop[np.unique(pieces[seeds.certain == label])] = False
             drop[0] = False
-            lost = drop[pieces]
-            probability[:, lost] = np.array([0.98, 0.01, 0.01], np.float32)[:, None]
+            probability[:, drop[pieces]] = np.array([0.98, 0.01, 0.01], np.float32)[:, None]
         return probability
 
-    def _learn(self, bins: np.ndarray) -> None:
-        for label, first in enumerate(self.first):
+    def _learn(self, depth: np.ndarray | None) -> None:
+        """Colors, from each fourth frame, and the background."""
+        if self.background is not None and self.learns:
+            labels = self.probability.argmax(axis=0)
+            self.background.learn(self.lab, apart(labels, 3) & (self.probability[NOTHING] > CONFIDENT), depth)
+        if self.steps % EVERY:
+            return
+        bins = bins_of(self.lab)
+        for label in LABELS:
             sure = self.probability[label] > CONFIDENT
             if label != NOTHING:
                 core = cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+                # A thin rope has no core.
                 sure = core if core.sum() > 0.4 * sure.sum() else sure
             seen = count(bins, sure)
             if seen.sum():
                 self.running[label] = (1 - LEARN) * self.running[label] + LEARN * seen / seen.sum()
         parts = [mixed([(TRUST_START, a), (1 - TRUST_START, b)]) for a, b in zip(self.first, self.running, strict=True)]
-        self.colors = [Colors.of(part if np.ndim(part) else np.zeros_like(self.first[0])) for part in parts]
-        if self.background is not None and self.learns:
-            labels = self.probability.argmax(axis=0)
-            self.background.learn(self.lab, apart(labels, 3) & (self.probability[NOTHING] > CONFIDENT))
+        self.colors = [Colors.of(part) for part in parts]
 
 
 def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
-    """Log odds [3, H, W] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
+    """Log odds [3, h, w] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
     for label in LABELS:
@@ -172,3 +234,15 @@ def flow_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Flow [H, W, 2], pixels: where in image `there` each pixel of `here` is (gray [H, W] uint8)."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     return np.asarray(method.calc(np.ascontiguousarray(here), np.ascontiguousarray(there), None))
+
+
+def _entering(changed: np.ndarray) -> np.ndarray:
+    """Pieces of what changed [H, W] bool that reach the border of the image and are not small."""
+    opened = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, pieces, boxes, _ = cv2.connectedComponentsWithStats(opened)
+    left, top, width, height, area = boxes.T
+    rows, columns = changed.shape
+    keep = (left == 0) | (top == 0) | (left + width == columns) | (top + height == rows)
+    keep &= area > LEAST_ENTERING * changed.size
+    keep[0] = False
+    return np.asarray(keep[pieces])

@@ -1,9 +1,9 @@
 """Masks of a capture: made from its marks, and kept in its folder mask/.
 
-    marks = Marks.load(folder / MARKS)
-    capture = Capture.load(folder)
-    carried = carry_camera(capture, "0", marks.of("0"), MarksSegmentation())
-    save_masks(capture, "0", carried.labels)
+marks = Marks.load(folder / MARKS)
+capture = Capture.load(folder)
+carried = carry_camera(capture, "0", marks.of("0"), MarksSegmentation())
+save_masks(capture, "0", carried.labels)
 """
 
 from __future__ import annotations
