@@ -46,6 +46,10 @@ HAND_PIECE = 0.15
 LARGEST_HOLE = 0.0015
 """Holes in the foreground up to this part of the image are filled: print that has the table's color."""
 SPECK = np.ones((3, 3), np.uint8)
+THIN_WIDTH = 7
+"""What is as wide, pixels, is no thin rope."""
+THIN_HAND_PIECE = 0.03
+"""HAND_PIECE where the object is a thin rope: no part of it is as large as what is seen of a hand."""
 THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
 """Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
 
@@ -140,7 +144,7 @@ def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings
     foreground |= _holes(foreground)
     hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), settings.smoothing) > 0
     labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
-    return _tidy(labels, settings)
+    return _slim(_tidy(labels, settings)) if settings.thin else _tidy(labels, settings)
 
 
 def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -177,6 +181,18 @@ def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: Op
     high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
     logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
     return solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5
+
+
+def _slim(labels: np.ndarray) -> np.ndarray:
+    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade have few colors of hands."""
+    own = (labels == OBJECT).astype(np.uint8)
+    wide = cv2.morphologyEx(own, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN_WIDTH,) * 2))
+    near = cv2.dilate((labels == HANDS).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    _, pieces = cv2.connectedComponents(wide)
+    fingers = np.isin(pieces, np.setdiff1d(pieces[near], 0)).astype(np.uint8)
+    slim = labels.copy()
+    slim[(cv2.dilate(fingers, SPECK) > 0) & (own > 0)] = HANDS
+    return slim
 
 
 def _region(capture: Capture, camera: str, frame: int, settings: OpenCvSegmentation) -> np.ndarray:
@@ -217,7 +233,7 @@ def _holes(foreground: np.ndarray) -> np.ndarray:
 def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     """Specks, and pieces of hand color much smaller than the hand, become what surrounds them: nothing, or the other label."""
     tidy = labels.copy()
-    for label, share in ((HANDS, HAND_PIECE), (OBJECT, 0.0)):
+    for label, share in ((HANDS, THIN_HAND_PIECE if settings.thin else HAND_PIECE), (OBJECT, 0.0)):
         count, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
         least = max(settings.smallest * labels.size, share * areas.max()) if count > 1 else 0.0

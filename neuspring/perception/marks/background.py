@@ -9,12 +9,17 @@ import numpy as np
 
 LEAST_SPREAD = np.array([4.0, 2.5, 2.5], np.float32)
 """Smallest standard deviation of L, a and b: noise of sensor and compression."""
-SHADOW, DARKEST = 0.3, 90.0
-"""Probability that a pixel of the background lies in a shadow: darker by up to DARKEST, of almost the same hue."""
-TINTED = 2.0
-"""How much more a and b vary in a shadow: the object throws its color there."""
+SHADOW, TINT = 0.22, 0.08
+"""Probabilities that a pixel of the background lies in a shadow, and in a shadow that has the color of what throws it."""
+SHADE, TINTED = 35.0, 2.0
+"""How much darker shadows are in the mean, L, and how much more a and b vary in a tinted one."""
+NEVER_SHADE = -50.0
 FORGET = 0.05
 """Smallest weight of a new frame in the running mean."""
+USUAL = 0.9
+"""Probability that a background pixel has its usual color."""
+SURE_AFTER = 3.0
+"""Looks after which the usual color of a pixel is known."""
 DIFFERENT = 30
 """Difference of L, a or b from which a pixel may show something that came in."""
 LEAST_KNOWN = 500
@@ -73,6 +78,12 @@ class Background:
         """
         return shaded_density(lab.astype(np.float32) - self.mean - gain, np.sqrt(self.variance + LEAST_SPREAD**2))
 
+    def explain(self, logs: np.ndarray, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Log densities [H, W] of the background: from `logs`, those of its colors anywhere, and the usual color of each pixel."""
+        known = np.clip(self.seen / SURE_AFTER, 0, 1) * USUAL
+        mixture = np.logaddexp(np.log(known + 1e-9) + self.log_density(lab, gain), np.log(1 - known) + logs)
+        return np.asarray(np.where(known > 0, mixture, logs), dtype=np.float32)
+
     def gain(self, lab: np.ndarray, where: np.ndarray) -> np.ndarray:
         """By how much the frame is lighter [3], from pixels `where` [H, W] it shows the background; 0 where few are known."""
         sparse = (slice(None, None, 3), slice(None, None, 3))
@@ -98,15 +109,16 @@ class Background:
 def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Log density [H, W] per unit of (L, a, b) of colors that differ by `step` [H, W, 3] from a usual color of this spread.
 
-    Normal, or with SHADOW a shadow: L is darker by anything up to DARKEST, a and b are almost as usual.
+    A mixture of three: normal; a shadow, darker by d in L, of density exp(-d / s) / s, a and b as usual; and a shadow that has the
+    color of what throws it, a and b TINTED times as wide.
     """
     near = step / spread
     hue = 0.5 * (near[..., 1] ** 2 + near[..., 2] ** 2)
     area = np.log(2 * np.pi * spread[..., 1] * spread[..., 2])
-    lit = -0.5 * near[..., 0] ** 2 - np.log(np.sqrt(2 * np.pi) * spread[..., 0]) - hue - area
-    shaded = -np.log(DARKEST) - hue / TINTED**2 - area - 2 * np.log(TINTED)
-    darker = (step[..., 0] < 0) & (step[..., 0] > -DARKEST)
-    return np.asarray(np.logaddexp(np.log(1 - SHADOW) + lit, np.where(darker, np.log(SHADOW) + shaded, -50.0)), dtype=np.float32)
+    lit = np.log(1 - SHADOW - TINT) - 0.5 * near[..., 0] ** 2 - np.log(np.sqrt(2 * np.pi) * spread[..., 0]) - hue
+    darker = np.where(step[..., 0] < 0, step[..., 0] / SHADE - np.log(SHADE), NEVER_SHADE)
+    shaded = np.logaddexp(np.log(SHADOW) - hue, np.log(TINT) - hue / TINTED**2 - 2 * np.log(TINTED))
+    return np.asarray(np.logaddexp(lit, darker + shaded) - area, dtype=np.float32)
 
 
 def apart(labels: np.ndarray, distance: int) -> np.ndarray:

@@ -153,16 +153,21 @@ class _Walker:
     done: int = 0
 
     @property
-    def keys(self) -> list[int]:
-        """Frames with an object or hands marked on, from the first one with an object."""
-        return sorted(frame for frame, own in self.film.marks.items() if any(mark.label != "ignore" for mark in own))
+    def _begin(self) -> int:
+        """The first frame with an object marked on."""
+        return min(frame for frame, own in self.film.marks.items() if any(mark.label == "object" for mark in own))
+
+    def _start(self) -> Start:
+        """That frame, solved from its marks."""
+        lab, seeds, height = self.film.lab(self._begin), self.film.seeds(self._begin), self.film.height(self._begin)
+        return start(lab, seeds, self.settings.smoothness, height, self.background)
 
     def first_pass(self) -> np.ndarray:
         """Labels [T, h, w], from the first frame with an object marked on; marked frames on the way correct them."""
         film, count = self.film, self.film.images.count
-        begin = min(frame for frame, own in film.marks.items() if any(mark.label == "object" for mark in own))
+        begin = self._begin
         labels = np.zeros((count, *film.size), np.uint8)
-        self.starts[begin] = start(film.lab(begin), film.seeds(begin), self.settings.smoothness, film.height(begin))
+        self.starts[begin] = self._start()
         labels[begin] = self.starts[begin].labels
         self.background = Background.empty(film.size) if self.settings.background else None
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
@@ -174,7 +179,7 @@ class _Walker:
                     self.starts[frame] = Start.of(walk.lab, probability, seeds)
                     walk.first = self._colors()
                 labels[frame] = probability.argmax(axis=0)
-                self._tick(2 * count)
+                self._tick()
         return labels
 
     def second_pass(self, first: np.ndarray) -> Carried:
@@ -182,6 +187,8 @@ class _Walker:
         film, count = self.film, self.film.images.count
         if self.background is not None:
             self.background = self._whole_background(first)
+            # What was uncovered later shows where the object ended at first.
+            self.starts[self._begin] = self._start()
         labels, cues = np.zeros((count, *film.full), np.uint8), [Cues() for _ in range(count)]
         keys = sorted(self.starts)
         for key in keys:
@@ -192,7 +199,7 @@ class _Walker:
                 step = walk.step(film.lab(frame), film.depth(frame))
                 labels[frame] = film.labels(step.probability)
                 cues[frame] = Cues.of(step, first[frame])
-                self._tick(2 * count)
+                self._tick()
         for left, right in pairwise(keys):
             self._between(left, right, labels, cues)
         return Carried(labels, doubt_of(labels, cues))
@@ -209,7 +216,7 @@ class _Walker:
             there, weight = forward.pop(frame) / np.float32(255), (frame - left) / (right - left)
             cues[frame] = Cues.of(step, there.argmax(axis=0))
             labels[frame] = self.film.labels((1 - weight) * there + weight * step.probability)
-            self._tick(2 * self.film.images.count)
+            self._tick()
 
     def _pass(self, key: int, *, learns: bool) -> Pass:
         own = self.starts[key]
@@ -237,6 +244,7 @@ class _Walker:
             background.learn(self.film.lab(frame), apart(labels[frame], APART), self.film.depth(frame))
         return background
 
-    def _tick(self, total: int) -> None:
+    def _tick(self) -> None:
+        # The first pass solves all frames but its start, the second one all that are not marked.
         self.done += 1
-        self.progress(min(self.done, total), total)
+        self.progress(self.done, 2 * self.film.images.count - 1 - len(self.film.marks))

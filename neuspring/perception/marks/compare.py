@@ -46,7 +46,9 @@ def compare(masks: Path, truth: Path) -> list[Agreement]:
 def table(rows: list[Agreement]) -> str:
     """Text of a table: IoU per frame, and the mean."""
     lines = ["frame  object  hands"] + [f"{row.frame:5d}  {row.object:6.3f}  {row.hands:5.3f}" for row in rows]
-    means = [float(np.nanmean([getattr(row, name) for row in rows])) for name in ("object", "hands")]
+    values = np.array([[row.object, row.hands] for row in rows])
+    known = np.isfinite(values)
+    means = np.where(known, values, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
     return "\n".join([*lines, f" mean  {means[0]:6.3f}  {means[1]:5.3f}"]) + "\n"
 
 

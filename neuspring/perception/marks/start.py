@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT
-from neuspring.perception.marks.background import shaded_density
+from neuspring.perception.marks.background import Background, shaded_density
 from neuspring.perception.marks.colors import Colors, bins_of, count, mixed
 from neuspring.perception.marks.field import solve
 from neuspring.perception.marks.seeds import UNKNOWN, Seeds
@@ -60,8 +60,14 @@ class Start:
         return np.asarray(self.probability.argmax(axis=0), dtype=np.uint8)
 
 
-def start(lab: np.ndarray, seeds: Seeds, smoothness: float, height: np.ndarray | None = None) -> Start:
-    """Labels and colors of a frame, Lab [H, W, 3], from its marks, and from the height above the table [H, W], m."""
+def start(
+    lab: np.ndarray,
+    seeds: Seeds,
+    smoothness: float,
+    height: np.ndarray | None = None,
+    background: Background | None = None,
+) -> Start:
+    """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, and the background."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
     if height is not None:
@@ -71,6 +77,8 @@ def start(lab: np.ndarray, seeds: Seeds, smoothness: float, height: np.ndarray |
         logs = np.stack([Colors.of(own).logs[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
         near = np.log(LOCAL) + _local_density(lab, labels == NOTHING)
         logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL) + logs[NOTHING])
+        if background is not None:
+            logs[NOTHING] = background.explain(logs[NOTHING], lab, np.zeros(3, np.float32))
         logs = place + COLOR * logs
         probability = solve(logs.astype(np.float32), lab, smoothness)
         labels = tidy(probability.argmax(axis=0).astype(np.uint8), seeds)

@@ -30,10 +30,6 @@ TRUST_START = 0.6
 """Weight of the marked frames' colors, against the running ones."""
 SHOWN = 0.5
 """Weight of the colors beneath the marks of a frame on the way, against those of the frames before."""
-USUAL = 0.9
-"""Probability that a background pixel has its usual color."""
-SURE_AFTER = 3.0
-"""Looks after which the usual color of a pixel is known."""
 CORRECTION, CORRECTED = 6.0, 5.0
 """Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
 MOVES = 12.0
@@ -73,9 +69,12 @@ class Pass:
     reach: float
     running: list[np.ndarray] = field(init=False)
     colors: list[Colors] = field(init=False)
+    explained: np.ndarray = field(init=False)
+    """[H, W] bool: where the background explains the last frame's colors best."""
     steps: int = 0
 
     def __post_init__(self) -> None:
+        self.explained = np.zeros(self.lab.shape[:2], bool)
         self.running = [np.zeros_like(own) for own in self.first]
         self._learn(None)
 
@@ -168,12 +167,13 @@ class Pass:
         nearer = np.float32(0)
         if self.background is not None:
             background = self.background.part(window)
-            usual = background.log_density(lab, background.gain(lab, probability[NOTHING] > CONFIDENT))
-            known = np.clip(background.seen / SURE_AFTER, 0, 1) * USUAL
-            mixture = np.logaddexp(np.log(known + 1e-9) + usual, np.log(1 - known) + logs[NOTHING])
-            logs[NOTHING] = np.where(known > 0, mixture, logs[NOTHING])
+            gain = background.gain(lab, probability[NOTHING] > CONFIDENT)
+            logs[NOTHING] = background.explain(logs[NOTHING], lab, gain)
             if depth is not None:
                 nearer = background.depth_log_ratio(depth)
+        # What the background explains teaches no color of the object: its shadow would become a part of it.
+        self.explained = np.zeros(self.lab.shape[:2], bool)
+        self.explained[window] = logs[NOTHING] > logs[1:].max(axis=0)
         logs = COLOR * np.maximum(logs - logs.max(axis=0), -MOST_COLOR / COLOR)
         logs[NOTHING] += nearer
         return np.asarray(logs, dtype=np.float32)
@@ -210,7 +210,7 @@ class Pass:
             if label != NOTHING:
                 core = cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
                 # A thin rope has no core.
-                sure = core if core.sum() > 0.4 * sure.sum() else sure
+                sure = (core if core.sum() > 0.4 * sure.sum() else sure) & ~self.explained
             seen = count(bins, sure)
             if seen.sum():
                 self.running[label] = (1 - LEARN) * self.running[label] + LEARN * seen / seen.sum()
