@@ -4,6 +4,8 @@ TOOLS = {
     "draw": ("neuspring.stages.draw", "splats and trajectory -> RGBA pictures of any camera"),
     "fetch": ("neuspring.cli.data", "released archives -> the folders that the readers expect"),
     "check-data": ("neuspring.cli.data", "report how a data folder departs from the expected layout"),
+    "mask": ("neuspring.cli.masks", "marks on a few frames -> masks of object and hands in every frame of a capture"),
+    "compare-masks": ("neuspring.cli.masks", "two folders of masks -> their overlap per frame"),
     "verify-released": ("neuspring.cli.data", "PhysTwin's released results, checked against ours"),
     "tables": ("neuspring.cli.results", "run records -> tables"),
     "perception-table": ("neuspring.cli.results", "errors of perception, per category"),

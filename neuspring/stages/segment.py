@@ -7,13 +7,17 @@ from pathlib import Path
 
 from neuspring import config
 from neuspring.config import Config
+from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.mask_facts import mask_facts
+from neuspring.perception.mask_verdict import verdict
 from neuspring.perception.results import Masks
 from neuspring.stages import options as shared
+
+REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or set a region of interest (perception.segment.opencv)."
 
 
 def options(parser: ArgumentParser) -> None:
@@ -42,7 +46,14 @@ def run(folder: Path, camera: str, settings: Config, device: str, output: Path) 
     capture = Capture.load(folder)
     capture.require_camera(camera)
     labels = BACKENDS["segment"][section.backend].segment(capture, camera, settings.perception, device)
-    masks = Masks(labels=labels, backend=section.backend, facts=mask_facts(capture, camera, labels))
+    facts = mask_facts(capture, camera, labels)
+    numbers, findings = verdict(capture, camera, labels)
+    for finding in findings:
+        print(f"warning: camera {camera}: {finding}", flush=True)
+    if findings and section.verdict == "error":
+        rule = "perception.segment.verdict: error asks for masks that can be right"
+        raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(findings), REMEDY)
+    masks = Masks(labels=labels, backend=section.backend, facts=facts | numbers)
     files = record.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])
