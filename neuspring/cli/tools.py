@@ -6,6 +6,7 @@ TOOLS = {
     "check-data": ("neuspring.cli.data", "report how a data folder departs from the expected layout"),
     "mask": ("neuspring.cli.masks", "marks on a few frames -> masks of object and hands in every frame of a capture"),
     "compare-masks": ("neuspring.cli.masks", "two folders of masks -> their overlap per frame"),
+    "annotate": ("neuspring.cli.annotate", "mark masks and tracks of a capture in the browser"),
     "verify-released": ("neuspring.cli.data", "PhysTwin's released results, checked against ours"),
     "tables": ("neuspring.cli.results", "run records -> tables"),
     "perception-table": ("neuspring.cli.results", "errors of perception, per category"),
