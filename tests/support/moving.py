@@ -28,8 +28,10 @@ def texture(size: int, seed: int) -> np.ndarray:
     return cv2.normalize(noise, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload,no-any-return]
 
 
-def moving(folder: Path, *, missing: tuple[int, ...] = (), depth: bool = True) -> Capture:
-    """The capture, cameras "0" and "covered"; "0" lacks the frames `missing`."""
+def moving(
+    folder: Path, *, missing: tuple[int, ...] = (), depth: bool = True, tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Capture:
+    """The capture, cameras "0" and "covered"; "0" lacks the frames `missing`. All is gray, but for the square's tint."""
     cameras = (entry("0", *SIZE, missing=missing), entry("covered", *SIZE))
     writer = Writer(folder, describe(frame_count=FRAMES, cameras=cameras, masks=False))
     wall, square = texture(SIZE[0], 0)[: SIZE[1]], texture(SIDE, 1)
@@ -37,7 +39,7 @@ def moving(folder: Path, *, missing: tuple[int, ...] = (), depth: bool = True) -
         place = np.hstack([np.eye(2), (CORNER + frame * SHIFT)[:, None]])
         moved = cv2.warpAffine(square, place, SIZE)
         own = cv2.warpAffine(np.full_like(square, 255), place, SIZE) > 250
-        image = np.where(own, moved, wall)
+        image = np.where(own[..., None], moved[..., None] * np.array(tint), wall[..., None]).astype(np.uint8)
         distance = np.where(own, 1000 * NEAR, 1000 * FAR).astype(np.uint16)
         for camera in cameras:
             if frame in camera.missing:
@@ -45,7 +47,7 @@ def moving(folder: Path, *, missing: tuple[int, ...] = (), depth: bool = True) -
             seen = image.copy()
             if camera.name == "covered" and frame in COVERED:
                 seen[:, 20:100] = 128
-            writer.frame(camera.name, frame, np.repeat(seen[..., None], 3, axis=2), distance)
+            writer.frame(camera.name, frame, seen, distance)
             if not depth:
                 writer.capture.path("depth", camera.name, frame).unlink()
     return writer.finish()
