@@ -164,9 +164,11 @@ def test_frames_and_cameras_are_reached_by_keys(page):
     assert page.text("#frame-text") == "frame 11 of 0–11"
     page.browser.key("k")
     assert page.browser.run("annotate.camera") == "covered"
+    page.browser.click("#overlay")  # a clicked button does not take the keys
     page.browser.key("Home")
     page.browser.key(" ")
     page.browser.wait("annotate.frame === 11")
+    assert page.browser.run("annotate.view.showOverlay") is False
     page.browser.key("k")
     page.browser.run("annotate.go(4)")
     page.shown("#hint", "This camera missed this frame.")

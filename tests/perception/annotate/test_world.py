@@ -1,5 +1,8 @@
 """Places in images to points in the world, and what is said to be doubtful about them."""
 
+import re
+from importlib.resources import files
+
 import numpy as np
 import pytest
 
@@ -123,3 +126,12 @@ def test_looks_are_noted(capture):
 def test_tracks_need_a_point(capture):
     with pytest.raises(InputError, match=r"annotations\.json: a point or more must be clicked; received 0"):
         tracks_of(capture, Annotations())
+
+
+def test_the_script_of_the_page_makes_tracks(tmp_path):
+    text = files("neuspring.perception").joinpath("README.md").read_text().split("### In the browser")[1]
+    script = re.search("```python\n(.*?)```", text, re.DOTALL)[1]
+    capture = moving(tmp_path)
+    exec(script.replace("FOLDER", str(tmp_path)), {})
+    assert capture.tracks().shape == (FRAMES, 1, 3)
+    assert np.isfinite(capture.tracks()).any()

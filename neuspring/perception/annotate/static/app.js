@@ -33,6 +33,8 @@ class App {
     for (const name of ["masks", "tracks"]) find(`mode-${name}`).onclick = () => this.setMode(name);
     find("show-help").onclick = () => find("help").showModal();
     find("overlay").onclick = () => this.toggleOverlay();
+    // A button that was clicked gives the keys back: Space plays, and does not press it again.
+    document.addEventListener("click", (event) => event.detail && event.target.closest("button")?.blur());
     window.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("beforeunload", (event) => {
       if (Object.values(this.modes).some((mode) => mode.edits.dirty)) event.preventDefault();
