@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import Count, NonNegative, Positive, Range, Section
+from neuspring.config.types import Count, Finite, Name, NonNegative, Positive, Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +24,34 @@ class OpenCvSegmentation(Section):
     """Width, pixels, over which the decision between hand and object is averaged."""
     smallest: NonNegative = 0.0004
     """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
+    boxes: dict[Name, tuple[Finite, Finite, Finite, Finite]] = field(default_factory=dict)
+    """Region of interest: by camera, left, top, right and bottom, pixels. Cameras that are not named have none."""
+    table: tuple[Range, Range] | None = None
+    """Region of interest: ranges of x and y on the table, m in the world; null: everywhere."""
+    sleeves: bool = False
+    """What moves, touches a hand and reaches the border of the image is hand too, whatever its color."""
+    clutter: Literal["keep", "drop"] = "keep"
+    """drop: what never moves and is not held is not the object."""
+    object: Literal["all", "largest", "moving", "nearest_hand"] = "all"
+    """Which of several pieces of frame 0, and what overlaps with it later. all: every one. moving: the one with most pixels that
+    change during the video."""
+    thin: bool = False
+    """For ropes of a few pixels: nothing is opened, neighbors decide the border less than in GrabCut, and what is wider and touches a
+    hand is hand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarksSegmentation(Section):
+    """Segmentation from the marks of a user (`marks.json` of the capture), carried through the video."""
+
+    smoothness: NonNegative = 1.5
+    """Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
+    reach: Positive = 4.0
+    """How far the border may be from where the flow carries it, pixels at a width of 848."""
+    background: bool = True
+    """Learn the color of every pixel of the background; for a camera that stands still."""
+    scale: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """Size of the images that are worked on, as a multiple of the camera's; 2 helps ropes of a few pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,10 +199,14 @@ class Sampling(Section):
 class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
-    backend: Literal["given", "opencv", "grounded_sam2"] = "given"
-    """given: the capture's masks. opencv: height and color. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
+    """given: the capture's masks. opencv: height and color. marks: the capture's marks.json, carried through the video.
+    grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    marks: MarksSegmentation = field(default_factory=MarksSegmentation)
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
+    verdict: Literal["warn", "error"] = "warn"
+    """What happens where masks made here cannot be right: it is printed and recorded (warn), or the step fails (error)."""
 
 
 @dataclass(frozen=True, kw_only=True)

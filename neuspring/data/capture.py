@@ -253,14 +253,19 @@ class Writer:
         folder, before = self.capture.folder, self.capture.description
         description = replace(before, provenance={**before.provenance, "images": images_digest(folder), **provenance})
         if tracks is not None:
-            listed = [
-                [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
-                for track in np.swapaxes(tracks, 0, 1)
-            ]
-            write_text(folder / TRACKS, json.dumps(listed) + "\n")
+            write_tracks(folder, tracks)
         plain = TypeAdapter(Description).dump_python(description, mode="json")
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
+
+
+def write_tracks(folder: Path, tracks: np.ndarray) -> None:
+    """Write tracks.json of a capture's folder from tracks [T, K, 3], m, NaN where not annotated."""
+    listed = [
+        [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
+        for track in np.swapaxes(tracks, 0, 1)
+    ]
+    write_text(folder / TRACKS, json.dumps(listed) + "\n")
 
 
 def images_digest(folder: Path) -> str:

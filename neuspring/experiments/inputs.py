@@ -404,7 +404,9 @@ def options(files: Mapping[str, Any], **names: str) -> list[str]:
 def _stamps(folder: Path) -> str:
     digest = hashlib.sha256()
     kinds = [folder / kind for kind in ("color", "depth", "mask")]
-    for path in sorted(path for kind in kinds for path in kind.rglob("*")):
+    # Marks are segmented from as images are.
+    marks = [path for path in [folder / "marks.json"] if path.exists()]
+    for path in sorted([*marks, *(path for kind in kinds for path in kind.rglob("*"))]):
         # A link without target must not end the planning either: whoever reads it says so.
         facts = path.stat() if path.exists() else path.lstat()
         digest.update(f"{path} {facts.st_size} {facts.st_mtime_ns}".encode())

@@ -2,7 +2,7 @@
 
 | step | modules |
 |---|---|
-| segment | `segment_given`, `segment_opencv`, `segment_sam2`: which pixels show the object and the hands |
+| segment | `segment_given`, `segment_opencv`, `segment_marks`, `segment_sam2`: which pixels show the object and the hands |
 | track | `track_opencv`, `track_cotracker`, `track_truth`: where the pixels of frame 0 go |
 | lift | `lift`, `controllers`: tracks of all cameras -> points in the world, and which points of the hands move the object |
 | | `release`: when hands let go |
@@ -12,6 +12,8 @@
 | findings | `look`, `look_world`: what the steps notice about their own results |
 | look, judge | `figures`: pictures of each step; `judge`: errors against the truth of a synthetic capture |
 
-`backends`: `BACKENDS` declares the backends of segmentation and tracking; `mask_facts`: quality numbers of masks; `assemble`:
-observations. `results` declares what the steps hand on: `Masks`, `PixelTracks`, `LiftedTracks`, `ShapePrior`.
+`marks`: masks from a few marks of a user. `segment_pieces`: pieces of automatic masks over the video. `mask_verdict`: whether masks
+can be right. `backends`: `BACKENDS` declares the backends of segmentation and tracking; `mask_facts`: quality numbers of masks;
+`assemble`: observations. `results` declares what the steps hand on: `Masks`, `PixelTracks`, `LiftedTracks`, `ShapePrior`.
+`annotate`: the page on which a person makes masks and ground-truth tracks.
 """

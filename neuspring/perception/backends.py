@@ -56,6 +56,7 @@ BACKENDS = {
     "segment": {
         "given": Backend(module="neuspring.perception.segment_given"),
         "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv"),
+        "marks": Backend(module="neuspring.perception.segment_marks", section="marks"),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },
     "track": {

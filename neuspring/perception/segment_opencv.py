@@ -5,6 +5,7 @@
 2. Per frame, the log ratio of both and the height make seeds, and GrabCut draws the border.
 3. Foreground is divided into hands and object by the same kind of ratio. The hands' histogram starts from skin tones and is made
    again from the hands that these show. Only pieces of some size are hands.
+4. Where settings ask for it, pieces are judged over the whole video (`segment_pieces`): sleeves, clutter, which object.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from scipy.ndimage import gaussian_filter
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.marks.field import solve
+from neuspring.perception.segment_pieces import sort_pieces
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""
@@ -43,6 +46,12 @@ HAND_PIECE = 0.15
 LARGEST_HOLE = 0.0015
 """Holes in the foreground up to this part of the image are filled: print that has the table's color."""
 SPECK = np.ones((3, 3), np.uint8)
+THIN_WIDTH = 7
+"""What is as wide, pixels, is no thin rope."""
+THIN_HAND_PIECE = 0.03
+"""HAND_PIECE where the object is a thin rope: no part of it is as large as what is seen of a hand."""
+THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
+"""Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,7 @@ def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.n
     for frame in range(capture.frame_count):
         if capture.has(camera, frame):
             labels[frame] = _frame(capture, camera, frame, palette, settings)
-    return labels
+    return sort_pieces(capture, camera, labels, settings)
 
 
 def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palette:
@@ -81,7 +90,7 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
     views = []
     for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
         image, height = capture.colour(camera, frames[index]), _heights(capture, camera, frames[index])
-        risen = height > settings.height
+        risen = (height > settings.height) & _region(capture, camera, frames[index], settings)
         views.append((image, risen))
         above += _count(_bins(image)[risen])
         edge = _border(risen.shape) & ~(height > settings.height / 2)
@@ -125,12 +134,17 @@ def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings
     flat = np.nan_to_num(height, nan=0.0) < settings.height
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
-    seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
-    foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) if seeds.any() else seeds
+    region = _region(capture, camera, frame, settings)
+    seeds &= region
+    if settings.thin:
+        foreground = _thin(image, palette.rise[bins], height, settings) & region
+    else:
+        seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
+        foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) & region if seeds.any() else seeds
     foreground |= _holes(foreground)
     hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), settings.smoothing) > 0
     labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
-    return _tidy(labels, settings)
+    return _slim(_tidy(labels, settings)) if settings.thin else _tidy(labels, settings)
 
 
 def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -155,6 +169,56 @@ def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndar
     return mask
 
 
+def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+    """Foreground [H, W] bool by color and height, each pixel nearly for itself: a rope of three pixels is all border.
+
+    A pixel's log odds are those of its color, and 2 for being as high as `height` or -1 for lying lower; none without depth.
+    """
+    rise = np.where(
+        np.isnan(height), 0.0, np.clip(2 * height / settings.height, -1.0, 2.0) - np.where(height < settings.height, 1, 0)
+    )
+    odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
+    high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
+    logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
+    return solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5
+
+
+def _slim(labels: np.ndarray) -> np.ndarray:
+    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade have few colors of hands."""
+    own = (labels == OBJECT).astype(np.uint8)
+    wide = cv2.morphologyEx(own, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN_WIDTH,) * 2))
+    near = cv2.dilate((labels == HANDS).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    _, pieces = cv2.connectedComponents(wide)
+    fingers = np.isin(pieces, np.setdiff1d(pieces[near], 0)).astype(np.uint8)
+    slim = labels.copy()
+    slim[(cv2.dilate(fingers, SPECK) > 0) & (own > 0)] = HANDS
+    return slim
+
+
+def _region(capture: Capture, camera: str, frame: int, settings: OpenCvSegmentation) -> np.ndarray:
+    """The region of interest [H, W] bool. Pixels without depth are judged by the point of the table behind them."""
+    view = capture.cameras[camera]
+    region = np.ones((view.height, view.width), dtype=bool)
+    if camera in settings.boxes:
+        left, top, right, bottom = settings.boxes[camera]
+        rows, columns = np.indices(region.shape)
+        region &= (columns >= left) & (columns <= right) & (rows >= top) & (rows <= bottom)
+        if not region.any():
+            rule = f"must hold a pixel of the image of {view.width} x {view.height}"
+            raise InputError(f"perception.segment.opencv.boxes.{camera}", rule, settings.boxes[camera])
+    if settings.table is not None:
+        pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
+        depth, eye = capture.depth(camera, frame), view.camera_to_world[:3, 3]
+        one = view.lift(pixels, np.ones_like(depth))
+        fall = eye[2] - one[..., 2]
+        behind = np.where(np.abs(fall) > 1e-9, eye[2] / np.where(np.abs(fall) > 1e-9, fall, 1.0), np.inf)
+        points = view.lift(pixels, np.where(depth > 0, depth, np.clip(behind, 0.0, 100.0)))
+        (least_x, most_x), (least_y, most_y) = settings.table
+        x, y = points[..., 0], points[..., 1]
+        region &= (least_x <= x) & (x <= most_x) & (least_y <= y) & (y <= most_y)
+    return region
+
+
 def _holes(foreground: np.ndarray) -> np.ndarray:
     """Small enclosed pieces of background [H, W] bool."""
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats((~foreground).astype(np.uint8), connectivity=4)
@@ -169,7 +233,7 @@ def _holes(foreground: np.ndarray) -> np.ndarray:
 def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     """Specks, and pieces of hand color much smaller than the hand, become what surrounds them: nothing, or the other label."""
     tidy = labels.copy()
-    for label, share in ((HANDS, HAND_PIECE), (OBJECT, 0.0)):
+    for label, share in ((HANDS, THIN_HAND_PIECE if settings.thin else HAND_PIECE), (OBJECT, 0.0)):
         count, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
         least = max(settings.smallest * labels.size, share * areas.max()) if count > 1 else 0.0

@@ -3,18 +3,25 @@ start masks, masks are carried through the video.
 
 Weights come from the usual Hugging Face cache or from a folder; they are large and only downloaded if `download` allows it. As in
 the released processing, the prompt names object and hand, boxes need a score, and every detection that is not a hand is the object.
+
+With a user's marks (`carry`) SAM 2 starts from the masks of the marked frames, and words are not needed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from neuspring.config.perception import GroundedSam2
+from neuspring.config.perception import GroundedSam2, MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.marks.carry import Carried, frame_mask
+from neuspring.perception.marks.doubt import Cues, doubt_of
+from neuspring.perception.marks.marks import Mark
+from neuspring.perception.marks.store import film_of
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,65 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     return labels
 
 
-def load(settings: GroundedSam2, device: str) -> Models:
-    """Networks with pretrained weights. Raises InputError saying which are missing."""
+def carry(
+    capture: Capture, camera: str, marks: Sequence[Mark], settings: GroundedSam2, device: str, models: Models | None = None
+) -> Carried:
+    """Labels [T, H, W] and doubt [T] from marks on a few frames: their masks (`frame_mask`), carried by SAM 2 both ways.
+
+    Doubt comes from how unsure SAM 2 is at borders and from jumps of areas. Raises InputError where weights are missing or marks do
+    not fit.
+    """
+    film = film_of(capture, camera)
+    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    place = {frame: index for index, frame in enumerate(frames)}
+    absent = [mark.frame for mark in marks if mark.frame not in place]
+    if absent or not any(mark.label == "object" for mark in marks):
+        rule = "an object must be marked, and marks must lie on frames that the camera has"
+        raise InputError(f"marks of camera {camera}", rule, absent or sorted({mark.label for mark in marks}))
+    models = models or load(settings, device, words=False)
+    starts: dict[int, np.ndarray] = {}
+    for frame in sorted({mark.frame for mark in marks if mark.label != "ignore"}):
+        own = [replace(mark, frame=place[frame]) for mark in marks if mark.frame == frame]
+        starts[place[frame]] = frame_mask(film, place[frame], own, MarksSegmentation())
+    images = [film.color(index) for index in range(film.count)]
+    labels = np.zeros((film.count, *images[0].shape[:2]), np.uint8)
+    unsure = np.zeros((film.count, 2))
+    # Hands come last: they are in front of what they hold.
+    for column, label in enumerate((OBJECT, HANDS)):
+        masks = {index: start == label for index, start in starts.items() if (start == label).any()}
+        for index, logits in carry_masks(images, masks, models, device).items():
+            labels[index][logits > 0] = label
+            near = np.abs(logits) < np.quantile(np.abs(logits[logits > 0]), 0.2) if (logits > 0).any() else logits > 0
+            unsure[index, column] = float((1 / (1 + np.exp(np.abs(logits[near])))).mean()) if near.any() else 0.0
+    doubt = doubt_of(labels, [Cues(unsure=float(own.max())) for own in unsure])
+    whole = np.zeros((capture.frame_count, *images[0].shape[:2]), np.uint8)
+    whole[frames] = labels
+    doubts = np.zeros(capture.frame_count)
+    doubts[frames] = doubt
+    return Carried(whole, doubts)
+
+
+def carry_masks(images: list[np.ndarray], masks: dict[int, np.ndarray], models: Models, device: str) -> dict[int, np.ndarray]:
+    """Logits [H, W] by frame of one thing, from its masks [H, W] bool by frame: carried forward from the first, and back."""
+    import torch
+
+    size, logits = list(images[0].shape[:2]), {}
+    if not masks:
+        return {}
+    with torch.inference_mode():
+        session = models.video_processor.init_video_session(video=images, inference_device=device)
+        for index, mask in sorted(masks.items()):
+            models.video_processor.add_inputs_to_inference_session(session, frame_idx=index, obj_ids=[1], input_masks=[mask])
+            models.video(inference_session=session, frame_idx=index)
+        for reverse in (False, True):
+            for output in models.video.propagate_in_video_iterator(session, start_frame_idx=min(masks), reverse=reverse):
+                scaled = models.video_processor.post_process_masks([output.pred_masks], original_sizes=[size], binarize=False)[0]
+                logits[output.frame_idx] = scaled[0, 0].float().cpu().numpy()
+    return logits
+
+
+def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
+    """Networks with pretrained weights, the detector only for `words`. Raises InputError saying which are missing."""
     try:
         import transformers
     except ImportError as error:
@@ -73,13 +137,14 @@ def load(settings: GroundedSam2, device: str) -> Models:
     video_model: Any = transformers.Sam2VideoModel
     try:
         return Models(
-            detector.from_pretrained(settings.detector, **weights).to(device).eval(),
-            transformers.AutoProcessor.from_pretrained(settings.detector, local_files_only=local),
+            detector.from_pretrained(settings.detector, **weights).to(device).eval() if words else None,
+            transformers.AutoProcessor.from_pretrained(settings.detector, local_files_only=local) if words else None,
             video_model.from_pretrained(settings.video_model, **weights).to(device).eval(),
             transformers.Sam2VideoProcessor.from_pretrained(settings.video_model, local_files_only=local),
         )
     except OSError as error:
-        rule = f"weights of {settings.detector} and {settings.video_model} must be in the Hugging Face cache, or be folders"
+        wanted = f"{settings.detector} and {settings.video_model}" if words else settings.video_model
+        rule = f"weights of {wanted} must be in the Hugging Face cache, or be folders"
         remedy = "Set perception.segment.grounded_sam2.download: true once, or copy the cache from a machine that has it."
         raise InputError("perception.segment.grounded_sam2", rule, str(error).splitlines()[0], remedy) from error
 

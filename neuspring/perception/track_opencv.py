@@ -59,18 +59,18 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
     own = _labels_at(labels[0], start)
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
-    first = before = _gray(capture, camera, 0, settings)
+    first = before = gray(capture, camera, 0, settings)
     flow = _dense_flow() if settings.method == "dis" else None
     last = 0
     for frame in range(1, capture.frame_count):
         pixels[frame] = pixels[frame - 1]
         if not capture.has(camera, frame):
             continue
-        now = _gray(capture, camera, frame, settings)
+        now = gray(capture, camera, frame, settings)
         place, alive = pixels[last].copy(), visible[last].copy()
         if alive.any():
             place[alive], alive[alive] = _follow(before, now, place[alive], settings, flow)
-        alive &= _inside(place, now.shape)
+        alive &= inside(place, now.shape)
         if settings.reacquire:
             alive |= _reacquire(first, now, start, place, alive, settings)
         alive &= _labels_at(labels[frame], place) == own
@@ -102,14 +102,14 @@ def _follow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the next frame [n, 2], and whether going back returns to the start [n]."""
     if flow is None:
-        return _lucas_kanade(before, now, points, points, settings)
+        return lucas_kanade(before, now, points, points, settings)
     there, back = flow.calc(before, now, None), flow.calc(now, before, None)  # type: ignore[call-overload]
     moved = points + _sample(there, points)
     returned = moved + _sample(back, moved)
     return moved, np.linalg.norm(returned - points, axis=1) < settings.forward_backward
 
 
-def _lucas_kanade(
+def lucas_kanade(
     source: np.ndarray, target: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: OpenCvTracking
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the target [n, 2] near the `guess`, and whether going back returns to the start [n]."""
@@ -135,11 +135,11 @@ def _reacquire(
     if len(guides) >= GUIDES:
         nearest = guides[cKDTree(start[guides]).query(start[lost], k=GUIDES)[1]]
         guess = start[lost] + np.median((place - start)[nearest], axis=1)
-    moved, ok = _lucas_kanade(first, now, start[lost], guess, settings)
+    moved, ok = lucas_kanade(first, now, start[lost], guess, settings)
     ok &= np.linalg.norm(moved - guess, axis=1) < settings.window
-    ok &= _inside(moved, now.shape)
+    ok &= inside(moved, now.shape)
     if ok.any():
-        ok[ok] = _likeness(first, now, start[lost][ok], moved[ok]) > settings.likeness
+        ok[ok] = likeness(first, now, start[lost][ok], moved[ok]) > settings.likeness
         place[lost[ok]] = moved[ok]
         again[lost[ok]] = True
     return again
@@ -162,7 +162,7 @@ def _labels_at(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)])
 
 
-def _likeness(first: np.ndarray, now: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+def likeness(first: np.ndarray, now: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Normalized correlation [n] of the patches around the points `here` in the first image and `there` in the other."""
     one, other = _patches(first, here), _patches(now, there)
     norms = np.maximum(np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1), 1e-6)
@@ -185,15 +185,16 @@ def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.concatenate(rows).reshape(len(points), -1)
 
 
-def _inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Whether points (x, y) [n, 2] lie in an image of a shape [n]."""
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
 
 
-def _gray(capture: Capture, camera: str, frame: int, settings: OpenCvTracking) -> np.ndarray:
+def gray(capture: Capture, camera: str, frame: int, settings: OpenCvTracking) -> np.ndarray:
     """The gray image [H, W] uint8; for Lucas-Kanade less its local mean and divided by its local deviation."""
-    gray = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+    plain = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
     if settings.method == "dis":
-        return np.asarray(gray)
-    centered = gray.astype(np.float32) - cv2.GaussianBlur(gray.astype(np.float32), (0, 0), LOCAL)
+        return np.asarray(plain)
+    centered = plain.astype(np.float32) - cv2.GaussianBlur(plain.astype(np.float32), (0, 0), LOCAL)
     deviation = np.sqrt(cv2.GaussianBlur(centered**2, (0, 0), LOCAL) + FAINT**2)
     return np.asarray(np.clip(128.0 + CONTRAST * centered / deviation, 0, 255).astype(np.uint8))

@@ -13,6 +13,7 @@ from neuspring.core.errors import InputError
 from neuspring.perception import segment_sam2
 from neuspring.perception.segment_sam2 import Detection, Models
 from tests.support.filmed import FRAMES, film
+from tests.support.marked import mark
 
 transformers = pytest.importorskip("transformers", reason="needs the extra perception")
 torch = pytest.importorskip("torch")
@@ -126,6 +127,36 @@ def test_sam2_carries_boxes_through_the_video(capture):
     masks = segment_sam2.propagate(images, detections, Models(None, None, model, processor), "cpu")
     assert len(masks) == FRAMES - 1
     assert all(mask.shape == (2, 90, 160) and mask.dtype == bool for mask in masks)
+
+
+def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
+    torch.manual_seed(0)
+    model, processor = video_models()
+    marks = [mark("object", "polygon", [(40, 30), (90, 30), (90, 70), (40, 70)], frame=1)]
+    marks.append(mark("hand", "box", [(60, 5), (100, 40)], frame=3))
+    heard = []
+    carry_masks = segment_sam2.carry_masks
+
+    def hear(images, masks, *rest):
+        result = carry_masks(images, masks, *rest)
+        heard.append((sorted(masks), sorted(result)))
+        return result
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segment_sam2, "carry_masks", hear)
+        carried = segment_sam2.carry(capture, "0", marks, GroundedSam2(), "cpu", Models(None, None, model, processor))
+    # Frame 2 is missing: frames 3 to 5 are the third to the fifth that there are.
+    assert heard[0] == ([1], [0, 1, 2, 3, 4])
+    assert heard[1][0] in ([2], [])
+    assert carried.labels.shape == (FRAMES, 90, 160)
+    assert not carried.labels[2].any()
+    assert set(np.unique(carried.labels)) <= {0, 1, 2}
+    assert (carried.doubt[[0, 1, 3, 4, 5]] >= 0).all()
+
+
+def test_marks_without_an_object_start_nothing(capture):
+    with pytest.raises(InputError, match=r"an object must be marked.*received \['hand'\]"):
+        segment_sam2.carry(capture, "0", [mark("hand", "click", [(5, 5)])], GroundedSam2(), "cpu", Models(None, None, None, None))
 
 
 def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path):

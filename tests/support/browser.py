@@ -10,6 +10,7 @@ import select
 import shutil
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 from typing import Any, Self
 
@@ -39,7 +40,10 @@ def chromium() -> str | None:
 
 
 class Browser:
-    """`with Browser() as browser:`; pages are opened without network."""
+    """`with Browser() as browser:`; pages are opened without network, or with `served=True` from this machine alone."""
+
+    def __init__(self, *, served: bool = False) -> None:
+        self._served = served
 
     def __enter__(self) -> Self:
         program = chromium()
@@ -48,6 +52,7 @@ class Browser:
         to_browser, ours = os.pipe()
         theirs, from_browser = os.pipe()
         options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars"]
+        options += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
         # The browser reads from descriptor 3 and writes to 4.
         command = f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}'
         self._process = subprocess.Popen(
@@ -64,7 +69,7 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        self.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=-1, uploadThroughput=-1)
+        self.online(self._served)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -104,13 +109,18 @@ class Browser:
             self.events.append(message)
         return message
 
-    def open(self, path: Path, width: int, height: int = 900, *, dark: bool = False, print_view: bool = False) -> None:
-        """Show a file in a window of a size in CSS pixels; below 600 as a phone does."""
+    def online(self, yes: bool) -> None:
+        """Give pages the network, or take it."""
+        limits = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        self.call("Network.emulateNetworkConditions", offline=not yes, **limits)
+
+    def open(self, page: Path | str, width: int, height: int = 900, *, dark: bool = False, print_view: bool = False) -> None:
+        """Show a file or an address in a window of a size in CSS pixels; below 600 as a phone does."""
         self.events.clear()
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=scheme, media="print" if print_view else "")
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self._message()
 
@@ -119,6 +129,41 @@ class Browser:
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
+
+    def wait(self, script: str, seconds: float = PATIENCE) -> Any:
+        """The value of an expression in the page, once it is true."""
+        end = time.monotonic() + seconds
+        while not (value := self.run(script)):
+            assert time.monotonic() < end, f"not true after {seconds} s: {script}"
+            time.sleep(0.05)
+        return value
+
+    def drag(self, *places: tuple[float, float], modifiers: int = 0) -> None:
+        """Press the mouse at the first place of the window, CSS pixels, move it over the others, release it at the last one."""
+        for kind, (x, y) in [("mouseMoved", places[0]), ("mousePressed", places[0])]:
+            self._mouse(kind, x, y, modifiers)
+        for x, y in places[1:]:
+            self._mouse("mouseMoved", x, y, modifiers, buttons=1)
+        self._mouse("mouseReleased", *places[-1], modifiers)
+
+    def click(self, selector: str) -> None:
+        """Click the middle of an element."""
+        box = self.run(f"JSON.parse(JSON.stringify(document.querySelector({json.dumps(selector)}).getBoundingClientRect()))")
+        self.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+
+    def _mouse(self, kind: str, x: float, y: float, modifiers: int, buttons: int = 0) -> None:
+        pressed = {
+            "button": "none" if kind == "mouseMoved" else "left",
+            "clickCount": int(kind != "mouseMoved"),
+            "buttons": buttons,
+        }
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, **pressed)
+
+    def key(self, key: str, modifiers: int = 0) -> None:
+        """Press and release a key, as `KeyboardEvent.key` names it; modifiers: 2 control, 8 shift."""
+        text = {"text": key} if len(key) == 1 and not modifiers & 2 else {}
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **(text if kind == "keyDown" else {}))
 
     def check(self) -> dict[str, Any]:
         """What is wrong with the page: `CHECK`, once all pictures are decoded, with what it logged as `errors`."""

@@ -1,0 +1,123 @@
+"""`neuspring annotate` as a user has it: the command, a real browser, the real method, on a synthetic capture."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.files import write_text
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from tests.support.browser import Browser, chromium
+from tests.support.filmed import film
+
+IOU = 0.95
+MARGIN = 3.0
+"""Pixels between what is marked and its box."""
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A capture of two cameras whose masks were taken away, and the masks [T, H, W] by camera."""
+    capture = film(tmp_path_factory.mktemp("film"), cameras=2, sizes=[(320, 180)] * 2)
+    frames = range(capture.frame_count)
+    truth = {name: np.stack([capture.mask(name, frame) for frame in frames]) for name in capture.cameras}
+    shutil.rmtree(capture.folder / "mask")
+    path = capture.folder / "capture.json"
+    write_text(path, path.read_text().replace('"masks": true', '"masks": false'))
+    return Capture.load(capture.folder), truth
+
+
+@pytest.fixture
+def address(filmed):
+    """What the command prints, in a process of its own; it must end well with Ctrl-C."""
+    command = [sys.executable, "-m", "neuspring", "annotate", str(filmed[0].folder), "--port", "0", "--no-open"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    try:
+        line = process.stdout.readline()
+        found = re.fullmatch(r"Annotate \S+ at (http://127\.0\.0\.1:\d+/#\S+) \(stop with Ctrl-C\)\n", line)
+        assert found, line
+        yield found[1]
+        process.send_signal(signal.SIGINT)
+        assert "Marks and clicks are saved" in process.communicate(timeout=60)[0]
+        assert process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def overlap(ours: np.ndarray, truth: np.ndarray, label: int) -> float:
+    """Mean intersection over union of a label over the frames."""
+    one, other = ours == label, truth == label
+    return float(((one & other).sum(axis=(1, 2)) / (one | other).sum(axis=(1, 2))).mean())
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+def test_two_boxes_a_camera_become_masks_and_three_clicks_a_track(filmed, address):
+    (capture, truth), vertex = filmed, seen_vertex(filmed[0])
+    with Browser(served=True) as browser:
+        browser.open(address, 1280, 800)
+        browser.wait("document.body.dataset.ready === 'yes'")
+
+        def drag(*points):
+            browser.drag(*[browser.run(f"annotate.view.toWindow([{x}, {y}])") for x, y in points])
+
+        for camera, labels in truth.items():
+            browser.run(f"annotate.go(0, '{camera}')")
+            for key, label in (("1", OBJECT), ("2", HANDS)):
+                browser.key(key)
+                y, x = np.nonzero(labels[0] == label)
+                first, last = (x.min() - MARGIN, y.min() - MARGIN), (x.max() + MARGIN, y.max() + MARGIN)
+                drag(first, np.mean([first, last], axis=0), last)
+            browser.wait("document.getElementById('overlay-text').textContent === 'previewed'")
+        browser.wait("document.getElementById('saved').textContent === 'Marks saved'")
+        browser.click("#carry-all")
+        browser.wait("Object.keys(annotate.modes.masks.results.carried).length === 2", 300)
+        browser.wait("document.getElementById('overlay-text').textContent === 'carried' && annotate.view.overlay !== null")
+        browser.click("#save-masks")
+        browser.wait("document.getElementById('messages').textContent.includes('Saved masks of camera 0, 1')")
+        browser.click("#mode-tracks")
+        for frame in (0, 3, 5):
+            browser.run(f"annotate.go({frame}, '0')")
+            drag(capture.cameras["0"].project(vertex)[0][frame])
+        browser.wait("document.getElementById('saved').textContent === 'Clicks saved'")
+        browser.wait("annotate.modes.tracks.busy === false")
+        browser.click("#save-tracks")
+        browser.wait("document.getElementById('messages').textContent.includes('Saving replaces them')")
+        browser.click("#messages button")
+        browser.wait("document.getElementById('messages').textContent.includes('Saved 1 track')")
+        # The browser itself logs the answer that asked whether to replace the tracks.
+        assert [error for error in browser.check()["errors"] if "status of 428" not in error] == []
+    saved = Capture.load(capture.folder)
+    assert saved.description.masks
+    for camera, labels in truth.items():
+        ours = np.stack([saved.mask(camera, frame) for frame in range(saved.frame_count)])
+        for label in (OBJECT, HANDS):
+            assert overlap(ours, labels, label) > IOU
+    distance = np.linalg.norm(saved.tracks()[:, 0] - vertex, axis=1)
+    assert distance.max() < 0.004
+
+
+def seen_vertex(capture: Capture) -> np.ndarray:
+    """The way [T, 3] of an annotated vertex that camera 0 sees in all frames, and nearly from the front."""
+    camera, best = capture.cameras["0"], []
+    for track in np.swapaxes(capture.tracks(), 0, 1):
+        pixels, distance = camera.project(track)
+        x, y = np.round(pixels).astype(int).T
+        windows = [capture.depth("0", t)[y[t] - 2 : y[t] + 3, x[t] - 2 : x[t] + 3] for t in range(capture.frame_count)]
+        best.append(max(np.abs(window - z).max() for window, z in zip(windows, distance, strict=True)))
+    return capture.tracks()[:, int(np.argmin(best))]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["nowhere"], "capture.json: this file must be readable"), (["{capture}", "--port", "70000"], "--port: must be 0 to 65535")],
+)
+def test_what_cannot_be_served_is_bad_input(filmed, capsys, arguments, message):
+    assert main(["annotate", *[word.replace("{capture}", str(filmed[0].folder)) for word in arguments]]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,278 @@
+"""The page in a real browser, by mouse and keys, beside a server with a stand-in for the masks' method."""
+
+import json
+
+import numpy as np
+import pytest
+
+from neuspring.data.capture import Capture
+from tests.support.browser import Browser, chromium
+from tests.support.moving import FRAMES, moving, truth
+from tests.support.painted import Painted
+from tests.support.served import TOKEN, served
+
+pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+POINT = (46.0, 62.0)
+CONTROL, SHIFT = 2, 8
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser(served=True) as browser:
+        yield browser
+
+
+@pytest.fixture
+def capture(tmp_path) -> Capture:
+    return moving(tmp_path / "capture", missing=(4,))
+
+
+@pytest.fixture
+def method() -> Painted:
+    return Painted()
+
+
+@pytest.fixture
+def client(capture, method):
+    with served(capture, method) as client:
+        yield client
+
+
+class Page:
+    """What a user does on the page."""
+
+    def __init__(self, browser: Browser, client, query: str = "") -> None:
+        self.browser, self.client = browser, client
+        browser.open("about:blank", 1280, 800)
+        browser.open(f"http://127.0.0.1:{client.port}/{query}#{TOKEN}", 1280, 800)
+        browser.wait("document.body.dataset.ready === 'yes'")
+
+    def at(self, *point: float) -> tuple[float, float]:
+        """Where a pixel of the frame is in the window."""
+        return tuple(self.browser.run(f"annotate.view.toWindow({[float(value) for value in point]})"))
+
+    def drag(self, *points: tuple[float, float]) -> None:
+        self.browser.drag(*[self.at(*point) for point in points])
+
+    def text(self, selector: str) -> str:
+        return self.browser.run(f"document.querySelector({json.dumps(selector)}).textContent")
+
+    def saved(self, what: str = "Marks") -> None:
+        self.shown("#saved", f"{what} saved")
+
+    def marks(self, camera: str = "0") -> list:
+        return self.client.get("/api/masks")["marks"]["cameras"].get(camera, [])
+
+    def told(self, text: str) -> None:
+        """Wait until the page says something."""
+        self.browser.wait(f"document.getElementById('messages').textContent.includes({json.dumps(text)})")
+
+    def press(self, choice: str) -> None:
+        """Press a button of a message."""
+        self.browser.run(
+            f"[...document.querySelectorAll('#messages button')].find((one) => one.textContent === '{choice}').click()"
+        )
+
+    def shown(self, selector: str, text: str) -> None:
+        """Wait until an element has a text."""
+        self.browser.wait(f"document.querySelector({json.dumps(selector)}).textContent === {json.dumps(text)}")
+
+
+@pytest.fixture
+def page(browser, client) -> Page:
+    return Page(browser, client)
+
+
+def test_the_page_opens_without_complaints_and_fits(page):
+    found = page.browser.check()
+    assert found["errors"] == []
+    assert found["broken"] == [] and found["outside"] == []
+    assert found["needed"] == found["width"]
+    assert all(url.startswith((f"http://127.0.0.1:{page.client.port}/", "about:", "blob:")) for url in found["asked"])
+    assert page.text("#name") == "thing"
+
+
+def test_without_the_token_the_page_says_what_to_do(browser, client):
+    browser.run("sessionStorage.clear()")
+    browser.open("about:blank", 1280, 800)
+    browser.open(f"http://127.0.0.1:{client.port}/#guess", 1280, 800)
+    browser.wait("document.getElementById('messages').textContent.includes('Open the address that neuspring annotate printed')")
+
+
+def test_every_kind_of_mark_is_drawn_with_the_mouse(page):
+    page.drag((10, 12), (30, 20), (50, 42))
+    page.browser.key("2")
+    page.browser.key("c")
+    page.drag((70, 30))
+    page.browser.key("3")
+    page.browser.key("s")
+    page.drag((20, 80), (40, 82), (60, 80))
+    page.browser.key("1")
+    page.browser.key("p")
+    for corner in ((80, 50), (110, 50), (110, 80), (80, 80)):
+        page.drag(corner)
+    page.browser.key("Enter")
+    page.saved()
+    box, click, scribble, polygon = page.marks()
+    assert (box["label"], box["kind"], click["label"], click["kind"]) == ("object", "box", "hand", "click")
+    assert (scribble["label"], scribble["kind"], polygon["label"], polygon["kind"]) == ("ignore", "scribble", "object", "polygon")
+    np.testing.assert_allclose(box["points"], [[10, 12], [50, 42]], atol=0.15)
+    np.testing.assert_allclose(click["points"], [[70, 30]], atol=0.15)
+    np.testing.assert_allclose(scribble["points"], [[20, 80], [40, 82], [60, 80]], atol=0.15)
+    np.testing.assert_allclose(polygon["points"], [[80, 50], [110, 50], [110, 80], [80, 80]], atol=0.15)
+    assert page.browser.run("document.querySelectorAll('#marks li').length") == 4
+
+
+def test_marks_can_be_undone_removed_and_copied(page):
+    page.drag((10, 12), (50, 42))
+    page.drag((60, 12), (90, 42))
+    page.saved()
+    page.browser.key("z", CONTROL)
+    page.browser.wait("document.querySelectorAll('#marks li').length === 1")
+    page.browser.key("Z", CONTROL | SHIFT)
+    page.browser.wait("document.querySelectorAll('#marks li').length === 2")
+    page.browser.click("#marks li:first-child button")
+    page.browser.wait("document.querySelectorAll('#marks li').length === 1")
+    page.browser.key("ArrowRight")
+    page.browser.click("#copy")
+    page.saved()
+    np.testing.assert_allclose([mark["frame"] for mark in page.marks()], [0, 1])
+    page.browser.key("Delete")
+    page.client.wait(lambda: [mark["frame"] for mark in page.marks()] == [0])
+    np.testing.assert_allclose(page.marks()[0]["points"], [[60, 12], [90, 42]], atol=0.15)
+
+
+def test_zoom_keeps_the_pixel_under_the_pointer(page):
+    x, y = np.round(page.at(100, 30)).tolist()
+    here = f"annotate.view.toImage({{ clientX: {x}, clientY: {y} }})"
+    before = page.browser.run(here)
+    page.browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-600)
+    page.browser.wait("!annotate.view.fitted")
+    np.testing.assert_allclose(page.browser.run(here), before, atol=0.11)  # it is rounded to 0.1 pixel
+    page.drag((95, 25), (105, 35))
+    page.saved()
+    np.testing.assert_allclose(page.marks()[0]["points"], [[95, 25], [105, 35]], atol=0.1)
+    page.browser.key("f")
+    assert page.browser.run("annotate.view.fitted")
+
+
+def test_frames_and_cameras_are_reached_by_keys(page):
+    page.browser.key("ArrowRight", SHIFT)
+    assert page.text("#frame-text") == "frame 10 of 0–11"
+    page.browser.key("End")
+    page.browser.key("ArrowRight")
+    assert page.text("#frame-text") == "frame 11 of 0–11"
+    page.browser.key("k")
+    assert page.browser.run("annotate.camera") == "covered"
+    page.browser.click("#overlay")  # a clicked button does not take the keys
+    page.browser.key("Home")
+    page.browser.key(" ")
+    page.browser.wait("annotate.frame === 11")
+    assert page.browser.run("annotate.view.showOverlay") is False
+    page.browser.key("k")
+    page.browser.run("annotate.go(4)")
+    page.shown("#hint", "This camera missed this frame.")
+
+
+def test_marks_are_previewed_carried_with_progress_and_saved(page, method):
+    page.drag((40, 50), (60, 70))
+    page.shown("#overlay-text", "previewed")
+    method.gate.clear()
+    page.browser.click("#carry")
+    page.browser.wait("!document.getElementById('progress').hidden")
+    assert page.text("#progress-text").startswith("camera 0: ")
+    method.gate.set()
+    page.shown("#overlay-text", "carried")
+    page.told("Carried camera 0")
+    page.browser.wait("annotate.view.overlay !== null")
+    assert page.browser.run("document.querySelectorAll('#doubtful button').length") == 2
+    page.browser.key("d")
+    page.shown("#frame-text", "frame 11 of 0–11")
+    page.browser.click("#save-masks")
+    page.client.wait(lambda: "0" in method.written)
+    page.told("Saved masks of camera 0")
+    page.drag((70, 50), (90, 70))
+    page.saved()
+    page.browser.wait("!document.getElementById('stale').hidden")
+
+
+def test_an_error_is_shown_in_the_page(page):
+    page.browser.click("#carry")
+    page.told("Draw a box around it first")
+    page.browser.click("#messages button")
+    page.shown("#messages", "")
+
+
+@pytest.mark.parametrize(("choice", "left"), [("Take theirs", 1), ("Keep mine", 2)])
+def test_two_tabs_do_not_write_over_each_other_unasked(page, choice, left):
+    page.drag((10, 12), (50, 42))
+    page.saved()
+    theirs = page.client.get("/api/masks")
+    other = {"format": 1, "cameras": {"0": [theirs["marks"]["cameras"]["0"][0] | {"frame": 7}]}}
+    assert page.client.post("/api/marks", revision=theirs["revision"], marks=other)[0] == 200
+    page.drag((60, 12), (90, 42))
+    page.told("changed in another tab or program")
+    assert page.marks()[0]["frame"] == 7
+    page.press(choice)
+    page.saved()
+    page.client.wait(lambda: len(page.marks()) == left and page.marks()[0]["frame"] == (7 if left == 1 else 0))
+
+
+def test_a_lost_server_is_told_and_the_change_is_kept(page):
+    page.browser.online(False)
+    page.drag((10, 12), (50, 42))
+    page.told("The server does not answer")
+    page.shown("#saved", "Marks NOT saved")
+    assert page.browser.run("document.querySelectorAll('#marks li').length") == 1
+    page.browser.online(True)
+    page.press("Try again")
+    page.saved()
+    assert len(page.marks()) == 1
+
+
+def test_points_are_clicked_followed_corrected_and_saved(browser, client, capture):
+    page, places = Page(browser, client, "?tracks"), truth(POINT)
+    page.drag(tuple(places[0]))
+    page.saved("Clicks")
+    page.browser.wait("annotate.modes.tracks.followed.get('point 1')?.trails['0'].filter(Boolean).length === 11")
+    page.browser.key("End")
+    ring = page.browser.run("annotate.modes.tracks.placeHere(annotate.modes.tracks.point)")
+    np.testing.assert_allclose(ring, places[11], atol=0.4)
+    page.drag(tuple(places[11] + (3, 0)), tuple(places[11]))  # pressed beside it and pulled to its place
+    page.browser.key("n")
+    page.drag(tuple(places[11] + (8, 6)))
+    page.browser.run("annotate.go(6)")
+    page.browser.key("h")
+    page.browser.run("const name = document.getElementById('point-name'); name.value = 'tip'; name.onchange()")
+    page.saved("Clicks")
+    page.browser.wait("annotate.modes.tracks.busy === false && annotate.modes.tracks.followed.has('tip')")
+    page.browser.click("#save-tracks")
+    page.told("Saved 2 tracks")
+    points = client.get("/api/clicks")["annotations"]["points"]
+    assert [point["name"] for point in points] == ["point 1", "tip"]
+    assert [click["frame"] for click in points[0]["clicks"]["0"]] == [0, 11]
+    assert points[1]["clicks"]["0"][0] == {"frame": 6, "hidden": True}
+    tracks = capture.tracks()
+    pixels, _ = capture.cameras["0"].project(tracks[:, 0])
+    assert np.nanmax(np.linalg.norm(pixels - places, axis=1)) < 0.5
+    assert np.isfinite(tracks[:, 1]).all(axis=1).tolist() == [False] * (FRAMES - 1) + [True]
+
+
+def test_a_note_leads_to_its_frame_and_camera(browser, client):
+    places = truth(POINT)
+    page = Page(browser, client, "?tracks")
+    page.browser.key("k")
+    page.drag(tuple(places[0]))
+    page.browser.wait("document.querySelector('#notes li')?.textContent.includes('lost')")
+    page.browser.key("k")
+    page.browser.click("#notes li")
+    assert page.browser.run("[annotate.camera, annotate.frame]") == ["covered", 5]
+
+
+def test_the_page_works_in_a_narrow_window(browser, client):
+    browser.open("about:blank", 500, 900)
+    browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", 500, 900)
+    browser.wait("document.body.dataset.ready === 'yes'")
+    found = browser.check()
+    assert found["needed"] == found["width"]
+    assert found["errors"] == []

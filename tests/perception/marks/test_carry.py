@@ -1,0 +1,97 @@
+"""Marks carried through films whose masks are known."""
+
+import numpy as np
+import pytest
+
+from neuspring.config.perception import MarksSegmentation
+from neuspring.core.errors import InputError
+from neuspring.data.capture import HANDS, OBJECT
+from neuspring.perception.marks import carry, frame_mask
+from tests.support.marked import SQUARE, Painted, mark, overlap, painted, rope
+
+SETTINGS = MarksSegmentation()
+
+
+def test_an_object_and_the_hand_over_it_are_carried():
+    film, heard = painted(), []
+    carried = carry(film, SQUARE, SETTINGS, progress=lambda done, total: heard.append((done, total)))
+    for frame in range(film.count):
+        assert overlap(carried.labels[frame], film.truth[frame], OBJECT) > 0.9, frame
+        assert overlap(carried.labels[frame], film.truth[frame], HANDS) > 0.8, frame
+    assert carried.doubt.shape == (film.count,)
+    assert (carried.doubt >= 0).all()
+    assert (carried.doubt <= 1).all()
+    assert [done for done, _ in heard] == list(range(1, heard[0][1] + 1))
+    assert heard[-1][0] == heard[-1][1]
+
+
+def test_a_box_and_a_click_are_enough_for_one_frame():
+    film = painted(1)
+    marks = [mark("object", "box", [(15, 24), (48, 56)]), mark("hand", "scribble", [(38, 2), (38, 24)], radius=2.0)]
+    labels = frame_mask(film, 0, marks, SETTINGS)
+    assert overlap(labels, film.truth[0], OBJECT) > 0.85
+    assert overlap(labels, film.truth[0], HANDS) > 0.8
+
+
+def test_a_thin_rope_stays_whole():
+    film = rope()
+    ends = [(12, 30), (41, 37), (70, 37), (100, 31)]
+    carried = carry(film, [mark("object", "scribble", ends, radius=1.5)], SETTINGS)
+    for frame in range(film.count):
+        assert overlap(carried.labels[frame], film.truth[frame], OBJECT) > 0.7, frame
+
+
+def test_a_cut_in_the_film_is_doubted_most():
+    film = painted(9, hand=False)
+    frames = [*film.frames[:5], *(np.ascontiguousarray(frame[:, ::-1]) for frame in film.frames[5:])]
+    whole, cut = (carry(Painted(own, film.truth), SQUARE[:1], SETTINGS).doubt for own in (film.frames, frames))
+    assert cut.argmax() == 5
+    assert cut[5] > 0.8
+    assert whole.max() < 0.4
+
+
+def test_a_hand_that_is_marked_later_is_known_before_too():
+    film = painted(6)
+    late = mark("hand", "scribble", [(53, 2), (53, 26)], frame=5, radius=2.0)
+    carried = carry(film, [SQUARE[0], late], SETTINGS)
+    assert overlap(carried.labels[5], film.truth[5], HANDS) > 0.7
+    assert overlap(carried.labels[3], film.truth[3], HANDS) > 0.6
+
+
+def test_a_mark_corrects_what_was_carried():
+    film = painted(5, hand=False)
+    there = mark("ignore", "polygon", [(32, 24), (60, 24), (60, 56), (32, 56)], frame=4, radius=1.0)
+    carried = carry(film, [SQUARE[0], there], SETTINGS)
+    assert not (carried.labels[4][26:54, 34:58] == OBJECT).any()
+
+
+def test_half_the_size_is_coarser_and_of_the_same_shape():
+    film = painted(3)
+    carried = carry(film, SQUARE, MarksSegmentation(scale=0.5))
+    assert carried.labels.shape == film.truth.shape
+    assert overlap(carried.labels[2], film.truth[2], OBJECT) > 0.8
+
+
+def test_without_the_background_flow_and_colors_carry():
+    film = painted(4, hand=False)
+    carried = carry(film, SQUARE[:1], MarksSegmentation(background=False))
+    assert overlap(carried.labels[3], film.truth[3], OBJECT) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("marks", "message"),
+    [
+        ([], "an object must be marked in one frame or more; received 0"),
+        (SQUARE[1:], "an object must be marked"),
+        ([mark("object", "click", [(500, 5)])], "must lie in the image of 112 x 72 pixels"),
+        ([mark("object", "click", [(5, 5)], frame=99)], "must lie below 3"),
+    ],
+)
+def test_marks_that_carry_nothing_are_refused(marks, message):
+    with pytest.raises(InputError, match=message):
+        carry(painted(3), marks, SETTINGS)
+
+
+def test_a_frame_without_marks_has_no_mask_of_its_own():
+    with pytest.raises(InputError, match="frame 1: an object or a hand must be marked on it"):
+        frame_mask(painted(2), 1, SQUARE, SETTINGS)

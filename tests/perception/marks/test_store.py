@@ -1,0 +1,141 @@
+"""Masks on disk, the command that makes them, and that it does nothing twice."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.config.perception import Perception, Segmentation
+from neuspring.core.errors import InputError
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.backends import BACKENDS
+from neuspring.perception.marks import Marks
+from neuspring.perception.marks.store import Made, film_of, has_masks, save_masks
+from tests.support.filmed import FRAMES, film
+from tests.support.marked import mark, overlap
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """Two cameras, the second one lacks a frame, without masks; the truth is kept aside."""
+    folder = tmp_path_factory.mktemp("film")
+    capture = film(folder, cameras=2, missing={1: (3,)})
+    (folder / "mask").rename(folder / "truth")
+    text = json.loads((folder / "capture.json").read_text())
+    (folder / "capture.json").write_text(json.dumps(text | {"masks": False}))
+    cameras = {}
+    for camera in capture.cameras:
+        truth = cv2.imread(str(folder / "truth" / camera / "00000.png"), cv2.IMREAD_UNCHANGED)
+        cameras[camera] = tuple(polygon(truth, label, name) for label, name in ((OBJECT, "object"), (HANDS, "hand")))
+    Marks(cameras=cameras).save(folder / "marks.json")
+    return folder
+
+
+@pytest.fixture
+def folder(original, tmp_path):
+    return shutil.copytree(original, tmp_path / "capture")
+
+
+def polygon(truth, label, name):
+    """A coarse outline, as a user draws it."""
+    outlines, _ = cv2.findContours((truth == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    coarse = cv2.approxPolyDP(max(outlines, key=cv2.contourArea), 1.5, True)[:, 0]
+    return mark(name, "polygon", [tuple(map(float, point)) for point in coarse], radius=2.0)
+
+
+def test_marks_become_the_masks_of_a_capture(folder, capsys):
+    assert main(["mask", str(folder)]) == 0
+    out, err = capsys.readouterr()
+    assert "camera 0: most doubtful frames: " in out
+    assert "camera 1: 100 %" not in out
+    assert "100 %" in err
+    capture = Capture.load(folder)
+    assert capture.description.masks
+    for camera in capture.cameras:
+        for frame in range(FRAMES):
+            if capture.has(camera, frame):
+                truth = cv2.imread(str(folder / "truth" / camera / f"{frame:05d}.png"), cv2.IMREAD_UNCHANGED)
+                assert overlap(capture.mask(camera, frame), truth, OBJECT) > 0.85, (camera, frame)
+                assert overlap(capture.mask(camera, frame), truth, HANDS) > 0.8, (camera, frame)
+    assert not capture.path("mask", "1", 3).exists()
+    assert cv2.imread(str(folder / "mask_0.png")).shape[1] == 4 * 160
+    assert len(Made.of(capture).cameras["0"].doubt) == FRAMES
+
+    times = {path: path.stat().st_mtime_ns for path in (folder / "mask").rglob("*.png")}
+    assert main(["mask", str(folder)]) == 0
+    assert "camera 0: marks, images and settings are unchanged; its masks are kept" in capsys.readouterr().out
+    assert times == {path: path.stat().st_mtime_ns for path in (folder / "mask").rglob("*.png")}
+
+    marks = Marks.load(folder / "marks.json")
+    Marks(cameras=marks.cameras | {"1": (*marks.of("1"), mark("ignore", "click", [(2, 2)]))}).save(folder / "marks.json")
+    assert main(["mask", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "camera 0: marks, images and settings are unchanged" in out
+    assert "camera 1: masks are in" in out
+
+
+def test_the_workflow_segments_from_marks(folder):
+    capture, settings = Capture.load(folder), Perception(segment=Segmentation(backend="marks"))
+    labels = BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
+    truth = cv2.imread(str(folder / "truth" / "1" / "00004.png"), cv2.IMREAD_UNCHANGED)
+    assert not labels[3].any()
+    assert overlap(labels[4], truth, OBJECT) > 0.85
+    (folder / "marks.json").unlink()
+    with pytest.raises(InputError, match=r"marks needs this file.*neuspring annotate"):
+        BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
+
+
+def test_masks_are_announced_when_every_camera_has_them(folder):
+    capture = Capture.load(folder)
+    for camera, announced in (("0", False), ("1", True)):
+        save_masks(capture, camera, np.ones((FRAMES, 90, 160), np.uint8))
+        assert Capture.load(folder).description.masks == announced
+    assert has_masks(capture)
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (np.zeros((FRAMES, 90, 161), np.uint8), r"labels must be uint8 of shape \(6, 90, 160\)"),
+        (np.full((FRAMES, 90, 160), 3, np.uint8), "labels must be 0 .* received 3"),
+    ],
+)
+def test_masks_that_do_not_fit_are_refused(folder, labels, message):
+    with pytest.raises(InputError, match=message):
+        save_masks(Capture.load(folder), "0", labels)
+    assert not (folder / "mask").exists()
+
+
+def test_frames_have_heights_above_the_table(folder):
+    images = film_of(Capture.load(folder), "0")
+    height = images.height(0)
+    truth = cv2.imread(str(folder / "truth" / "0" / "00000.png"), cv2.IMREAD_UNCHANGED)
+    assert abs(np.nanmedian(height[truth == 0])) < 0.003
+    assert np.nanmedian(height[truth == OBJECT]) > 0.03
+
+
+def test_a_camera_without_marks_and_damaged_files_are_named(folder, capsys):
+    marks = Marks.load(folder / "marks.json")
+    Marks(cameras={"0": marks.of("0")}).save(folder / "one.json")
+    assert main(["mask", str(folder), "--marks", str(folder / "one.json"), "--cameras", "1"]) == 2
+    assert "camera 1 needs marks; received ['0']" in capsys.readouterr().err
+    (folder / "masks.json").write_text("[]")
+    assert main(["mask", str(folder)]) == 2
+    assert "masks.json: a JSON object is required; received list. Delete it; the masks are made again." in capsys.readouterr().err
+
+
+def test_masks_are_compared_frame_by_frame(folder, capsys):
+    one, two = folder / "one", folder / "two"
+    for path, width in ((one, 10), (two, 5)):
+        path.mkdir()
+        image = np.zeros((20, 20), np.uint8)
+        image[:10, :width] = OBJECT
+        cv2.imwrite(str(path / "0003.png"), image)
+    assert main(["compare-masks", str(one), str(two)]) == 0
+    assert "    3   0.500" in capsys.readouterr().out
+    cv2.imwrite(str(two / "4.png"), image)
+    assert main(["compare-masks", str(one), str(two)]) == 2
+    assert "a mask of frame 4 is required" in capsys.readouterr().err

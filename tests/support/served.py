@@ -1,0 +1,90 @@
+"""The server of `neuspring annotate` in a thread, and requests to it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Thread
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuspring.data.capture import Capture
+from neuspring.perception.annotate.guard import TOKEN_HEADER
+from neuspring.perception.annotate.masks import Method
+from neuspring.perception.annotate.server import Server
+
+TOKEN = "the-token"
+
+
+class Client:
+    """Requests to a server."""
+
+    def __init__(self, server: Server) -> None:
+        self.server, self.port = server, server.server_address[1]
+
+    def raw(self, method: str, path: str, body: bytes | None = None, **headers: str | None) -> tuple[int, dict[str, str], bytes]:
+        """Status, headers and body; the token is sent, and underscores in names of headers are dashes; None leaves one out."""
+        sent = {TOKEN_HEADER: TOKEN} | {name.replace("_", "-"): value for name, value in headers.items()}
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        connection.putrequest(method, path, skip_host="Host" in sent, skip_accept_encoding=True)
+        if body is not None:
+            sent = {"Content-Type": "application/json", "Content-Length": str(len(body))} | sent
+        for name, value in sent.items():
+            if value is not None:
+                connection.putheader(name, value)
+        connection.endheaders(body)
+        answer = connection.getresponse()
+        content = answer.read()
+        connection.close()
+        return answer.status, dict(answer.getheaders()), content
+
+    def get(self, path: str) -> Any:
+        """JSON of an answer that must be good."""
+        status, _, content = self.raw("GET", path)
+        assert status == 200, content
+        return json.loads(content)
+
+    def image(self, path: str) -> np.ndarray:
+        """An image of an answer that must be good, as OpenCV has it."""
+        status, _, content = self.raw("GET", path)
+        assert status == 200, content
+        return decoded(content)
+
+    def post(self, path: str, **values: Any) -> tuple[int, Any]:
+        """Status and JSON of an answer."""
+        status, _, content = self.raw("POST", path, json.dumps(values).encode())
+        return status, json.loads(content)
+
+    def wait(self, condition: Callable[[], Any], seconds: float = 30.0) -> Any:
+        """What a condition gives once it is true."""
+        end = time.monotonic() + seconds
+        while not (value := condition()):
+            assert time.monotonic() < end, "it did not happen"
+            time.sleep(0.02)
+        return value
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """The image of some bytes."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
+@contextmanager
+def served(capture: Capture, method: Method) -> Iterator[Client]:
+    """A server for a capture, while the block runs."""
+    server = Server(capture, method, token=TOKEN)
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield Client(server)
+    finally:
+        server.shutdown()
+        thread.join()
+        server.close()
