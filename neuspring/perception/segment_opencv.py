@@ -184,7 +184,7 @@ def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: Op
 
 
 def _slim(labels: np.ndarray) -> np.ndarray:
-    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade have few colors of hands."""
+    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade lack its colors."""
     own = (labels == OBJECT).astype(np.uint8)
     wide = cv2.morphologyEx(own, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN_WIDTH,) * 2))
     near = cv2.dilate((labels == HANDS).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
