@@ -180,7 +180,7 @@ def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: Op
     odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
     high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
     logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
-    return solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5
+    return np.asarray(solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5)
 
 
 def _slim(labels: np.ndarray) -> np.ndarray:
