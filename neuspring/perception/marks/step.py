@@ -124,11 +124,11 @@ class Pass:
         flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-        came, no_map = grid + flow, np.empty(0, np.float32)
+        came_x, came_y = (np.ascontiguousarray((grid + flow)[..., axis]) for axis in (0, 1))
 
         def brought(values: np.ndarray) -> np.ndarray:
             image = np.ascontiguousarray(values)
-            return np.asarray(cv2.remap(image, came, no_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+            return np.asarray(cv2.remap(image, came_x, came_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
         change = cv2.absdiff(np.ascontiguousarray(lab), brought(last)).max(axis=-1).astype(np.float32)
         doubt = np.clip(cv2.GaussianBlur(change, (0, 0), 1.5) / CHANGED, 0.05, 1.0)
