@@ -35,6 +35,8 @@ CORRECTION, CORRECTED = 6.0, 5.0
 """Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
 MOVES = 12.0
 """How far things move in a frame at most, as a multiple of `reach`: the margin of the part of the image that is worked on."""
+LEAST_SIDE = 64
+"""Smallest side of images between which flow is sought, pixels; smaller ones are continued."""
 BROUGHT = 0.2
 """Probability by place from which a piece counts as brought by the flow."""
 LEAST_ENTERING = 0.0005
@@ -235,8 +237,13 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
 def flow_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Flow [H, W, 2], pixels: where in image `there` each pixel of `here` is (gray [H, W] uint8)."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    start = np.zeros((*here.shape, 2), np.float32)
-    return np.asarray(method.calc(np.ascontiguousarray(here), np.ascontiguousarray(there), start))
+    height, width = here.shape
+    # Its pyramid is chosen by the longer side; a strip would vanish on the way up, which OpenCV does not survive.
+    least = max(LEAST_SIDE, max(height, width) // 2)
+    beside = (0, max(least - height, 0), 0, max(least - width, 0))
+    wide = [np.asarray(cv2.copyMakeBorder(image, *beside, cv2.BORDER_REPLICATE)) for image in (here, there)]
+    flow = method.calc(wide[0], wide[1], np.zeros((*wide[0].shape, 2), np.float32))
+    return np.asarray(flow)[:height, :width]
 
 
 def _entering(changed: np.ndarray) -> np.ndarray:
