@@ -36,8 +36,8 @@ class OpenCvSegmentation(Section):
     """Which of several pieces of frame 0, and what overlaps with it later. all: every one. moving: the one with most pixels that
     change during the video."""
     thin: bool = False
-    """For ropes of a few pixels: nothing is opened, neighbors decide the border less than in GrabCut, and what is wider and touches a
-    hand is hand."""
+    """For ropes of a few pixels: nothing is opened, neighbors decide the border less than in GrabCut, and what is wider than a rope
+    and touches a hand is hand."""
 
 
 @dataclass(frozen=True, kw_only=True)

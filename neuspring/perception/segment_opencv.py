@@ -180,11 +180,11 @@ def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: Op
     odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
     high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
     logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
-    return solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5
+    return np.asarray(solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5)
 
 
 def _slim(labels: np.ndarray) -> np.ndarray:
-    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade have few colors of hands."""
+    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade lack its colors."""
     own = (labels == OBJECT).astype(np.uint8)
     wide = cv2.morphologyEx(own, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN_WIDTH,) * 2))
     near = cv2.dilate((labels == HANDS).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

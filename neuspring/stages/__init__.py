@@ -34,7 +34,9 @@ COMMON = ("simulation", "losses", "released_quirks")
 """Sections that search and fit share."""
 STAGES = {
     "capture": Stage(about="synthetic scene or PhysTwin's raw layout -> capture folder", minutes=120),
-    "segment": Stage(about="one camera of a capture -> masks", gpu="backend", memory_mb=8000, minutes=120),
+    "segment": Stage(
+        about="one camera of a capture -> masks", reads=("perception.segment.verdict",), gpu="backend", memory_mb=8000, minutes=120
+    ),
     "track": Stage(
         about="masks of one camera -> tracks of pixels", reads=("perception.seed",), gpu="backend", memory_mb=8000, minutes=120
     ),

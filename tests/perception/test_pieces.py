@@ -7,7 +7,7 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.perception.mask_verdict import verdict
-from neuspring.perception.segment_opencv import _region, _thin
+from neuspring.perception.segment_opencv import _region, _slim, _thin
 from neuspring.perception.segment_pieces import changing, sort_pieces
 from tests.support.captures import describe, entry
 
@@ -98,6 +98,16 @@ def test_a_rope_of_two_pixels_is_kept_whole():
     found = _thin(image, ratio, height, OpenCvSegmentation(thin=True))
     assert found[20:22, 5:55].all()
     assert found.sum() == 100
+
+
+def test_fingers_at_a_thin_rope_are_hand():
+    labels = np.zeros((40, 60), np.uint8)
+    labels[14:26, 40:52] = labels[20:22, 5:55] = labels[30:38, 5:15] = OBJECT
+    labels[2:14, 40:52] = HANDS
+    slim = _slim(labels)
+    assert (slim[15:25, 41:51] == HANDS).all()
+    assert (slim[20:22, 5:36] == OBJECT).all()
+    assert (slim[30:38, 5:15] == OBJECT).all(), "what is wide and touches no hand is left alone"
 
 
 def test_masks_that_can_be_right_have_no_findings(tmp_path):

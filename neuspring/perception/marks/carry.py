@@ -72,9 +72,9 @@ class _Film:
     full: tuple[int, int]
 
     @classmethod
-    def of(cls, images: Images, marks: Sequence[Mark], settings: MarksSegmentation) -> _Film:
+    def of(cls, images: Images, marks: Sequence[Mark], settings: MarksSegmentation, *, whole: bool = True) -> _Film:
         full = images.color(0).shape[:2]
-        require_marks(tuple(marks), images.count, full)
+        require_marks(tuple(marks), images.count, full, whole=whole)
         by_frame: dict[int, list[Mark]] = {}
         for mark in marks:
             by_frame.setdefault(mark.frame, []).append(mark)
@@ -119,7 +119,7 @@ def frame_mask(images: Images, frame: int, marks: Sequence[Mark], settings: Mark
     own = [mark for mark in marks if mark.frame == frame]
     if not any(mark.label != "ignore" for mark in own):
         raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
-    film = _Film.of(images, own, settings)
+    film = _Film.of(images, own, settings, whole=False)
     return film.labels(start(film.lab(frame), film.seeds(frame), settings.smoothness, film.height(frame)).probability)
 
 

@@ -61,7 +61,7 @@ def area_jumps(areas: np.ndarray) -> np.ndarray:
     floor = 0.01 * max(float(areas.max(initial=0.0)), 100.0)
     logs = np.log(areas + floor)
     usual = [np.median(logs[max(frame - AROUND, 0) : frame + AROUND + 1]) for frame in range(len(logs))]
-    return np.abs(logs - usual)
+    return np.asarray(np.abs(logs - usual))
 
 
 def _overlap(one: np.ndarray, other: np.ndarray) -> float:

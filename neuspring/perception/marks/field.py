@@ -58,7 +58,7 @@ def _open(logs: np.ndarray) -> np.ndarray:
     near = cv2.dilate(border, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSE + 1,) * 2)).astype(bool)
     first = logs.max(axis=0)
     others = np.stack([np.where(best == label, -np.inf, part) for label, part in enumerate(logs)]).max(axis=0)
-    return near & (first - others < DECIDED)
+    return np.asarray(near & (first - others < DECIDED))
 
 
 def _softmax(logs: np.ndarray) -> np.ndarray:

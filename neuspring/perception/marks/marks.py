@@ -105,8 +105,13 @@ class Marks:
                     raise InputError(f"{where}, cameras.{name}", "marks must lie on frames that the camera has", mark.frame)
 
 
-def require_marks(marks: tuple[Mark, ...], count: int, size: tuple[int, int], where: object = "marks") -> None:
-    """Check the marks of one camera against its count of frames and its size (height, width). Raises InputError."""
+def require_marks(
+    marks: tuple[Mark, ...], count: int, size: tuple[int, int], where: object = "marks", *, whole: bool = True
+) -> None:
+    """Check marks of one camera against its count of frames and its size (height, width). Raises InputError.
+
+    `whole`: they are all of them, so an object must be among them.
+    """
     height, width = size
     for index, mark in enumerate(marks):
         at = f"{where}[{index}]"
@@ -115,7 +120,7 @@ def require_marks(marks: tuple[Mark, ...], count: int, size: tuple[int, int], wh
         for x, y in mark.points:
             if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
                 raise InputError(f"{at}.points", f"must lie in the image of {width} x {height} pixels", [x, y])
-    if marks and not any(mark.label == "object" for mark in marks):
+    if whole and marks and not any(mark.label == "object" for mark in marks):
         labels = sorted({mark.label for mark in marks})
         raise InputError(where, "an object must be marked in one frame or more", labels, 'Add a mark with "label": "object".')
 

@@ -83,7 +83,7 @@ class Seeds:
 
 def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
     """The pixels [H, W] bool that a mark covers: a polygon without its uncertain border (-1), as it is (0), or grown by it (1)."""
-    image = np.zeros(size, np.uint8)
+    image: np.ndarray = np.zeros(size, np.uint8)
     # Pixel centers lie at whole coordinates, so the image begins at -0.5.
     points = (np.array(mark.points) + 0.5) * scale - 0.5
     radius = max(mark.radius * scale, 0.5)
@@ -98,7 +98,7 @@ def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) 
             ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)
             # Outside of the image the polygon goes on: a hand is not uncertain where the image ends.
             eroded = cv2.erode(image, ellipse, borderType=cv2.BORDER_REPLICATE)
-            image = cv2.dilate(image, ellipse) if grown > 0 else eroded
+            image = np.asarray(cv2.dilate(image, ellipse) if grown > 0 else eroded)
         return image.astype(bool)
     cv2.polylines(image, [whole], False, 1, max(round(2 * radius), 1))
     for x, y in whole[:, 0].tolist():

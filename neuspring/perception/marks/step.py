@@ -18,15 +18,16 @@ COLOR = 0.5
 """Weight of the log densities of colors: neighboring pixels are not independent."""
 MOST_COLOR = 6.0
 """Largest log ratio that a pixel's color counts."""
-ANYWHERE = (0.0, 0.004, 0.015)
-"""Probability that a pixel becomes object or hand far from where the flow carries one: things come out of hiding, hands come in."""
+ANYWHERE = (0.01, 0.004, 0.015)
+"""Probability that a pixel becomes nothing, object or hand where the flow carries none: things uncover the table or come out of
+hiding, hands come in. Without it for nothing, the shadow of an object that left stays its part for good."""
 CHANGED = 12.0
 """Difference of L, a, b, from which the flow is doubted."""
 CONFIDENT = 0.95
 """Probability from which a pixel teaches colors."""
 LEARN, EVERY = 0.2, 4
 """Weight of a frame in the running colors, which are learned from each fourth frame."""
-TRUST_START = 0.6
+TRUST_START = 0.75
 """Weight of the marked frames' colors, against the running ones."""
 SHOWN = 0.5
 """Weight of the colors beneath the marks of a frame on the way, against those of the frames before."""
@@ -34,6 +35,8 @@ CORRECTION, CORRECTED = 6.0, 5.0
 """Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
 MOVES = 12.0
 """How far things move in a frame at most, as a multiple of `reach`: the margin of the part of the image that is worked on."""
+LEAST_SIDE = 64
+"""Smallest side of images between which flow is sought, pixels; smaller ones are continued."""
 BROUGHT = 0.2
 """Probability by place from which a piece counts as brought by the flow."""
 LEAST_ENTERING = 0.0005
@@ -123,17 +126,18 @@ class Pass:
         flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-        came = grid + flow
+        came_x, came_y = (np.ascontiguousarray((grid + flow)[..., axis]) for axis in (0, 1))
 
         def brought(values: np.ndarray) -> np.ndarray:
-            return cv2.remap(np.ascontiguousarray(values), came, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            image = np.ascontiguousarray(values)
+            return np.asarray(cv2.remap(image, came_x, came_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
         change = cv2.absdiff(np.ascontiguousarray(lab), brought(last)).max(axis=-1).astype(np.float32)
         doubt = np.clip(cv2.GaussianBlur(change, (0, 0), 1.5) / CHANGED, 0.05, 1.0)
         moved = np.stack([brought(part) for part in probability], axis=-1)
         narrow, wide = (cv2.GaussianBlur(moved, (0, 0), width * self.reach) for width in (0.35, 2.0))
         place = ((1 - doubt)[..., None] * narrow + doubt[..., None] * wide).transpose(2, 0, 1)
-        for label in (OBJECT, HANDS):
+        for label in LABELS:
             if self.first[label].sum():
                 place[label] += ANYWHERE[label]
         place = place + np.float32(1e-6)
@@ -164,7 +168,7 @@ class Pass:
         """Weighted log densities [3, h, w] of a frame's colors, and of its depth against the background's."""
         bins = bins_of(lab)
         logs = np.stack([own.logs[bins] for own in self.colors])
-        nearer = np.float32(0)
+        nearer = np.zeros(lab.shape[:2], np.float32)
         if self.background is not None:
             background = self.background.part(window)
             gain = background.gain(lab, probability[NOTHING] > CONFIDENT)
@@ -233,7 +237,13 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
 def flow_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Flow [H, W, 2], pixels: where in image `there` each pixel of `here` is (gray [H, W] uint8)."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(method.calc(np.ascontiguousarray(here), np.ascontiguousarray(there), None))
+    height, width = here.shape
+    # Its pyramid is chosen by the longer side; a strip would vanish on the way up, which OpenCV does not survive.
+    least = max(LEAST_SIDE, max(height, width) // 2)
+    beside = (0, max(least - height, 0), 0, max(least - width, 0))
+    wide = [np.asarray(cv2.copyMakeBorder(image, *beside, cv2.BORDER_REPLICATE)) for image in (here, there)]
+    flow = method.calc(wide[0], wide[1], np.zeros((*wide[0].shape, 2), np.float32))
+    return np.asarray(flow)[:height, :width]
 
 
 def _entering(changed: np.ndarray) -> np.ndarray:

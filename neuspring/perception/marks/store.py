@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -115,10 +116,8 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
         raise InputError(f"masks of camera {camera}", "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
     for frame in range(capture.frame_count):
         if capture.has(camera, frame):
-            ok, png = cv2.imencode(".png", labels[frame])
-            assert ok, "a mask can be encoded"
             # A renamed file replaces a link to the original of an imported capture, and leaves the original alone.
-            write_atomically(capture.path("mask", camera, frame), lambda temporary, data=png: temporary.write_bytes(data.tobytes()))
+            write_atomically(capture.path("mask", camera, frame), partial(_write, labels[frame]))
     if has_masks(capture):
         path = capture.folder / CAPTURE
         values = load_json(path) | {"masks": True}
@@ -126,6 +125,12 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
             values["provenance"]["images"] = images_digest(capture.folder)
         write_text(path, json.dumps(values, indent=1) + "\n")
     return capture.folder / "mask" / camera
+
+
+def _write(labels: np.ndarray, path: Path) -> None:
+    ok, png = cv2.imencode(".png", labels)
+    assert ok, "a mask can be encoded"
+    path.write_bytes(png.tobytes())
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:

@@ -33,6 +33,12 @@ def test_a_box_and_a_click_are_enough_for_one_frame():
     assert overlap(labels, film.truth[0], HANDS) > 0.8
 
 
+def test_a_frame_may_show_a_hand_alone():
+    labels = frame_mask(painted(1), 0, SQUARE[1:], SETTINGS)
+    assert overlap(labels, painted(1).truth[0], HANDS) > 0.8
+    assert not (labels == OBJECT).any()
+
+
 def test_a_thin_rope_stays_whole():
     film = rope()
     ends = [(12, 30), (41, 37), (70, 37), (100, 31)]
