@@ -132,4 +132,4 @@ def test_masks_that_cannot_be_right_are_found(tmp_path):
     assert verdict(capture, "0", print_on_toy)[0]["hands_inside"] == 1
     mostly_hand = np.full_like(labels, HANDS)
     mostly_hand[:, 10:14, 10:14] = OBJECT
-    assert any("times as much hand as object" in finding for finding in verdict(capture, "0", mostly_hand)[1])
+    assert any("times as much hand as object" in finding.text for finding in verdict(capture, "0", mostly_hand)[1])
