@@ -108,7 +108,8 @@ def _note_lines(noted: pd.DataFrame, runs: pd.Series) -> list[str]:
     single = noted.assign(note=noted["notes"].str.split("; ")).explode("note")
     single["kind"] = single["note"].str.replace(NUMBER, HOLE, regex=True)
     lines = []
-    for (method, kind), group in single.groupby(["method", "kind"], sort=False):
+    for key, group in single.groupby(["method", "kind"], sort=False):
+        method, kind = map(str, key)
         numbers = group["note"].str.findall(NUMBER).map(lambda found: [float(number) for number in found])
         for least, most in _ranges(numbers):
             kind = kind.replace(HOLE, f"{least:g}" if least == most else f"{least:g} to {most:g}", 1)
