@@ -214,6 +214,7 @@ class Observations(Artifact):
     object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is seen in each frame")
     object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from frame t to t+1 may be trusted")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "points that move the object (hands, grippers)")
+    """A controller that first holds in a later frame has, in frame 0, the place of the body that it will hold: springs are made there."""
     controller_valid: np.ndarray = array(
         "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: all do in all frames", omitted=True
     )

@@ -7,6 +7,6 @@ one twin or of several. population: twins of topologies of their own in one solv
 of torch tensors. path: the controllers' way within a frame. reference: the specification. stability: whether the substep is small
 enough.
 
-For others: solver.FrameSolver and Parameters; population.solver_of; path.waypoints; autograd.simulate_frame, pack and twin_tensors;
+For others: solver.FrameSolver and Parameters; population.solver_of; path.waypoints; grips.Grips; autograd.simulate_frame, pack and twin_tensors;
 lanes.WIDTHS; reference; stability.
 """

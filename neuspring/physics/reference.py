@@ -58,12 +58,15 @@ def rollout(
 ) -> tuple[np.ndarray, np.ndarray]:
     """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3].
 
-    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it.
+    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it. When it begins to
+    hold, they take the lengths of that moment.
     """
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
     hands = controllers.astype(np.float64)
     for k in range(len(hands) - 1):
         slopes = (tangent(hands, k), tangent(hands, k + 1)) if scene.simulation.controller_path == "cubic" else None
+        if valid is not None and k:
+            scene = gripped(scene, xs[-1], hands[k], valid[k] & ~valid[k - 1])
         held = scene if valid is None else holding(scene, valid[k] & valid[k + 1])
         x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
         xs.append(x)
@@ -76,6 +79,15 @@ def holding(scene: Scene, holds: np.ndarray) -> Scene:
     led = np.concatenate([np.ones(scene.nodes, bool), holds])
     acts = led[scene.springs].all(axis=1)
     return replace(scene, stiffness=scene.stiffness * acts, dashpot=scene.dashpot * acts)
+
+
+def gripped(scene: Scene, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> Scene:
+    """The scene after controllers with `begin` [C] took hold: l0' = |x_c - x_n|, and Y' / l0' = Y / l0."""
+    taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1)
+    points = np.concatenate([x, hands])
+    apart = np.linalg.norm(points[scene.springs[:, 1]] - points[scene.springs[:, 0]], axis=1)
+    lengths = np.where(taken, np.maximum(apart, MIN_LENGTH), scene.rest_lengths)
+    return replace(scene, rest_lengths=lengths, stiffness=scene.stiffness * (lengths / scene.rest_lengths))
 
 
 def tangent(hands: np.ndarray, k: int) -> np.ndarray:
