@@ -16,7 +16,7 @@ import torch
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load
 from neuspring.core.errors import InputError
-from neuspring.physics import collision, contact, frame, position, springs, velocity
+from neuspring.physics import collision, contact, frame, obstacles, position, springs, velocity
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.grips import Grips, begins
 
@@ -85,9 +85,9 @@ class FrameSolver:
         threads = device != "cpu" if threads is None else threads
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
         springs.allocate(self.buffers, spring_pairs)
-        for term in (velocity, collision, position):
+        for term in (velocity, collision, position, obstacles):
             term.allocate(self.buffers)
-        self._kernels = frame.kernels(self.buffers.real, self.buffers.width)
+        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, bool(self.simulation.obstacles))
         self._graphs = Graphs(device)
         self.grips = Grips(spring_pairs, nodes, device)
         self._held: torch.Tensor | None = None
