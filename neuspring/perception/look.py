@@ -11,7 +11,7 @@ import numpy as np
 
 from neuspring.core.findings import Finding, finding
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.check_capture import objects
+from neuspring.data.plausible.pieces import objects
 
 HOLES = 0.2
 """Share of the object's pixels without depth, median over frames, from which shape and motion suffer."""
