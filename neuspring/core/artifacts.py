@@ -19,6 +19,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.npz import DamagedFile, read_npz, write_npz
+from neuspring.core.obstacles import Obstacle, obstacles_of
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
@@ -26,6 +27,8 @@ InitialVelocity = Literal["rest", "observed"]
 ControllerPath = Literal["linear", "cubic"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
+OMITTED = {"empty": "omitted"}
+"""Metadata of a field that files do not have where it is empty."""
 NO_REST_SHAPE = np.zeros((0, 3))
 """The rest shape that stands for: as in frame 0."""
 
@@ -103,9 +106,10 @@ class Artifact:
             elif isinstance(value, Artifact):
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-                plain[spec.name] = dataclasses.asdict(value)
-            else:
-                plain[spec.name] = value
+                parts = dataclasses.asdict(value)
+                plain[spec.name] = {f.name: parts[f.name] for f in dataclasses.fields(value) if _kept(f, parts[f.name])}
+            elif _kept(spec, value):
+                plain[spec.name] = _lists(value)
         return plain
 
     @classmethod
@@ -156,6 +160,18 @@ class Artifact:
         return cls(**values)
 
 
+def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
+    """Whether a file has a field: an empty one may be left out."""
+    return bool(value) or spec.metadata != OMITTED
+
+
+def _lists(value: Any) -> Any:
+    """Dataclasses in a tuple as JSON holds them."""
+    if not isinstance(value, tuple):
+        return value
+    return [dataclasses.asdict(one) if isinstance(one, Obstacle) else one for one in value]
+
+
 def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
@@ -180,10 +196,13 @@ class Scenario(Artifact):
     """Which way is up along the world's z axis; the ground is the plane z = 0."""
     self_collision: bool = False
     ground: bool = True
+    obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
+    """What stands in the scene and does not move."""
     provenance: dict[str, str] = field(default_factory=dict)
     """What the reader used, as text: files with digests, options."""
 
     def check(self) -> None:
+        object.__setattr__(self, "obstacles", obstacles_of(self.obstacles, f"scenario {self.name}"))
         if not SAFE_NAME.fullmatch(self.name):
             raise InputError("scenario.name", f"a name must match {SAFE_NAME.pattern}", repr(self.name))
         if not 1 < self.train_end <= self.frame_count:
@@ -214,6 +233,7 @@ class Observations(Artifact):
     object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is seen in each frame")
     object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from frame t to t+1 may be trusted")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "points that move the object (hands, grippers)")
+    """A controller that first holds later has, in frame 0, the place of the body that it will hold: its springs are made there."""
     controller_valid: np.ndarray = array(
         "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: all do in all frames", omitted=True
     )
@@ -390,8 +410,11 @@ class Simulation:
     """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
     controller_path: ControllerPath = "linear"
     """How controllers move within a frame: straight, as in the released simulator, or along a cubic through neighboring frames."""
+    obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
+    """Nodes collide with them as with the ground, with its elasticity and friction."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "obstacles", obstacles_of(self.obstacles, "simulation"))
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
             rule = "finite frame_time > 0, substeps >= 1, collision_capacity >= 1, finite gravity are required"
             raise InputError("simulation", rule, self)

@@ -29,6 +29,7 @@ from neuspring.config import parse
 from neuspring.config.types import STRICT, Finite, Name, Positive
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.obstacles import Obstacle
 from neuspring.core.records import digest_file
 from neuspring.data.calibration import TEXT_TOLERANCE, intrinsics_departures, pose_departures
 from neuspring.data.departure import Departure, broken, refuse
@@ -121,6 +122,9 @@ class Description:
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
     """Whether the capture has masks."""
+    obstacles: tuple[Obstacle, ...] = ()
+    """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
+    [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
     provenance: dict[str, str] = field(default_factory=dict)
 
 
@@ -255,6 +259,8 @@ class Writer:
         if tracks is not None:
             write_tracks(folder, tracks)
         plain = TypeAdapter(Description).dump_python(description, mode="json")
+        if not description.obstacles:
+            del plain["obstacles"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
 
@@ -293,6 +299,9 @@ def description_departures(path: Path, description: Description) -> list[Departu
     if description.train_end is not None and description.train_end > description.frame_count:
         rule = f"must be at most frame_count = {description.frame_count}"
         departures.append(broken(path, "train_end", rule, description.train_end))
+    for number, obstacle in enumerate(description.obstacles):
+        if wrong := obstacle.wrong():
+            departures.append(broken(path, f"obstacles[{number}].{wrong[0]}", wrong[1], wrong[2]))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
         size = (camera.width, camera.height)

@@ -10,19 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, description_departures, read_description
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Description, description_departures, read_description
 from neuspring.data.departure import Departure, Inspection, broken, note, unusual
 from neuspring.data.intake.plane import cloud, planes
 from neuspring.data.intake.units import FAR, FASTEST, NEAR, SLOWEST
 from neuspring.data.plausible.pieces import objects
 from neuspring.data.plausible.table import table_departures
-from neuspring.data.plausible.things import Sample, at_border, thing_departures
+from neuspring.data.plausible.things import Sample, at_border, lifted, thing_departures
 from neuspring.data.plausible.views import view_departures
 
 SAMPLED = 5
 """Frames per camera, evenly spaced, that are compared with the world."""
 LEAVES = 0.1
 """Fraction of its area in frame 0 below which an object has left the view."""
+INSIDE, INSIDE_SHARE = 0.01, 0.05
+"""m, and share of the object's points: deeper in an obstacle than depth cameras err, they are inside."""
 LEAST_AROUND = 0.1
 """Share of the image that must have depth, beside object and hands, before the table is looked for."""
 
@@ -105,7 +107,23 @@ def _world_departures(capture: Capture, name: str, samples: dict[int, Sample], t
     departures = table_departures(path, name, found, camera.camera_to_world, up, unit)
     if capture.description.masks:
         departures += thing_departures(path, camera, samples, up, touching)
+    if 0 in samples:
+        departures += obstacle_departures(path, capture.description, lifted(camera, samples[0], OBJECT))
     return departures
+
+
+def obstacle_departures(path: Path, description: Description, points: np.ndarray) -> list[Departure]:
+    """Departures of obstacles in which points [n, 3], m, of the object lie in frame 0: nodes there would be thrown out."""
+    found = []
+    for number, obstacle in enumerate(description.obstacles):
+        share = float((obstacle.depth(points) > INSIDE).mean()) if len(points) else 0.0
+        if share > INSIDE_SHARE:
+            rule = f"the object of frame 0 must be outside, but for {INSIDE_SHARE:.0%} of what is seen of it"
+            remedy = "Look at center, rotation and sizes; they are in meters, in the world of the cameras."
+            found.append(
+                broken(path, f"obstacles[{number}]", f"{rule}. {remedy}", f"{share:.0%} more than {1e3 * INSIDE:g} mm inside")
+            )
+    return found
 
 
 def depth_departures(capture: Capture, name: str, medians: list[float]) -> list[Departure]:

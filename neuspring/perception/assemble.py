@@ -37,6 +37,7 @@ def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: Sh
             up=capture.description.up,
             self_collision=row.self_collision,
             ground=row.ground,
+            obstacles=capture.description.obstacles,
             provenance=capture.description.provenance | origin,
         ),
         object_points=points,

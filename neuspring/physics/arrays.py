@@ -31,6 +31,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     integers: Any = wp.array(dtype=int)
     lists: Any = wp.array3d(dtype=int)
     table: Any = wp.array2d(dtype=int)
+    reals: Any = wp.array2d(dtype=real)
 
     @wp.struct
     class Model:
@@ -65,6 +66,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         near: lists
         near_lanes: lists
         near_count: table
+        obstacles: reals
 
     @wp.struct
     class State:
@@ -131,6 +133,7 @@ class Buffers:
         self.tensors: dict[str, torch.Tensor] = {}
         self.views: dict[str, Any] = {}
         self.indices: dict[str, torch.Tensor] = {}
+        self.constants: dict[str, torch.Tensor] = {}
         self._arguments: tuple[Any, Any, Any] | None = None
         self.history = self.substeps if differentiable else 1
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuspring.physics import collision, position, springs, velocity
+from neuspring.physics import collision, obstacles, position, springs, velocity
 from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import lanes
 
@@ -39,14 +39,35 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def kernels(real: Any, width: int) -> Kernels:
-    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def _open(real: Any, width: int) -> position.Functions:
+    """The motion of position.py, with a last argument that it has no use for."""
+    lane = lanes(real, width)
+    Vector, Number = lane.Vector, lane.Number
+    Table: Any = wp.array2d(dtype=real)
+    plain, plain_adjoint = position.functions(real, width)
+
+    @wp.func
+    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, table: Table):
+        x, v = plain(p, w, dt, up, e, mu)
+        return x, v
+
+    @wp.func
+    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector, table: Table):
+        adj_x, adj_v, adj_e, adj_mu = plain_adjoint(p, w, dt, up, e, mu, hx, hv)
+        return adj_x, adj_v, adj_e, adj_mu
+
+    return position.Functions(moved, moved_adjoint)
+
+
+@functools.cache
+def kernels(real: Any, width: int, among: bool = False) -> Kernels:
+    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; `among` obstacles, or without any."""
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
-    spring, speed, motion = springs.functions(real, width), velocity.functions(real, width), position.functions(real, width)
+    spring, speed = springs.functions(real, width), velocity.functions(real, width)
     move_controller, updated, updated_adjoint = speed
-    moved, moved_adjoint = motion
+    moved, moved_adjoint = obstacles.functions(real, width) if among else _open(real, width)
     collided, collided_adjoint = collision.functions(real, width)
     add_row, add_row_adjoint, gathered, gathered_adjoint = spring[2:]
 
@@ -61,6 +82,7 @@ def kernels(real: Any, width: int) -> Kernels:
             model.up,
             model.ground_e[g],
             model.ground_mu[g],
+            model.obstacles,
         )
         if step >= model.fewest:
             x = chosen(step, model.counts[g], x, state.x[slot, i, g])
@@ -81,6 +103,7 @@ def kernels(real: Any, width: int) -> Kernels:
             model.ground_mu[g],
             adjoint.x[i, g],
             adjoint.v[i, g],
+            model.obstacles,
         )
         if step >= model.fewest:
             adj_x = chosen(step, model.counts[g], adj_x, adjoint.x[i, g])

@@ -16,6 +16,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from neuspring.physics.grips import BEGINS
+
 
 class ChosenPath(Protocol):
     """The simulation of a twin, or the settings that it is made with."""
@@ -28,8 +30,9 @@ class ChosenPath(Protocol):
 def waypoints(hands: torch.Tensor, simulation: ChosenPath, valid: np.ndarray | None = None) -> torch.Tensor:
     """What a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m, or with their tangents [T, C, 6].
 
-    Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0.
-    The springs of a controller act in a frame if it holds at both ends of the frame.
+    Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0,
+    and 2 where it begins to hold, but in frame 0. The springs of a controller act in a frame if it holds at both ends of the frame.
+    When it begins to hold they take the rest lengths of that moment (grips.py).
 
     A row depends on the frames next to it, so make them for all known frames before taking some.
     """
@@ -37,6 +40,7 @@ def waypoints(hands: torch.Tensor, simulation: ChosenPath, valid: np.ndarray | N
     if valid is None or valid.all():
         return rows
     holds = torch.tensor(valid[: len(hands)], dtype=hands.dtype, device=hands.device)
+    holds[1:] += (BEGINS - 1.0) * (holds[1:] - holds[:-1]).clamp(min=0.0)
     return torch.cat([rows, holds[..., None]], dim=-1)
 
 

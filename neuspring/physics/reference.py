@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
+from neuspring.core.obstacles import Obstacle
 from neuspring.physics.contact import APPROACH, MIN_TANGENT
 from neuspring.physics.lanes import MIN_LENGTH
 
@@ -58,12 +59,15 @@ def rollout(
 ) -> tuple[np.ndarray, np.ndarray]:
     """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3].
 
-    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it.
+    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it. When it begins to
+    hold, they take the lengths of that moment.
     """
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
     hands = controllers.astype(np.float64)
     for k in range(len(hands) - 1):
         slopes = (tangent(hands, k), tangent(hands, k + 1)) if scene.simulation.controller_path == "cubic" else None
+        if valid is not None and k:
+            scene = gripped(scene, xs[-1], hands[k], valid[k] & ~valid[k - 1])
         held = scene if valid is None else holding(scene, valid[k] & valid[k + 1])
         x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
         xs.append(x)
@@ -76,6 +80,15 @@ def holding(scene: Scene, holds: np.ndarray) -> Scene:
     led = np.concatenate([np.ones(scene.nodes, bool), holds])
     acts = led[scene.springs].all(axis=1)
     return replace(scene, stiffness=scene.stiffness * acts, dashpot=scene.dashpot * acts)
+
+
+def gripped(scene: Scene, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> Scene:
+    """The scene after controllers with `begin` [C] took hold: l0' = |x_c - x_n|, and Y' / l0' = Y / l0."""
+    taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1)
+    points = np.concatenate([x, hands])
+    apart = np.linalg.norm(points[scene.springs[:, 1]] - points[scene.springs[:, 0]], axis=1)
+    lengths = np.where(taken, np.maximum(apart, MIN_LENGTH), scene.rest_lengths)
+    return replace(scene, rest_lengths=lengths, stiffness=scene.stiffness * (lengths / scene.rest_lengths))
 
 
 def tangent(hands: np.ndarray, k: int) -> np.ndarray:
@@ -160,6 +173,8 @@ def substep(
     v = dragged(v + dt * (force / mass[:, None] + gravity), dt, scene.drag, scene.drag_quadratic)
     if pairs is not None:
         v = collide(x, v, mass, pairs, scene.contact_distance, *scene.contact)
+    if sim.obstacles:
+        return among(x, v, dt, sim, *scene.ground)
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
@@ -226,3 +241,51 @@ def bounce(x: np.ndarray, v: np.ndarray, dt: float, up: float, e: float, mu: flo
     impact = -x[:, 2] / np.where(falling, v[:, 2], 1.0)
     after = x + v * impact[:, None] + bounced * (dt - impact)[:, None]
     return np.where(falling[:, None], after, x + v * dt), np.where(falling[:, None], bounced, v)
+
+
+def among(x: np.ndarray, v: np.ndarray, dt: float, sim: Simulation, e: float, mu: float) -> tuple[np.ndarray, np.ndarray]:
+    """Motion among obstacles: each node is reflected at the contact that is first in time, the ground among them."""
+    moved, speeds = x + v * dt, v.copy()
+    for i in range(len(x)):
+        found = [surface(obstacle, x[i], v[i], dt) for obstacle in sim.obstacles]
+        found += [(sim.up_sign * x[i, 2], np.array([0.0, 0.0, sim.up_sign]))] if sim.ground else []
+        # (time of impact, normal) of surfaces that the node would pass inwards.
+        hits = [
+            (-distance / (v[i] @ n), n)
+            for distance, n in (each for each in found if each is not None)
+            if v[i] @ n < -APPROACH and distance + v[i] @ n * dt < 0
+        ]
+        if not hits:
+            continue
+        impact, n = min(hits, key=lambda hit: hit[0])
+        s = v[i] @ n
+        tangent = v[i] - s * n
+        speeds[i] = response(np.asarray(s), np.asarray(np.linalg.norm(tangent)), e, mu) * tangent - e * s * n
+        moved[i] = x[i] + v[i] * impact + speeds[i] * (dt - impact)
+    return moved, speeds
+
+
+def surface(obstacle: Obstacle, x: np.ndarray, v: np.ndarray, dt: float) -> tuple[float, np.ndarray] | None:
+    """Distance from the surface of an obstacle that a node at x [3] with velocity v would pass, and its normal; None: none."""
+    away = x - np.array(obstacle.center)
+    if obstacle.shape == "sphere":
+        length = float(np.linalg.norm(away))
+        enters = length > 0 and np.linalg.norm(away + v * dt) < obstacle.radius
+        return (length - obstacle.radius, away / length) if enters else None
+    axes = np.array(obstacle.rotation)
+    own, speed, sizes = away @ axes, v @ axes, np.array(obstacle.half_sizes)
+    gaps = np.abs(own) - sizes
+    if (gaps <= 0).all():
+        axis = int(gaps.argmax())
+    else:
+        closing = np.sign(own) * speed
+        times = np.full(3, -np.inf)
+        outside = gaps > 0
+        if (closing[outside] >= 0).any():
+            return None
+        times[outside] = -gaps[outside] / closing[outside]
+        axis = int(times.argmax())
+        others = np.arange(3) != axis
+        if (np.abs(own + speed * times[axis])[others] > sizes[others]).any():
+            return None
+    return float(gaps[axis]), np.sign(own[axis]) * axes[:, axis]

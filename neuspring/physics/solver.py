@@ -16,8 +16,9 @@ import torch
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load
 from neuspring.core.errors import InputError
-from neuspring.physics import collision, contact, frame, position, springs, velocity
+from neuspring.physics import collision, contact, frame, obstacles, position, springs, velocity
 from neuspring.physics.arrays import Buffers, Graphs
+from neuspring.physics.grips import Grips, begins
 
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """What may differ between the simulations of one solver; it does not read the last."""
@@ -84,15 +85,13 @@ class FrameSolver:
         threads = device != "cpu" if threads is None else threads
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
         springs.allocate(self.buffers, spring_pairs)
-        for term in (velocity, collision, position):
+        for term in (velocity, collision, position, obstacles):
             term.allocate(self.buffers)
-        self._kernels = frame.kernels(self.buffers.real, self.buffers.width)
+        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, bool(self.simulation.obstacles))
         self._graphs = Graphs(device)
-        ends = np.asarray(spring_pairs).reshape(-1, 2).max(axis=1)
-        self._led = torch.tensor(np.flatnonzero(ends >= nodes), device=device)
-        """Springs of controllers."""
-        self._leader = torch.tensor(ends[ends >= nodes] - nodes, device=device, dtype=torch.long)
-        """The controller of each of them."""
+        self.grips = Grips(spring_pairs, nodes, device)
+        self._held: torch.Tensor | None = None
+        """Rest lengths of grips that began since the parameters were set [B, L] (grips.py)."""
         self._plain: torch.Tensor | None = None
         """Springs as they were set [B, S, 3]."""
         self._factor: torch.Tensor | None = None
@@ -105,7 +104,7 @@ class FrameSolver:
         """Copy packed parameters into the solver's buffers."""
         b, values = self.buffers, Parameters(*map(self._stacked, parameters))
         springs.fill(b, values.springs)
-        self._plain, self._factor = values.springs.detach(), None
+        self._plain, self._factor, self._held = values.springs.detach(), None, None
         velocity.fill(b, values.decay)
         for kind in ("ground", "contact"):
             contact.fill(b, kind, getattr(values, kind))
@@ -143,7 +142,9 @@ class FrameSolver:
         b, path = self.buffers, self.simulation.controller_path
         columns = 3 if path == "linear" else 6
         if begin.shape[-1] == end.shape[-1] == columns + 1:
-            self._hold(begin[..., -1] * end[..., -1])
+            if bool(begins(begin).any()):
+                self._held = self.grips.taken(self._held, self.buffers.get_vectors("x", 0, self.nodes), begin)
+            self._hold(begin[..., -1] * end[..., -1] > 0)
             begin, end = begin[..., :-1], end[..., :-1]
         elif self._factor is not None:
             self._hold(None)
@@ -159,15 +160,26 @@ class FrameSolver:
                 b.set_vectors(name, values[..., 3:] - travel)
 
     def _hold(self, holds: torch.Tensor | None) -> None:
-        """Let the springs of controllers act whose `holds` [B, C] is 1, and not those where it is 0; None: all act."""
+        """Let the springs of controllers act that hold [B, C], and not those of others; None: all act."""
         assert self._plain is not None, "set_parameters comes first"
         self._factor = None
         if holds is not None:
             self._factor = torch.ones_like(self._plain)
-            acting = holds.to(self.dtype)[:, self._leader]
-            self._factor[:, self._led, 0] = acting  # Y
-            self._factor[:, self._led, 2] = acting  # gamma
-        springs.fill(self.buffers, self._plain if self._factor is None else self._plain * self._factor)
+            acting = holds.to(self.dtype)[:, self.grips.leaders]
+            self._factor[:, self.grips.springs, 0] = acting  # Y
+            self._factor[:, self.grips.springs, 2] = acting  # gamma
+        own = self.grips.applied(self._plain, self._held)
+        springs.fill(self.buffers, own if self._factor is None else own * self._factor)
+
+    def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
+        """Hold what was held after the frames of `rows` [T, C, K] (path.py), in which the nodes were at `positions` [N, 3], m.
+
+        For a rollout that does not begin in frame 0; more positions than rows may be given. It makes no difference where all hold.
+        """
+        known = torch.nonzero(begins(rows).any(dim=-1)).flatten().tolist()
+        states = [torch.tensor(positions[number], dtype=self.dtype, device=self.device) for number in known]
+        lengths = self.grips.taken_before([rows[number] for number in known], states)
+        self._held = None if lengths is None else lengths.expand(self.buffers.twins, -1)
 
     def go_on(self) -> None:
         """Take the end of the last frame for the start of the next."""
@@ -189,6 +201,7 @@ class FrameSolver:
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for contact distance and masses."""
+        assert self._held is None, "gradients of a grip need its rest lengths among the parameters: autograd.simulate_frame"
         b = self.buffers
         self.clear_adjoints()
         b.set_vectors("adj_x", self._stacked(adj_x))

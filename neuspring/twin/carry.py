@@ -24,7 +24,7 @@ from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.physics.autograd import solver_for
 from neuspring.physics.path import waypoints
 from neuspring.twin.last_frame import State, StateEstimator
-from neuspring.twin.motion import recent_velocity, spread
+from neuspring.twin.motion import holding, recent_velocity, spread
 from neuspring.twin.rollout import Diverged, frames
 
 ORIGINS = 12
@@ -113,21 +113,24 @@ class Residuals:
         points = len(self._points)
         visible = observations.object_visibility[frame][:, None]
         targets = np.where(visible, observations.object_points[frame].astype(np.float64), np.nan)
-        x += self._spread(targets - x[:points])
-        v += self._spread(recent_velocity(observations, frame) - v[:points])
+        # Only a hand that holds keeps what it holds in its place.
+        held = self._controllers[holding(observations, slice(frame, frame + 1))]
+        x += self._spread(targets - x[:points], held)
+        v += self._spread(recent_velocity(observations, frame) - v[:points], held)
         try:
+            self._solver.resume(self._hands[:frame], [x for x, _ in states])
             later = frames(self.twin, self._solver, self._hands[frame:stop], v, positions=x)
             return [np.array([x.cpu().numpy() for _, x, _ in later]).reshape(-1, *x.shape)]
         except Diverged:
             return [None]
 
-    def _spread(self, residual: np.ndarray) -> np.ndarray:
-        """Residuals of tracked points [No, 3], NaN where unknown, on all nodes [N, 3]; none at the controllers."""
+    def _spread(self, residual: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Residuals of tracked points [No, 3], NaN where unknown, on all nodes [N, 3]; none at controllers `held` [C', 3]."""
         finite = ~np.isnan(residual).any(axis=1)
         if not finite.any():
             return np.zeros((len(self._nodes), 3))
-        anchors = np.concatenate([self._points[finite], self._controllers])
-        return spread(anchors, np.concatenate([residual[finite], np.zeros((len(self._controllers), 3))]), self._nodes)
+        anchors = np.concatenate([self._points[finite], held])
+        return spread(anchors, np.concatenate([residual[finite], np.zeros((len(held), 3))]), self._nodes)
 
 
 def training_gains(run: Correction, states: list[State], observations: Observations, future: int) -> list[float]:

@@ -32,6 +32,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame, solver_for
+from neuspring.physics.grips import Grips
 from neuspring.physics.path import waypoints
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.company import Seat
@@ -45,6 +46,10 @@ LOWEST_RATE = 0.01
 """Where the cosine schedule ends, as a fraction of the learning rate."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
+
+
+_Motion = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]
+"""x [N, 3] m, v [N, 3] m/s, and rest lengths of grips that have begun (grips.py)."""
 
 
 class NonFinite(ArithmeticError):
@@ -156,6 +161,8 @@ class TwinFit:
         end = problem.frame_end
         hands = torch.tensor(observations.controller_points[:end], device=problem.device)
         self.hands = waypoints(hands, problem.twin.simulation, observations.controller_valid)
+        graph = problem.twin.topology
+        self.grips = Grips(graph.springs, len(graph.nodes), problem.device)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
@@ -257,23 +264,24 @@ class TwinFit:
         Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and, if
         frames are held back and the epoch is one step, their `tail_loss` before it.
         """
-        x, v = self.rest, self.velocity
+        state: _Motion = (self.rest, self.velocity, None)
         total, largest, row = 0.0, 0.0, {}
         for start in range(1, self.head_end, self.horizon):
             window = range(start, min(start + self.horizon, self.head_end))
             self.optimiser.zero_grad(set_to_none=True)
             packed = self.settled()
-            x, v, mean = self._simulate(x, v, window, packed)
+            state, mean = self._simulate(state, window, packed)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
             objective = self.loss_scale * mean + self.parameters.penalty()
             if objective.requires_grad:
                 objective.backward()  # type: ignore[no-untyped-call]
             total += float(mean.detach()) * len(window)
-            x, v = x.detach(), v.detach()
+            x, v, lengths = state
+            state = (x.detach(), v.detach(), None if lengths is None else lengths.detach())
             if self.one_step and self.head_end < len(self.hands):
                 with torch.no_grad():
-                    row["tail_loss"] = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+                    row["tail_loss"] = float(self._simulate(state, range(self.head_end, len(self.hands)), packed)[1])
             largest = max(largest, self._step(window))
         return row | {"loss": total / (self.head_end - 1), "gradient_norm": largest}
 
@@ -281,23 +289,29 @@ class TwinFit:
         """Mean loss of the held-back frames, m^2, in a rollout from rest with the present values. Raises NonFinite."""
         with torch.no_grad():
             packed = self.settled()
-            x, v = self.rest, self.velocity
+            state: _Motion = (self.rest, self.velocity, None)
             for frame in range(1, self.head_end):
-                x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
-            loss = float(self._simulate(x, v, range(self.head_end, len(self.hands)), packed)[2])
+                state = self._frame(state, frame, packed)
+            loss = float(self._simulate(state, range(self.head_end, len(self.hands)), packed)[1])
         if not math.isfinite(loss):
             raise NonFinite("the loss of the held-back frames is not finite")
         return loss
 
-    def _simulate(
-        self, x: torch.Tensor, v: torch.Tensor, window: range, packed: Parameters
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _frame(self, state: _Motion, frame: int, packed: Parameters) -> _Motion:
+        """State at the end of a frame."""
+        x, v, lengths = state
+        lengths = self.grips.taken(lengths, x, self.hands[frame - 1])
+        if lengths is not None:
+            packed = packed._replace(springs=self.grips.applied(packed.springs, lengths))
+        return *simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame]), lengths
+
+    def _simulate(self, state: _Motion, window: range, packed: Parameters) -> tuple[_Motion, torch.Tensor]:
         """State after the frames of `window`, and their mean loss."""
         losses = []
         for frame in window:
-            x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame])
-            losses.append(self.loss(frame, x))
-        return x, v, torch.stack(losses).mean()
+            state = self._frame(state, frame, packed)
+            losses.append(self.loss(frame, state[0]))
+        return state, torch.stack(losses).mean()
 
     def _step(self, window: range) -> float:
         tensors = [tensor for tensor in self.parameters.parameters() if tensor.grad is not None]

@@ -103,6 +103,8 @@ class StateEstimator:
         self._solver = solver_of([twin] * self._lanes, device, differentiable=False)
         hands = torch.tensor(observations.controller_points, dtype=torch.float32, device=device)
         self._hands = waypoints(hands, twin.simulation, observations.controller_valid)
+        self._before: list[np.ndarray] = []
+        """Positions of the nodes in the frames so far: grips that began there hold what was there."""
 
     @property
     def variants(self) -> tuple[float, ...]:
@@ -115,6 +117,7 @@ class StateEstimator:
         None where it diverged. `states` are the uncorrected ones of the frames up to `frame` at least.
         """
         estimated = self.estimates(frame, states)
+        self._before = [x for x, _ in states]
         run = self.simulate(np.array([x for x, _ in estimated]), np.array([v for _, v in estimated]), frame, stop - 1)
         finite = np.isfinite(run.positions).all(axis=(1, 2, 3))
         return [positions[1:] if good else None for positions, good in zip(run.positions, finite, strict=True)]
@@ -122,6 +125,7 @@ class StateEstimator:
     def estimates(self, frame: int, states: list[State]) -> list[State]:
         """The state at `frame` with each weight of the prior, from the observations of the window that ends there."""
         first = max(frame - self.settings.window, 0)
+        self._before = [x for x, _ in states]
         x, v = (values.astype(np.float64) for values in states[first])
         controllers = self.observations.controller_points[first]
         modes = soft_modes(self.twin, x, controllers, self.settings.modes)
@@ -190,6 +194,7 @@ class StateEstimator:
         # Empty lanes repeat the first.
         filled = [*range(count), *[0] * (self._lanes - count)]
         here, speed = (torch.tensor(values[filled], dtype=solver.dtype, device=solver.device) for values in (x, v))
+        solver.resume(self._hands[:first], self._before)
         way, start, gone = [here], here, torch.zeros_like(here[:, :1, :1], dtype=torch.bool)
         for frame in range(first, last):
             begin, end = (self._hands[f].expand(self._lanes, -1, -1) for f in (frame, frame + 1))

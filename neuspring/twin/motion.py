@@ -27,8 +27,8 @@ def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndar
 def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.ndarray:
     """Velocity of each node in frame 0 [N, 3], m/s.
 
-    rest: zero, as in the released simulator. observed: (-3 x0 + 4 x1 - x2) / (2 dt) of tracked points and controllers, exact for
-    constant acceleration, spread over the nodes; (x1 - x0) / dt where frame 2 is not visible or not for training.
+    rest: zero, as in the released simulator. observed: (-3 x0 + 4 x1 - x2) / (2 dt) of tracked points and of controllers that hold,
+    exact for constant acceleration, spread over the nodes; (x1 - x0) / dt where frame 2 is not visible or not for training.
     """
     nodes = observations.nodes
     if kind == "rest":
@@ -42,7 +42,16 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
         twice = once & visible[2] & valid[1]
         v[twice] = (-3 * x[0] + 4 * x[1] - x[2])[twice] * scenario.frame_rate / 2
         v_hands = (-3 * hands[0] + 4 * hands[1] - hands[2]) * scenario.frame_rate / 2
-    return spread(np.concatenate([x[0][once], hands[0]]), np.concatenate([v[once], v_hands]), nodes)
+    held = holding(observations, slice(0, 3))
+    if not (once.any() or held.any()):
+        return np.zeros(nodes.shape)
+    return spread(np.concatenate([x[0][once], hands[0][held]]), np.concatenate([v[once], v_hands[held]]), nodes)
+
+
+def holding(observations: Observations, frames: slice) -> np.ndarray:
+    """Which controllers [C] hold the object in all of these frames."""
+    valid, count = observations.controller_valid, observations.controller_points.shape[1]
+    return np.asarray(valid[frames].all(axis=0)) if valid.size else np.ones(count, dtype=bool)
 
 
 def recent_velocity(observations: Observations, frame: int) -> np.ndarray:

@@ -175,6 +175,7 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         up=scenario.up,
         gravity=settings.gravity,
         ground=scenario.ground,
+        obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
         collision_capacity=settings.collision_capacity,
         controller_velocity=settings.controller_velocity,

@@ -64,6 +64,7 @@ def move(
         frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
         up=scenario.up,
         ground=scenario.ground,
+        obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
     )
     moved = replace(moved, simulation=simulation)

@@ -33,6 +33,23 @@ def test_controllers_that_move_as_a_body_carry_the_object_along():
     np.testing.assert_allclose(found, wanted, atol=2e-4)
 
 
+def test_the_object_follows_controllers_only_while_they_hold():
+    seen = small.observations()
+    frames, hands = seen.scenario.frame_count, seen.controller_points.shape[1]
+    still = np.repeat(seen.controller_points[:1], frames, axis=0)
+    moved = still + np.arange(frames)[:, None, None] * np.array([0.01, 0.0, 0.0])
+    moved[:, 0] = still[:, 0] - np.arange(frames)[:, None] * np.array([0.0, 0.0, 0.02])
+    valid = np.zeros((frames, hands), bool)
+    valid[2:5, 1:] = True
+    found = controller_lbs(replace(seen, controller_points=moved, controller_valid=valid)).trajectory.positions
+    # Held from frame 2 to 4 by those that go sideways; the first one, which goes down, never holds.
+    shifts = np.clip(np.arange(frames) - 2, 0, 2)[:, None, None] * np.array([0.01, 0.0, 0.0])
+    np.testing.assert_allclose(found, seen.nodes + shifts, atol=2e-4)
+    every = controller_lbs(replace(seen, controller_points=moved, controller_valid=np.ones_like(valid)))
+    plain = controller_lbs(replace(seen, controller_points=moved))
+    np.testing.assert_allclose(every.trajectory.positions, plain.trajectory.positions, atol=1e-6)
+
+
 def test_neither_sees_more_than_frame_0_of_the_object():
     seen = small.observations()
     spoiled = replace(seen, object_points=np.concatenate([seen.object_points[:1], seen.object_points[1:] + 1.0]))

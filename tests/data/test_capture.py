@@ -111,6 +111,19 @@ def test_bad_cameras_are_refused(tmp_path, change, message):
         ({"frame_count": 2}, "frame_count"),
         ({"format": 2}, "format"),
         ({"cameras": []}, "cameras"),
+        (
+            {"obstacles": [{"shape": "box", "center": [0, 0, 0]}]},
+            r"obstacles\[0\].half_sizes: three positive half sizes are required",
+        ),
+        ({"obstacles": [{"shape": "sphere", "center": [0, 0, 0], "size": 1}]}, r"obstacles.*size"),
+        (
+            {
+                "obstacles": [
+                    {"shape": "box", "center": [0, 0, 0], "half_sizes": [1, 1, 1], "rotation": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]}
+                ]
+            },
+            r"obstacles\[0\].rotation: must be a rotation",
+        ),
     ],
 )
 def test_bad_descriptions_are_refused(tmp_path, change, message):

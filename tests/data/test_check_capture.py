@@ -81,3 +81,13 @@ def test_two_objects(capture):
 def test_an_object_that_leaves_the_view(capture):
     relabel(capture, lambda labels, frame: np.where((labels == 1) & (frame > 3), 0, labels).astype(np.uint8))
     assert "almost nothing of it in 2 frames, first in frame 4" in warnings(capture)
+
+
+def test_an_object_inside_an_obstacle(capture):
+    around = {"shape": "sphere", "center": [0.0, 0.0, 0.0], "radius": 5.0}
+    beside = {"shape": "box", "center": [0.0, 9.0, 0.0], "half_sizes": [1.0, 1.0, 1.0]}
+    edit(capture, lambda values: values.update(obstacles=[beside]))
+    assert errors(capture) == ""
+    edit(capture, lambda values: values.update(obstacles=[beside, around]))
+    assert "obstacles[1]: the object of frame 0 must be outside" in errors(capture)
+    assert "received 100% more than 10 mm inside" in errors(capture)

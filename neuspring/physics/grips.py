@@ -1,0 +1,74 @@
+"""Grips that begin later than frame 0: springs of a controller take the rest lengths of the moment in which it takes hold.
+
+At the frame in which a controller at x_c begins to hold, spring (c, n) with stiffness Y and rest length l0 becomes
+
+    l0' = |x_c - x_n|,   Y' = Y l0' / l0,
+
+with x_n where the simulated node is then. So the springs have no force at that moment, and Y' / l0' = Y / l0: force per length, and
+with it the substep that was found stable, stay. Both are functions of the state of that frame, and of the parameters: gradients go
+through them, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from neuspring.physics.lanes import MIN_LENGTH
+
+BEGINS = 2.0
+"""In the last column of a row of waypoints (path.py): the controller begins to hold in this frame."""
+
+
+def begins(row: torch.Tensor) -> torch.Tensor:
+    """Which controllers [..., C] begin to hold, of a row of waypoints; none where it has no such column."""
+    flagged = row.shape[-1] in (4, 7)
+    return row[..., -1] == BEGINS if flagged else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
+
+
+def begun(row: torch.Tensor) -> torch.Tensor:
+    """The row after its grips were taken: who begins holds."""
+    return torch.cat([row[..., :-1], row[..., -1:].clamp(max=1.0)], dim=-1) if row.shape[-1] in (4, 7) else row
+
+
+class Grips:
+    """The springs of controllers among spring_pairs [S, 2]; i >= nodes means controller i - nodes."""
+
+    def __init__(self, spring_pairs: np.ndarray, nodes: int, device: str) -> None:
+        ends = np.sort(np.asarray(spring_pairs).reshape(-1, 2), axis=1)
+        led = np.flatnonzero(ends[:, 1] >= nodes)
+        self.springs, self.nodes, self.leaders = (
+            torch.tensor(values, dtype=torch.long, device=device) for values in (led, ends[led, 0], ends[led, 1] - nodes)
+        )
+        """Springs of controllers [L], the node and the controller of each."""
+
+    def taken(self, lengths: torch.Tensor | None, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor | None:
+        """Rest lengths [..., L], m, after the grips that begin in a frame; 0 where a spring's own holds; None: everywhere.
+
+        `lengths` are those before, x [..., N, 3], m, the nodes in that frame, and `row` [..., C, K] its waypoints.
+        """
+        now = begins(row)
+        if not bool(now.any()):
+            return lengths
+        apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_LENGTH)
+        before = torch.zeros_like(apart) if lengths is None else lengths
+        return torch.where(now[..., self.leaders], apart, before)
+
+    def taken_before(self, rows: Iterable[torch.Tensor], positions: Iterable[torch.Tensor]) -> torch.Tensor | None:
+        """The same after several frames, from the rows and the nodes' positions in each."""
+        lengths = None
+        for row, x in zip(rows, positions, strict=False):
+            lengths = self.taken(lengths, x, row)
+        return lengths
+
+    def applied(self, packed: torch.Tensor, lengths: torch.Tensor | None) -> torch.Tensor:
+        """Parameters [..., S, 3] of springs (springs.pack) with rest lengths [..., L], and the stiffness that goes with them."""
+        if lengths is None:
+            return packed
+        stiffness, inverse, dashpot = packed[..., self.springs, :].unbind(dim=-1)
+        new = lengths > 0
+        safe = torch.where(new, lengths, 1.0)
+        own = [torch.where(new, stiffness * inverse * safe, stiffness), torch.where(new, 1.0 / safe, inverse), dashpot]
+        return packed.index_copy(-2, self.springs, torch.stack(own, dim=-1))

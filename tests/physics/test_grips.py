@@ -1,0 +1,171 @@
+"""Grips that begin later than frame 0: no force when they begin, the reference, closed forms, gradients, all ways to run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring.physics import autograd, reference
+from neuspring.physics.autograd import pack, simulate_frame
+from neuspring.physics.grips import Grips
+from neuspring.physics.path import waypoints
+from neuspring.twin.rollout import frames, roll_out
+from neuspring.twin.trials import motions
+from tests.support.differences import assert_gradients, differences
+from tests.support.scenes import WAYS, random_scene, scene, solver_for, tensors, twin_of, with_values
+
+ROUNDING = 1e-12
+"""m and m/s: float64 over a few hundred substeps."""
+FRAMES = 1e-5
+"""Relative to the largest entry, of gradients against central differences, as in test_gradients."""
+GRIP = 40
+"""The frame, of one substep, in which the hand catches the body."""
+DT = 1e-3
+"""s."""
+PER_LENGTH = 400.0
+"""N/m, of the spring of the hand: 12 N per strain over the 3 cm that it has in frame 0."""
+
+
+def run(body, x, v, rows, device="cpu", threads=False):
+    """States at frame ends along the rows of `waypoints`."""
+    solver = solver_for(body, rows.shape[1], device=device, threads=threads)
+    states = [(torch.tensor(x, device=device), torch.tensor(v, device=device))]
+    for begin, end in pairwise(rows):
+        states.append(solver.forward(*states[-1], begin.to(device), end.to(device)))
+    return tuple(torch.stack(values).cpu().numpy() for values in zip(*states, strict=True))
+
+
+def caught(frames):
+    """A node of 1 kg falls from rest; in frame GRIP a hand takes hold of it from 7 cm above, and stays there."""
+    body = scene(1, [(0, 1)], [0.03], stiffness=[PER_LENGTH * 0.03], gravity=9.8, frame_time=DT, substeps=1)
+    n = np.arange(frames)
+    fall = 2.0 - 9.8 * DT**2 * n * (n + 1) / 2
+    hands = np.zeros((frames, 1, 3))
+    hands[:, 0, 2] = fall[GRIP] + 0.07
+    hands[0, 0, 2] = 2.03
+    return body, np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 3)), hands, n[:, None] >= GRIP, fall
+
+
+@pytest.mark.parametrize(("device", "threads"), WAYS)
+def test_a_falling_body_is_caught_without_a_jump_of_force(device, threads):
+    body, x, v, hands, valid, fall = caught(GRIP + 3)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+    np.testing.assert_allclose(xs[: GRIP + 1, 0, 2], fall[: GRIP + 1], atol=ROUNDING)
+    gained = np.diff(vs[:, 0, 2]) / DT
+    # Where the grip begins there is weight alone; one substep later also the force of the way fallen since.
+    np.testing.assert_allclose(gained[: GRIP + 1], -9.8, atol=ROUNDING / DT)
+    np.testing.assert_allclose(gained[GRIP + 1], -9.8 + PER_LENGTH * (fall[GRIP] - xs[GRIP + 1, 0, 2]), atol=PER_LENGTH * 1e-11)
+
+
+def test_a_caught_body_falls_as_deep_as_its_energy_says():
+    body, x, v, hands, valid, fall = caught(GRIP + 140)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid))
+    speed = vs[GRIP, 0, 2]
+    # m v^2 / 2 + m g D = K D^2 / 2 at the lowest point.
+    depth = (9.8 + np.sqrt(9.8**2 + PER_LENGTH * speed**2)) / PER_LENGTH
+    # Symplectic Euler keeps an energy that differs by the fraction omega dt = 0.02 at most.
+    assert fall[GRIP] - xs[GRIP:, 0, 2].min() == pytest.approx(depth, rel=0.02)
+
+
+def late_scene(path="linear"):
+    """A lively body; one hand lets go in frame 2 and grips again in frame 4, the other grips in frame 3 for the first time."""
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, on_ground=False, controller_path=path)
+    hands = np.concatenate([hands, hands[::-1]])[:7]
+    valid = np.ones(hands.shape[:2], bool)
+    valid[2:4, 0] = False
+    valid[:3, 1] = False
+    return body, x, v, hands, valid
+
+
+@pytest.mark.parametrize("path", ["linear", "cubic"])
+@pytest.mark.parametrize(("device", "threads"), WAYS)
+def test_the_solver_agrees_with_the_reference(device, threads, path):
+    body, x, v, hands, valid = late_scene(path)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+    expected, speeds = reference.rollout(body, x, v, hands, valid)
+    np.testing.assert_allclose(xs, expected, atol=ROUNDING)
+    np.testing.assert_allclose(vs, speeds, atol=1e-9)
+    # And the lengths of then matter: with those of frame 0 the motion is another.
+    kept = valid.copy()
+    kept[0, 1] = kept[2, 0] = True
+    assert np.abs(reference.rollout(body, x, v, hands, kept)[0] - expected).max() > 1e-3
+
+
+def simulated(body, rows, x, v, values):
+    """The last positions, differentiable in values, x and v: as a fit simulates."""
+    solver, grips = solver_for(body, rows.shape[1]), Grips(body.springs, body.nodes, "cpu")
+    parameters, lengths = pack(**values, substep=body.simulation.substep), None
+    for begin, end in pairwise(rows):
+        lengths = grips.taken(lengths, x, begin)
+        held = parameters._replace(springs=grips.applied(parameters.springs, lengths))
+        x, v = simulate_frame(solver, held, x, v, begin, end)
+    return x
+
+
+@pytest.mark.parametrize("name", ["stiffness", "dashpot", "rest_lengths", "x", "v"])
+def test_gradients_through_grips_are_exact(name):
+    """Rest lengths of grips depend on the state in which they begin, and so on everything before: no part is left out."""
+    body, x, v, hands, valid = late_scene()
+    rows, weights = waypoints(torch.tensor(hands), body.simulation, valid), np.random.default_rng(0).normal(size=x.shape)
+    values, start = tensors(body), {"x": torch.tensor(x), "v": torch.tensor(v)}
+    every = values | start
+    learned = every[name].clone().requires_grad_()
+    every = every | {name: learned}
+    end = simulated(body, rows, every["x"], every["v"], {key: every[key] for key in values})
+    np.testing.assert_allclose(end.detach(), reference.rollout(body, x, v, hands, valid)[0][-1], atol=ROUNDING)
+    (end * torch.tensor(weights)).sum().backward()
+
+    def loss(changed):
+        state = [changed.get(key, value) for key, value in (("x", x), ("v", v))]
+        other = with_values(body, {name: changed[name]}) if name in values else body
+        return float((reference.rollout(other, *state, hands, valid)[0][-1] * weights).sum())
+
+    wanted = differences(loss, {name: (values | start)[name].numpy()})
+    assert_gradients({name: learned.grad.numpy()}, wanted, FRAMES)
+
+
+def test_gradients_straight_from_the_solver_refuse_grips_that_it_took_itself():
+    body, x, v, hands, valid = late_scene()
+    rows, state = waypoints(torch.tensor(hands), body.simulation, valid), (torch.tensor(x), torch.tensor(v))
+    solver = solver_for(body, hands.shape[1])
+    for begin, end in pairwise(rows):
+        state = solver.forward(*state, begin, end)
+    with pytest.raises(AssertionError, match="simulate_frame"):
+        solver.backward(*state)
+
+
+def test_all_ways_to_roll_out_take_the_same_grips():
+    """`roll_out`, `trials.motions` (search, on lanes), a fit's frames, and a rollout that goes on from a frame after the grips."""
+    body, x, v, hands, valid = late_scene()
+    twin = twin_of(body, x, hands[0])
+    alone = roll_out(twin, hands, velocity=v, valid=valid).positions
+    rows = waypoints(torch.tensor(hands, dtype=torch.float32), twin.simulation, valid)
+    stiffer = replace(twin, material=replace(twin.material, stiffness=2.0 * twin.material.stiffness))
+    judged, speeds = motions([twin, stiffer], rows, torch.tensor(v, dtype=torch.float32), "cpu")
+    np.testing.assert_array_equal(judged[:, 0].numpy(), alone[1:])
+    np.testing.assert_array_equal(judged[:, 1].numpy(), roll_out(stiffer, hands, velocity=v, valid=valid).positions[1:])
+    double = torch.tensor(hands), torch.tensor(x), torch.tensor(v)
+    fitted = simulated(body, waypoints(double[0], body.simulation, valid), *double[1:], tensors(body))
+    assert np.abs(fitted.numpy() - alone[-1]).max() < 1e-5
+    solver = autograd.solver_for(twin, differentiable=False)
+    solver.resume(rows[:5], list(alone))
+    later = frames(twin, solver, rows[5:], speeds[4, 0].numpy(), positions=alone[5])
+    np.testing.assert_array_equal(np.stack([at.numpy() for _, at, _ in later]), alone[6:])
+
+
+def test_stiffness_per_length_stays_however_near_the_hand():
+    """So the substep that was checked for the lengths of frame 0 stays safe."""
+    body, x, _, _, _ = late_scene()
+    grips, springs = Grips(body.springs, body.nodes, "cpu"), pack(**tensors(body), substep=1e-3).springs
+    controllers = int(body.springs.max()) + 1 - body.nodes
+    row = torch.zeros(controllers, 4, dtype=torch.float64)
+    row[:, :3] = torch.tensor(x[int(grips.nodes[0])])
+    row[:, 3] = 2.0
+    after = grips.applied(springs, grips.taken(None, torch.tensor(x), row))
+    torch.testing.assert_close(after[:, 0] * after[:, 1], springs[:, 0] * springs[:, 1])
+    assert bool(torch.isfinite(after).all())
+    assert float(after[:, 1].max()) > 2 * float(springs[:, 1].max())

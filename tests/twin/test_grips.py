@@ -1,0 +1,101 @@
+"""Grips that begin later, in all that learns a twin: searches, fits, corrected states; the future is not read."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuspring import config
+from neuspring.core.artifacts import Observations
+from neuspring.twin import carry
+from neuspring.twin.carry import Residuals, training_states
+from neuspring.twin.fit import TwinFit, fit
+from neuspring.twin.last_frame import StateEstimator
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.search import search
+from tests.support import small
+
+SINGLE = 1e-5
+"""Relative: losses in float32, summed in another order."""
+
+
+def regripped(seen: Observations, begin: int = 2) -> Observations:
+    """The hands hold from frame `begin` on; one of them has held from the start."""
+    valid = np.ones(seen.controller_points.shape[:2], bool)
+    valid[:begin, 1:] = False
+    return replace(seen, controller_valid=valid)
+
+
+def outcome(twin, seen):
+    return roll_out(twin, seen.controller_points, valid=seen.controller_valid).positions
+
+
+def test_a_fit_simulates_what_a_rollout_does():
+    seen = regripped(small.observations())
+    problem = small.fit_problem(seen)
+    trained = TwinFit(problem)
+    positions = torch.tensor(outcome(problem.twin, seen))
+    loss = FrameLoss.of(seen, config.Losses(), "cpu")
+    for horizon in (1, 2, 4):
+        state, start = (trained.rest, trained.velocity, None), 1
+        while start < seen.scenario.train_end:
+            window = range(start, min(start + horizon, seen.scenario.train_end))
+            state, mean = trained._simulate(state, window, trained.settled())
+            wanted = torch.stack([loss(frame, positions[frame]) for frame in window]).mean()
+            assert float(mean.detach()) == pytest.approx(float(wanted), rel=SINGLE)
+            state, start = (state[0].detach(), state[1].detach(), None if state[2] is None else state[2].detach()), window.stop
+    assert np.abs(outcome(problem.twin, seen) - roll_out(problem.twin, seen.controller_points).positions).max() > 1e-4
+
+
+@pytest.mark.parametrize("horizon", [1, 0])
+def test_a_fit_lowers_its_loss_and_does_not_read_the_future(horizon):
+    settings = config.Fit(epochs=3, learning_rate=5e-2, horizon=horizon)
+    first, second = (
+        fit(small.fit_problem(regripped(seen), fit=settings)) for seen in (small.observations(), small.spoiled_future())
+    )
+    pd.testing.assert_frame_equal(first.history, second.history, check_exact=True)
+    np.testing.assert_array_equal(first.twin.material.stiffness, second.twin.material.stiffness)
+    assert first.history["loss"].iloc[-1] < first.history["loss"].iloc[0]
+
+
+def test_a_search_knows_grips_and_does_not_read_the_future():
+    first, second, plain = (
+        search(small.search_problem(seen), 0)
+        for seen in (regripped(small.observations()), regripped(small.spoiled_future()), small.observations())
+    )
+    np.testing.assert_array_equal(first.trace["cost"], second.trace["cost"])
+    assert first.cost != plain.cost
+
+
+def test_a_grip_after_the_split_does_not_read_the_body_there():
+    seen = small.observations()
+    end = seen.scenario.train_end
+    twin, known = small.scene().truth, regripped(seen, end + 1)
+    points = seen.object_points.copy()
+    points[end:] += 1.0
+    spoiled = replace(known, object_points=points)
+    np.testing.assert_array_equal(outcome(twin, known), outcome(twin, spoiled))
+    assert np.isfinite(outcome(twin, known)).all()
+
+
+def test_what_goes_on_from_a_later_state_holds_what_was_held(monkeypatch):
+    """Both ways to correct a state, with nothing to correct: they end where the rollout does."""
+    scene = small.scene(frames=16)
+    seen, twin = regripped(scene.observations, 4), scene.truth
+    velocity = initial_velocity(seen, "rest")
+    positions = outcome(twin, seen)
+    exact = replace(seen, object_points=positions[:, : seen.object_points.shape[1]])
+    states = training_states(twin, exact, velocity)
+    monkeypatch.setattr(carry, "recent_velocity", lambda seen, frame: np.full(seen.object_points[0].shape, np.nan))
+    for frame in (3, 8):
+        way = Residuals(twin, exact, "cpu").corrected(frame, states, 16)[0]
+        np.testing.assert_array_equal(way, positions[frame + 1 :])
+        run = StateEstimator(twin, exact, config.LastFrame(modes=4))
+        run._before = [x for x, _ in states]
+        x, v = (np.repeat(values[None], 2, axis=0) for values in states[frame])
+        for lane in run.simulate(x, v, frame, 15).positions:
+            np.testing.assert_array_equal(lane[1:], positions[frame + 1 :])
