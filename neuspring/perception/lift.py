@@ -64,7 +64,8 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
     in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    holds = holding(controllers, (hands.points, hands.visible), (objects.points, objects.visible), in_view, settings)
+    body = (objects.points, objects.visible)
+    holds = holding(controllers, (hands.points, hands.visible), body, in_view, capture.train_end, settings)
     if len(holds):
         facts |= {"controllers_let_go": float((~holds[-1]).sum()), "first_let_go": float(np.flatnonzero(~holds.all(axis=1))[0])}
     facts |= {

@@ -17,19 +17,21 @@ def holding(
     hands: tuple[np.ndarray, np.ndarray],
     body: tuple[np.ndarray, np.ndarray],
     in_view: np.ndarray,
+    train_end: int,
     settings: Lift,
 ) -> np.ndarray:
     """Whether each of `controllers` [T, C, 3] holds in each frame [T, C]; `ALWAYS` if all do, or `settings.release` is null.
 
     `hands` and `body` are tracked points [T, n, 3], m, and whether they are seen [T, n]; `in_view` [T]: whether any mask shows a
-    hand. A hand lets go after the last frame in which it was within `release` of the body: as soon as it is seen farther away, or
+    hand. Points of the body after the training frames are not read: from `train_end` on a hand lets go only by leaving the view. A
+    hand lets go after the last frame in which it was within `release` of the body: as soon as it is seen farther away, or
     when no hand was in view for `release_after` frames. A hand that comes near again has not let go before: springs of a new grip
     would need rest lengths of that moment.
     """
     if settings.release is None:
         return ALWAYS
     (points, seen), (own, shown) = hands, body
-    trees = [cKDTree(own[frame, shown[frame]]) if shown[frame].any() else None for frame in range(len(own))]
+    trees = [cKDTree(own[frame, shown[frame]]) if shown[frame].any() else None for frame in range(train_end)]
     groups = hands_of(points[0])
     label = np.zeros(points.shape[1], dtype=int)
     for number, group in enumerate(groups):
@@ -41,7 +43,10 @@ def holding(
         if not len(members):
             continue
         followed = seen[:, group].sum(axis=1) >= LEAST_FOR_POSE
-        apart = np.array([tree.query(controllers[t, members])[0].min() if tree else np.nan for t, tree in enumerate(trees)])
+        apart = np.full(len(own), np.nan)
+        for frame, tree in enumerate(trees):
+            if tree is not None:
+                apart[frame] = tree.query(controllers[frame, members])[0].min()
         near = np.flatnonzero(followed & (apart <= settings.release))
         if len(near):
             result[_gone(near[-1], followed & (apart > settings.release), in_view, settings.release_after) :, members] = False

@@ -31,10 +31,10 @@ def scene(away: np.ndarray):
     return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
 
 
-def held(away: np.ndarray, settings: Lift = SETTINGS, **changes: np.ndarray) -> np.ndarray:
+def held(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
     points, seen, bodies, shown, in_view = scene(away)
-    seen, in_view = changes.get("seen", seen), changes.get("in_view", in_view)
-    return holding(points[:, [0, 3, 4]], (points, seen), (bodies, shown), in_view, settings)
+    seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
+    return holding(points[:, [0, 3, 4]], (points, seen), (bodies, shown), in_view, train_end, settings)
 
 
 def leaving(at: int) -> np.ndarray:
@@ -53,6 +53,13 @@ def test_a_hand_that_goes_away_lets_go_and_the_other_holds_on():
     assert not valid[first:, :2].any()
     assert valid[:first].all()
     assert valid[:, 2].all()
+
+
+def test_the_body_is_not_read_after_the_training_frames():
+    assert held(leaving(20), train_end=18) is ALWAYS
+    spoiled = scene(leaving(10))[2]
+    spoiled[18:] += 9.0
+    np.testing.assert_array_equal(held(leaving(10), train_end=18, bodies=spoiled), held(leaving(10), train_end=18))
 
 
 def test_a_hand_that_comes_back_has_not_let_go():
