@@ -76,7 +76,7 @@ class Springs:
 
     def ends(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
         """[S, 2, 3] float32, m."""
-        return np.concatenate([nodes, hands]).astype(np.float32)[self.pairs]
+        return np.asarray(np.concatenate([nodes, hands]).astype(np.float32)[self.pairs])
 
     def strain(self, ends: np.ndarray) -> np.ndarray:
         """l / l0 - 1 [S] of ends [S, 2, 3], m."""
@@ -116,7 +116,7 @@ def _regions(twin: Twin) -> np.ndarray:
     """A region's color within it; dark between regions; gray for springs of hands."""
     springs, count = twin.topology.springs, len(twin.topology.nodes)
     of_nodes = node_colors(twin)
-    inner = (springs < count).all(axis=1)
+    inner: np.ndarray = (springs < count).all(axis=1)
     labels = twin.topology.labels
     colors = np.tile(PLAIN, (len(springs), 1))
     same = inner.copy()

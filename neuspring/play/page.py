@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neuspring.play.clock import SPEEDS
 from neuspring.play.colors import QUANTITIES
+from neuspring.play.live import LivePanel
 from neuspring.play.player import MOST_SHOWN, Player
 from neuspring.play.results import Scene
 
@@ -35,7 +37,7 @@ KEYS = "Keys: space plays, arrows left and right step, home and end jump."
 class Page:
     """The controls of a recording, shared by all browsers that have it open."""
 
-    def __init__(self, server: viser.ViserServer, found: Scene) -> None:
+    def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
         self.server, self.found = server, found
         scenario = found.observations.scenario
         server.scene.set_up_direction(scenario.up)
@@ -48,6 +50,7 @@ class Page:
         self._time()
         self._runs()
         self._shown()
+        self.panel = LivePanel(server, self.player, save_to)
         self._keys()
         self._thread = threading.Thread(target=self._tick, name="clock", daemon=True)
         self._thread.start()
@@ -56,6 +59,7 @@ class Page:
         """Stop the clock."""
         self._stop.set()
         self._thread.join(5)
+        self.panel.stop()
 
     def _look_at(self) -> None:
         """The first view: the whole scene, from the side of its first camera or from the front."""
@@ -173,7 +177,7 @@ class Page:
 
     def _tick(self) -> None:
         """Let time pass, and draw what has changed."""
-        last = time.monotonic()
+        last = told = time.monotonic()
         while not self._stop.wait(1 / RATE):
             now = time.monotonic()
             with self.player.lock:
@@ -185,5 +189,8 @@ class Page:
                         self.slider.value = self.player.clock.frame
                         self.bar.content = self.player.clock.bar()
                 playing = self.player.clock.playing
+            if now - told > 0.25:
+                told = now
+                self.panel.refresh()
             if self.play.label != (wanted := "Pause" if playing else "Play"):
                 self.play.label = wanted

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.play.body import Body
 from neuspring.play.clock import Clock
@@ -55,6 +56,7 @@ class Player:
         self.notes: dict[str, str] = {}
         """Run -> why it is not shown, or what to know about it."""
         self._scene, self._bodies = scene, dict[str, Body]()
+        self._hidden = False
         seen = found.observations
         everything = np.concatenate([seen.object_points[seen.object_visibility], seen.nodes])
         self.low, self.high = everything.min(axis=0), everything.max(axis=0)
@@ -82,10 +84,20 @@ class Player:
             for index, name in enumerate(name for name in wanted if name in self._bodies):
                 body = self._bodies[name]
                 body.show(nodes=look.nodes, springs=look.springs, hands=look.hands)
-                body.root.position = self.offset(index)
-            self.around.show(points=look.points, tracks=look.tracks, cameras=look.cameras, images=look.images)
+                body.root.position, body.root.visible = self.offset(index), not self._hidden
+            seen = not self._hidden
+            self.around.show(
+                points=look.points and seen, tracks=look.tracks and seen, cameras=look.cameras, images=look.images and seen
+            )
             self.scale = self._scale()
             self.draw()
+
+    def hide(self, hidden: bool) -> None:
+        """Take the recording out of sight, for a live twin; time stands still meanwhile."""
+        with self.lock:
+            self._hidden = hidden
+            self.clock.playing = False
+            self.apply()
 
     def offset(self, index: int) -> tuple[float, float, float]:
         """Where a run stands: beside the others along y, the first one where it was observed."""
@@ -127,7 +139,7 @@ class Player:
             notes.append(str(error))
         self.notes[run.name] = "; ".join(notes)
 
-    def _twin(self, run: Run, notes: list[str]) -> object:
+    def _twin(self, run: Run, notes: list[str]) -> Twin | None:
         try:
             twin = run.twin
         except InputError as error:
@@ -145,7 +157,7 @@ class Player:
 
     def _positions(self, run: Run, frame: int) -> np.ndarray:
         assert run.trajectory is not None
-        return run.trajectory.positions[min(frame, len(run.trajectory.positions) - 1)]
+        return np.asarray(run.trajectory.positions[min(frame, len(run.trajectory.positions) - 1)])
 
     def _scale(self) -> Scale | None:
         parts: list[Springs] = []

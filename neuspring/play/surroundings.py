@@ -71,11 +71,11 @@ class Surroundings:
                 camera.image = self._image(name, frame)
 
     def _points(self, frame: int) -> np.ndarray:
-        return self._seen.object_points[frame][self._seen.object_visibility[frame]]
+        return np.asarray(self._seen.object_points[frame][self._seen.object_visibility[frame]])
 
     def _tracks(self, frame: int) -> np.ndarray:
         tracks = self._seen.tracks[frame] if len(self._seen.tracks) else np.zeros((0, 3), np.float32)
-        return tracks[np.isfinite(tracks).all(axis=1)]
+        return np.asarray(tracks[np.isfinite(tracks).all(axis=1)])
 
     def _image(self, name: str, frame: int) -> np.ndarray | None:
         """A small picture, or none where the camera has none."""
