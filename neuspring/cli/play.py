@@ -23,12 +23,12 @@ def play_options(parser: ArgumentParser) -> None:
 
 def play(a: Namespace) -> None:
     """`neuspring play`: serves until Ctrl-C."""
-    from neuspring.perception.annotate.guard import is_loopback
     from neuspring.core.errors import InputError
+    from neuspring.perception.annotate.guard import is_loopback
     from neuspring.play.controls import load_controls
     from neuspring.play.page import Page
-    from neuspring.play.scoring import comparison, pulled_run
     from neuspring.play.results import find
+    from neuspring.play.scoring import comparison, pulled_run
     from neuspring.play.serve import address, start
 
     found = find(a.results)

@@ -1,4 +1,4 @@
-"""A run as it is drawn: nodes, springs, hands, and splats where there are any."""
+"""A run as it is drawn: nodes, springs and hands."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ WIDTH = 2.0
 """Pixels of a spring."""
 SIZE = 0.3
 """Radius of a node as a part of the median distance to its nearest neighbor."""
+LEAST, REACH = 0.004, 0.03
+"""Least radius of a node, and of what takes the mouse for it, as parts of the body's size."""
 
 
 class Body:
@@ -29,7 +31,10 @@ class Body:
         self.twin, self.name, self._scene = twin, name, scene
         self.parts = Springs.of(twin, sample(len(twin.topology.springs))) if twin and len(twin.topology.springs) else None
         self.root = scene.add_frame(f"/{name}", show_axes=False)
-        radius = SIZE * spacing(nodes)
+        size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+        radius = max(SIZE * spacing(nodes), LEAST * size)
+        self._reach = max(radius, REACH * size)
+        self._handles: Any = None
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, node_colors(twin) if twin else NODE)
         self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND)
         self.springs: Any = None
@@ -54,6 +59,8 @@ class Body:
         """Draw nodes [N, 3] and hands [C, 3], m; springs stretched beyond `most` are red. Returns the strain of drawn springs."""
         self.nodes.batched_positions = np.asarray(nodes, np.float32)
         self.hands.batched_positions = np.asarray(hands, np.float32)
+        if self._handles is not None:
+            self._handles.batched_positions = np.asarray(nodes, np.float32)
         self.label.position = (*nodes.mean(axis=0)[:2], float(nodes[:, 2].max()) + 0.02)
         if self.parts is None:
             return np.zeros(0)
@@ -74,6 +81,13 @@ class Body:
             colors[node] = GRABBED
         self.nodes.batched_colors = colors
 
+    def handles(self) -> Any:
+        """Unseen balls about the nodes, large enough to be hit with a mouse."""
+        if self._handles is None:
+            places = self.nodes.batched_positions
+            self._handles = _balls(self._scene, f"/{self.name}/handles", places, self._reach, NODE, opacity=0.0)
+        return self._handles
+
     def remove(self) -> None:
         """Take it out of the scene."""
         self.root.remove()
@@ -88,9 +102,18 @@ def spacing(nodes: np.ndarray) -> float:
     return max(float(np.median(cKDTree(nodes).query(nodes, k=2)[0][:, 1])), 1e-4)
 
 
-def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float, colors: Any) -> Any:
+def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float, colors: Any, opacity: float | None = None) -> Any:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=radius)
     turns = np.tile(np.array([1.0, 0, 0, 0], np.float32), (len(centers), 1))
     return scene.add_batched_meshes_simple(
-        name, ball.vertices, ball.faces, turns, np.asarray(centers, np.float32), batched_colors=colors, lod="off", cast_shadow=False
+        name,
+        ball.vertices,
+        ball.faces,
+        turns,
+        np.asarray(centers, np.float32),
+        batched_colors=colors,
+        opacity=opacity,
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
     )

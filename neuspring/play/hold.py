@@ -23,12 +23,12 @@ class Hold:
         """Let go, hands back to where they were."""
         with self._lock:
             self.owner: int | None = None
-            self.node, self._target = -1, np.zeros(3, np.float32)
+            self.node, self._target, self._shift = -1, np.zeros(3, np.float32), np.zeros(3, np.float32)
             self._hand, self._from, self._base = -1, np.zeros(3), self._start
             self.wanted = self._start.copy()
 
-    def take(self, client: int, kind: str, index: Any, place: Any) -> bool:
-        """A browser grabs a node or a hand at `place` [3], m; returns whether it may."""
+    def take(self, client: int, kind: str, index: Any, place: Any, at: Any = None) -> bool:
+        """A browser grabs a node, which is at `at` [3], m, or a hand, with the mouse at `place` [3], m; returns whether it may."""
         point = _point(place)
         with self._lock:
             most = self._nodes if kind == "node" else len(self._groups)
@@ -36,7 +36,8 @@ class Hold:
                 return False
             self.owner = client
             if kind == "node":
-                self.node, self._target = index, point
+                self.node, self._shift = index, np.zeros(3, np.float32) if at is None else np.asarray(at, np.float32) - point
+                self._target = point + self._shift
             else:
                 self._hand, self._from, self._base = int(self._groups[index]), point, self.wanted.copy()
             return True
@@ -47,7 +48,7 @@ class Hold:
         with self._lock:
             if self.owner != client or point is None:
                 return
-            self._target = point
+            self._target = point + self._shift
             if self._hand >= 0:
                 self.wanted = self._base.copy()
                 self.wanted[self._groups == self._hand] += point - self._from
@@ -64,6 +65,14 @@ class Hold:
             wanted, node, target = self.wanted, self.node, self._target
         reach = FASTEST * seconds
         return hands + _limited(wanted - hands, reach), node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
+
+
+def nearest_to_ray(points: np.ndarray, eye: Any, through: Any) -> int:
+    """The point [N, 3] nearest to the line from the eye [3] through a place [3], m."""
+    eye, way = np.asarray(eye, float), np.asarray(through, float) - np.asarray(eye, float)
+    way /= max(float(np.linalg.norm(way)), 1e-12)
+    offset = points - eye
+    return int(np.argmin(np.linalg.norm(offset - (offset @ way)[:, None] * way, axis=1)))
 
 
 def _limited(moves: np.ndarray, reach: float) -> np.ndarray:

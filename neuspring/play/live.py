@@ -14,7 +14,7 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.play.body import Body
 from neuspring.play.controls import MOST_FRAMES, Controls, digest_motion
-from neuspring.play.hold import Hold
+from neuspring.play.hold import Hold, nearest_to_ray
 from neuspring.play.player import Player
 from neuspring.play.results import Run
 from neuspring.play.simulator import Simulator, hands_of
@@ -90,7 +90,7 @@ class Live:
         lines = [
             f"<b>{self.rate:.1f} frames/s</b> of {wanted:.0f}; real-time factor <b>{self.factor:.2f}</b>",
             f"frame {simulator.frame}, {simulator.frame / wanted:.1f} s of the twin's time; {held}",
-            f"<span style='color:{color}'>largest strain {self.strain:.2f}; {self.over} springs above {self.most:.2f} are red</span>",
+            f"<span style='color:{color}'>largest strain {self.strain:.2f}; red above {self.most:.2f}: {self.over} springs</span>",
             escape(self.message),
         ]
         return f"<div style='margin:0 .8em;font-size:.8em'>{'<br>'.join(line for line in lines if line)}</div>"
@@ -101,7 +101,7 @@ class Live:
         def listener(kind: str) -> Any:
             async def dragged(event: Any) -> None:
                 if event.phase == "start":
-                    self.hold.take(event.client_id, kind, event.instance_index, event.start_position)
+                    self._take(event, kind)
                 if event.phase == "end":
                     self.hold.release(event.client_id)
                 else:
@@ -109,8 +109,16 @@ class Live:
 
             return dragged
 
+        self.body.handles().on_drag("left")(listener("node"))
         self.body.nodes.on_drag("left")(listener("node"))
         self.body.hands.on_drag("left")(listener("hand"))
+
+    def _take(self, event: Any, kind: str) -> None:
+        """Grab a hand, or the node nearest to where the mouse points."""
+        index, x = event.instance_index, self.simulator.positions
+        if kind == "node":
+            index = nearest_to_ray(x, event.client.camera.position, event.start_position)
+        self.hold.take(event.client_id, kind, index, event.start_position, x[index] if kind == "node" else None)
 
     def _run(self) -> None:
         frame_time = self.simulator.twin.simulation.frame_time

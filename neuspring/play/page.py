@@ -25,7 +25,6 @@ PARTS = {
     "nodes": "Nodes",
     "springs": "Springs",
     "hands": "Hands",
-    "splats": "Splats",
     "points": "Observed points",
     "tracks": "Annotated tracks",
     "cameras": "Cameras",
@@ -70,7 +69,7 @@ class Page:
         sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
         camera.up = (0.0, 0.0, sign)
         camera.look_at = tuple(middle)
-        camera.position = tuple(middle + 0.8 * reach * np.array([1.0, -0.45, 0.45 * sign]))
+        camera.position = tuple(middle + 0.65 * reach * np.array([1.0, -0.45, 0.45 * sign]))
 
     def _time(self) -> None:
         gui, clock = self.server.gui, self.player.clock
@@ -122,7 +121,6 @@ class Page:
             absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
         if not self.found.observations.tracks.size:
             absent["tracks"] = "no tracks were annotated"
-        absent["splats"] = "no appearance in the scenario's folder"
         return absent
 
     def _keys(self) -> None:

@@ -33,7 +33,6 @@ class Look:
     nodes: bool = True
     springs: bool = True
     hands: bool = True
-    splats: bool = False
     points: bool = True
     tracks: bool = True
     cameras: bool = True
