@@ -31,7 +31,7 @@ def pulled(twin: Twin, frames: int = FRAMES) -> tuple[Controls, np.ndarray]:
     start = simulator.positions[NODE]
     for frame in range(frames):
         node = NODE if frame < frames // 2 else -1
-        target = (start + [STEP * (frame + 1), 0, 0]).astype(np.float32)
+        target = start + np.array([STEP * (frame + 1), 0, 0], np.float32)
         rows.append((twin.topology.controllers, node, target))
         seen.append(simulator.step(*rows[-1]).copy())
     hands, grabbed, target = (np.stack([np.asarray(row[column]) for row in rows]) for column in range(3))

@@ -73,7 +73,7 @@ def test_a_port_in_use_is_an_error_with_the_next_move(tmp_path, capsys):
 
 @pytest.mark.parametrize(("host", "port"), [("no.such.host.invalid", 0), ("127.0.0.1", 70000)])
 def test_a_place_that_is_none_is_refused(host, port):
-    with pytest.raises(InputError, match="--host|--port"):
+    with pytest.raises(InputError, match=r"--host|--port"):
         start(host, port)
 
 
