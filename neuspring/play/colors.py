@@ -116,7 +116,7 @@ def _regions(twin: Twin) -> np.ndarray:
     """A region's color within it; dark between regions; gray for springs of hands."""
     springs, count = twin.topology.springs, len(twin.topology.nodes)
     of_nodes = node_colors(twin)
-    inner: np.ndarray = (springs < count).all(axis=1)
+    inner = np.asarray((springs < count).all(axis=1))
     labels = twin.topology.labels
     colors = np.tile(PLAIN, (len(springs), 1))
     same = inner.copy()
