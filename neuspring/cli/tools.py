@@ -8,6 +8,7 @@ TOOLS = {
     "mask": ("neuspring.cli.masks", "marks on a few frames -> masks of object and hands in every frame of a capture"),
     "compare-masks": ("neuspring.cli.masks", "two folders of masks -> their overlap per frame"),
     "annotate": ("neuspring.cli.annotate", "mark masks and tracks of a capture in the browser"),
+    "play": ("neuspring.cli.play", "runs of a results folder in the browser; twins that can be pulled by hand"),
     "verify-released": ("neuspring.cli.data", "PhysTwin's released results, checked against ours"),
     "tables": ("neuspring.cli.results", "run records -> tables"),
     "perception-table": ("neuspring.cli.results", "errors of perception, per category"),

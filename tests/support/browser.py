@@ -42,8 +42,8 @@ def chromium() -> str | None:
 class Browser:
     """`with Browser() as browser:`; pages are opened without network, or with `served=True` from this machine alone."""
 
-    def __init__(self, *, served: bool = False) -> None:
-        self._served = served
+    def __init__(self, *, served: bool = False, webgl: bool = False) -> None:
+        self._served, self._webgl = served, webgl
 
     def __enter__(self) -> Self:
         program = chromium()
@@ -51,7 +51,9 @@ class Browser:
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         to_browser, ours = os.pipe()
         theirs, from_browser = os.pipe()
-        options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars"]
+        # Without a GPU a scene is drawn by software.
+        graphics = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"] if self._webgl else ["--disable-gpu"]
+        options = ["--headless", "--no-sandbox", *graphics, "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars"]
         options += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
         # The browser reads from descriptor 3 and writes to 4.
         command = f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}'

@@ -1,0 +1,146 @@
+"""What springs show by their color: stiffness, region, strain or force, each with its range and a legend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from matplotlib import colormaps
+
+from neuspring.core.artifacts import Twin
+from neuspring.report.figures.twin import COLORS, region_colours, stiffness_limits
+
+QUANTITIES = ("stiffness", "strain", "force", "region")
+DIVERGING = "coolwarm"
+STEPS = 12
+"""Colors of a legend's bar."""
+PLAIN = np.array([150, 150, 150], np.uint8)
+CROSSING = np.array([70, 70, 70], np.uint8)
+OVER = np.array([255, 0, 0], np.uint8)
+"""Springs beyond the strain that is given as the most."""
+LEAST_STRAIN, LEAST_FORCE = 0.02, 0.1
+"""Half of the narrowest range, 1 and N: noise must not fill the colors."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A range of values and its colors; `log` for a logarithmic one."""
+
+    title: str
+    low: float
+    high: float
+    unit: str
+    colors: str
+    log: bool = False
+
+    def paint(self, values: np.ndarray) -> np.ndarray:
+        """RGB [S, 3] uint8 of values [S]; beyond the ends, the color of the end."""
+        low, high = self.low, self.high
+        if self.log:
+            values, low, high = np.log(np.maximum(values, 1e-30)), np.log(low), np.log(high)
+        part = np.clip((values - low) / (high - low), 0, 1)
+        return np.asarray(255 * colormaps[self.colors](part)[:, :3] + 0.5, np.uint8)
+
+    def legend(self) -> str:
+        """The legend as HTML: a bar from low to high with values and unit."""
+        stops = ", ".join(_hex(color) for color in colormaps[self.colors](np.linspace(0, 1, STEPS)))
+        middle = np.sqrt(self.low * self.high) if self.log else 0.5 * (self.low + self.high)
+        ticks = "".join(f"<span>{_number(value)}</span>" for value in (self.low, middle, self.high))
+        kind = ", logarithmic" if self.log else ""
+        return (
+            f"<div style='margin:0 .6em;font-size:.8em'><b>{escape(self.title)}</b> [{escape(self.unit)}]{kind}"
+            f"<div style='height:.9em;margin:.2em 0;border-radius:2px;background:linear-gradient(to right, {stops})'></div>"
+            f"<div style='display:flex;justify-content:space-between'>{ticks}</div></div>"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """The springs that are drawn, all of a twin's or a part of them."""
+
+    pairs: np.ndarray
+    """[S, 2]: nodes, then controllers."""
+    rest_lengths: np.ndarray
+    stiffness: np.ndarray
+    regions: np.ndarray
+    """RGB [S, 3] uint8."""
+
+    @classmethod
+    def of(cls, twin: Twin, chosen: np.ndarray | None = None) -> Springs:
+        """The chosen springs of a twin, or all."""
+        topology = twin.topology
+        part = np.arange(len(topology.springs)) if chosen is None else chosen
+        return cls(topology.springs[part], topology.rest_lengths[part], twin.material.stiffness[part], _regions(twin)[part])
+
+    def ends(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
+        """[S, 2, 3] float32, m."""
+        return np.asarray(np.concatenate([nodes, hands]).astype(np.float32)[self.pairs])
+
+    def strain(self, ends: np.ndarray) -> np.ndarray:
+        """l / l0 - 1 [S] of ends [S, 2, 3], m."""
+        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / self.rest_lengths - 1)
+
+    def paint(self, quantity: str, scale: Scale | None, strain: np.ndarray) -> np.ndarray:
+        """RGB [S, 3] uint8 at a strain [S]."""
+        if scale is None:
+            return self.regions.copy()
+        if quantity == "stiffness":
+            return scale.paint(self.stiffness)
+        return scale.paint(strain if quantity == "strain" else self.stiffness * strain)
+
+
+def scale_of(quantity: str, bodies: Sequence[Springs], strains: Sequence[np.ndarray]) -> Scale | None:
+    """The range that all bodies share; `strains` [..., S] of each are samples over time. None for regions, or without springs."""
+    if quantity == "region" or not bodies:
+        return None
+    if quantity == "stiffness":
+        low, high = stiffness_limits(np.concatenate([body.stiffness for body in bodies]))
+        return Scale("stiffness Y", low, high, "N", COLORS, log=True)
+    values = [one if quantity == "strain" else body.stiffness * one for body, one in zip(bodies, strains, strict=True)]
+    least = LEAST_STRAIN if quantity == "strain" else LEAST_FORCE
+    far = max(float(np.quantile(np.abs(np.concatenate([one.ravel() for one in values])), 0.99)), least)
+    if quantity == "strain":
+        return Scale("strain l / l0 − 1 (red: stretched)", -far, far, "1", DIVERGING)
+    return Scale("force Y (l / l0 − 1) (red: pulls)", -far, far, "N", DIVERGING)
+
+
+def node_colors(twin: Twin) -> np.ndarray:
+    """RGB [N, 3] uint8: a node's region."""
+    names, region = np.unique(twin.topology.labels, return_inverse=True)
+    return np.asarray(255 * region_colours(len(names))[region][:, :3] + 0.5, np.uint8)
+
+
+def _regions(twin: Twin) -> np.ndarray:
+    """A region's color within it; dark between regions; gray for springs of hands."""
+    springs, count = twin.topology.springs, len(twin.topology.nodes)
+    of_nodes = node_colors(twin)
+    inner = np.asarray((springs < count).all(axis=1))
+    labels = twin.topology.labels
+    colors = np.tile(PLAIN, (len(springs), 1))
+    same = inner.copy()
+    same[inner] = labels[springs[inner, 0]] == labels[springs[inner, 1]]
+    colors[same] = of_nodes[springs[same, 0]]
+    colors[inner & ~same] = CROSSING
+    return colors
+
+
+def region_legend(twin: Twin) -> str:
+    """The legend of regions as HTML."""
+    names, counts = np.unique(twin.topology.labels, return_counts=True)
+    rows = [
+        f"<span style='color:{_hex(color)}'>&#9632;</span> region {name} ({count} nodes)"
+        for name, count, color in zip(names, counts, region_colours(len(names)), strict=True)
+    ]
+    rows.append("<span style='color:#464646'>&#9632;</span> springs between regions")
+    rows.append("<span style='color:#969696'>&#9632;</span> springs of hands")
+    return f"<div style='margin:0 .6em;font-size:.8em'><b>region</b><br>{'<br>'.join(rows)}</div>"
+
+
+def _hex(color: np.ndarray) -> str:
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in color[:3])
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"

@@ -1,0 +1,194 @@
+"""The page beside the scene: time, runs, what is shown, the legend."""
+
+from __future__ import annotations
+
+import threading
+import time
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.play.clock import SPEEDS
+from neuspring.play.colors import QUANTITIES
+from neuspring.play.live import LivePanel
+from neuspring.play.player import MOST_SHOWN, Player
+from neuspring.play.results import Scene
+
+if TYPE_CHECKING:
+    import viser
+
+RATE = 30.0
+"""Most drawings per second."""
+PARTS = {
+    "nodes": "Nodes",
+    "springs": "Springs",
+    "hands": "Hands",
+    "points": "Observed points",
+    "tracks": "Annotated tracks",
+    "cameras": "Cameras",
+    "images": "Camera images",
+}
+KEYS = "Keys: space plays, arrows left and right step, home and end jump."
+
+
+class Page:
+    """The controls of a recording, shared by all browsers that have it open."""
+
+    def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
+        self.server, self.found = server, found
+        scenario = found.observations.scenario
+        server.scene.set_up_direction(scenario.up)
+        self.player = Player(server.scene, found)
+        self._stop, self._moved = threading.Event(), False
+        self._look_at()
+        server.gui.add_markdown(
+            f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
+        )
+        self._time()
+        self._runs()
+        self._shown()
+        self.panel = LivePanel(server, self.player, save_to)
+        self._keys()
+        self._thread = threading.Thread(target=self._tick, name="clock", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the clock."""
+        self._stop.set()
+        self._thread.join(5)
+        self.panel.stop()
+
+    def _look_at(self) -> None:
+        """The first view: the whole scene, from the side of its first camera or from the front."""
+        player, camera = self.player, self.server.initial_camera
+        middle = 0.5 * (player.low + player.high)
+        last = np.array(player.offset(max(len(player.look.shown) - 1, 0)))
+        middle, reach = middle + 0.5 * last, player.size + float(np.linalg.norm(last))
+        sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
+        camera.up = (0.0, 0.0, sign)
+        camera.look_at = tuple(middle)
+        camera.position = tuple(middle + 0.65 * reach * np.array([1.0, -0.45, 0.45 * sign]))
+
+    def _time(self) -> None:
+        gui, clock = self.server.gui, self.player.clock
+        with gui.add_folder("Time"):
+            self.bar = gui.add_html(clock.bar())
+            last = clock.count - 1
+            self.slider = gui.add_slider(
+                "Frame", 0, last, 1, 0, marks=((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
+            )
+            self.play = gui.add_button("Play")
+            self.speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 ×")
+            self.loop = gui.add_checkbox("Loop", clock.loop)
+        self.slider.on_update(lambda event: self._scrubbed(event))
+        self.play.on_click(lambda _: self.toggle())
+        self.speed.on_update(lambda _: setattr(clock, "speed", SPEEDS[self.speed.value]))
+        self.loop.on_update(lambda _: setattr(clock, "loop", bool(self.loop.value)))
+
+    def _runs(self) -> None:
+        gui, look = self.server.gui, self.player.look
+        self.boxes: dict[str, Any] = {}
+        with gui.add_folder("Runs", expand_by_default=len(self.found.runs) <= 12):
+            for run in self.found.runs:
+                self.boxes[run.name] = gui.add_checkbox(run.name, run.name in look.shown, hint="; ".join(run.notes) or None)
+            self.gap = gui.add_slider("Side by side", 0.0, 3.0, 0.1, look.gap, hint="0: all in one place")
+            self.notes = gui.add_html("")
+        for box in self.boxes.values():
+            box.on_update(lambda _: self._changed())
+        self.gap.on_update(lambda _: self._changed())
+
+    def _shown(self) -> None:
+        gui, look = self.server.gui, self.player.look
+        absent = self._absent()
+        self.parts: dict[str, Any] = {}
+        with gui.add_folder("Show"):
+            for name, title in PARTS.items():
+                hint = absent.get(name)
+                self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
+            self.quantity = gui.add_dropdown("Springs by", QUANTITIES, initial_value=look.quantity)
+            self.legend = gui.add_html("")
+        for box in self.parts.values():
+            box.on_update(lambda _: self._changed())
+        self.quantity.on_update(lambda _: self._changed())
+        self._changed()
+
+    def _absent(self) -> dict[str, str]:
+        """Part -> why it cannot be shown."""
+        absent = {}
+        if self.found.capture is None:
+            absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
+        if not self.found.observations.tracks.size:
+            absent["tracks"] = "no tracks were annotated"
+        return absent
+
+    def _keys(self) -> None:
+        gui, clock = self.server.gui, self.player.clock
+        gui.add_html(f"<div style='margin:0 .8em;font-size:.8em'>{KEYS}</div>")
+        for label, key, action in (
+            ("Play or pause", "space", self.toggle),
+            ("Next frame", "arrowright", lambda: self.show(clock.frame + 1)),
+            ("Previous frame", "arrowleft", lambda: self.show(clock.frame - 1)),
+            ("First frame", "home", lambda: self.show(0)),
+            ("Last frame", "end", lambda: self.show(clock.count - 1)),
+        ):
+            gui.add_command(label, hotkey=key).on_trigger(lambda _, action=action: action())  # type: ignore[misc,arg-type]
+
+    def toggle(self) -> None:
+        """Play, or pause."""
+        clock = self.player.clock
+        with self.player.lock:
+            if not clock.playing and clock.frame == clock.count - 1:
+                clock.show(0)
+            clock.playing = not clock.playing
+        self.play.label = "Pause" if clock.playing else "Play"
+
+    def show(self, frame: int) -> None:
+        """Go to a frame, and stay there."""
+        with self.player.lock:
+            self.player.clock.playing = False
+            self.player.clock.show(frame)
+            self._moved = True
+
+    def _scrubbed(self, event: Any) -> None:
+        # Only what a person does: the clock moves the slider too.
+        if event.client_id is not None:
+            self.show(int(self.slider.value))
+
+    def _changed(self) -> None:
+        """Take over what was switched."""
+        look = self.player.look
+        with self.player.lock:
+            for name, box in self.parts.items():
+                setattr(look, name, bool(box.value))
+            look.quantity = self.quantity.value
+            look.gap = float(self.gap.value)
+            look.shown = [name for name, box in self.boxes.items() if box.value]
+            self.player.apply()
+            self.legend.content = self.player.legend()
+            notes = [f"{name}: {note}" for name, note in self.player.notes.items() if note and name in look.shown]
+            if len(look.shown) > MOST_SHOWN:
+                notes.append(f"{MOST_SHOWN} runs are shown at once; take some away to see others")
+            rows = "<br>".join(escape(note[:400]) for note in [*self.found.notes, *notes])
+            self.notes.content = f"<div style='margin:0 .8em;font-size:.8em'>{rows}</div>"
+
+    def _tick(self) -> None:
+        """Let time pass, and draw what has changed."""
+        last = told = time.monotonic()
+        while not self._stop.wait(1 / RATE):
+            now = time.monotonic()
+            with self.player.lock:
+                changed = self.player.clock.advance(now - last) or self._moved
+                self._moved, last = False, now
+                if changed:
+                    with self.server.atomic():
+                        self.player.draw()
+                        self.slider.value = self.player.clock.frame
+                        self.bar.content = self.player.clock.bar()
+                playing = self.player.clock.playing
+            if now - told > 0.25:
+                told = now
+                self.panel.refresh()
+            if self.play.label != (wanted := "Pause" if playing else "Play"):
+                self.play.label = wanted

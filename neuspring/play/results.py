@@ -1,0 +1,187 @@
+"""What a results folder has to show: its scenario, its runs, and what is missing of each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.data.capture import CAPTURE, Capture
+from neuspring.play.guard import inside, require_modest, require_small
+
+OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
+SEED = re.compile(r"\d{1,9}")
+FIRST = ("neuspring_plus", "neuspring", "baseline")
+"""Methods that are shown first."""
+MOST_RUNS = 200
+"""Runs that are looked at in a scenario's folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run: a method with a seed. Its arrays are read when they are asked for."""
+
+    folder: Path
+    scenario_folder: Path
+    method: str
+    seed: str
+    notes: tuple[str, ...] = ()
+    """What a viewer must know."""
+    twin_path: Path | None = None
+    trajectory_path: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """method/seed."""
+        return f"{self.method}/{self.seed}"
+
+    @cached_property
+    def twin(self) -> Twin | None:
+        """The twin, where the method has one. Raises InputError."""
+        return None if self.twin_path is None else load_twin(self.twin_path)
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """The prediction, where there is one. Raises InputError."""
+        if self.trajectory_path is None:
+            return None
+        require_modest(self.trajectory_path)
+        return Trajectory.load(self.trajectory_path)
+
+    @cached_property
+    def twin_digest(self) -> str:
+        """SHA-256 of the twin's file."""
+        return "" if self.twin_path is None else digest_file(self.twin_path)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scenario's folder: what was observed, and runs."""
+
+    folder: Path
+    observations: Observations
+    runs: tuple[Run, ...]
+    shown: tuple[str, ...]
+    """Names of the runs to begin with."""
+    capture: Capture | None = None
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+
+def load_twin(path: Path) -> Twin:
+    """A twin of modest size. Raises InputError."""
+    require_modest(path)
+    return Twin.load(path)
+
+
+def find(paths: Sequence[Path]) -> Scene:
+    """What the folders have to show: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
+    named: list[Path] = []
+    scenarios: list[Path] = []
+    for path in (Path(path) for path in paths):
+        if not path.is_dir():
+            raise InputError(path, "must be a results folder", "no such folder", "Give results/<scenario>, or a run in it.")
+        if (path / OBSERVATIONS).is_file():
+            scenarios.append(path.resolve())
+        elif (path.resolve().parents[1] / OBSERVATIONS).is_file() and _is_run(path.resolve()):
+            named.append(path.resolve())
+            scenarios.append(path.resolve().parents[1])
+        else:
+            rule = f"must be a scenario's folder, which has {OBSERVATIONS}, or a run <scenario>/<method>/<seed>"
+            raise InputError(path, rule, _content(path), "Give results/<scenario>, or a run in it.")
+    if len(set(scenarios)) != 1:
+        raise InputError(", ".join(map(str, paths)), "all runs must be of one scenario", len(set(scenarios)))
+    folder = scenarios[0]
+    require_modest(folder / OBSERVATIONS)
+    observations = Observations.load(folder / OBSERVATIONS)
+    whole = len(named) < len(paths)
+    places = sorted(set(named) | set(_runs_below(folder) if whole else ()), key=_rank)
+    runs = tuple(_run(place, folder) for place in places[:MOST_RUNS])
+    notes = [] if len(places) <= MOST_RUNS else [f"{len(places) - MOST_RUNS} runs are left out"]
+    if not runs:
+        raise InputError(folder, "must have at least one run <method>/<seed>", _content(folder), "Run the benchmark first.")
+    shown = tuple(run.name for run in runs if run.folder in named) or _first(runs)
+    return Scene(folder, observations, runs, shown, _capture(folder, notes), tuple(notes))
+
+
+def _is_run(path: Path) -> bool:
+    return bool(SEED.fullmatch(path.name)) and any((path / name).is_file() for name in (RUN_RECORD, ROLLOUT))
+
+
+def _runs_below(folder: Path) -> list[Path]:
+    return [place for place in folder.glob("*/*") if place.is_dir() and not place.is_symlink() and _is_run(place)]
+
+
+def _rank(path: Path) -> tuple[int, str, int]:
+    method = path.parent.name
+    return (FIRST.index(method) if method in FIRST else len(FIRST), method, int(path.name))
+
+
+def _first(runs: Sequence[Run]) -> tuple[str, ...]:
+    """The first run, and the first one of another method."""
+    usable = [run for run in runs if run.trajectory_path] or list(runs)
+    other = next((run for run in usable if run.method != usable[0].method and run.twin_path), None)
+    return tuple(run.name for run in (usable[0], other) if run is not None)
+
+
+def _run(folder: Path, scenario_folder: Path) -> Run:
+    """A run with what can be used of it; a record that cannot be read is a note."""
+    notes: list[str] = []
+    twin = trajectory = None
+    rollout = folder / ROLLOUT
+    try:
+        require_small(rollout)
+        record = StageRecord.load(rollout)
+        if record.status == "failed":
+            notes.append(f"failed: {record.reason}")
+        if "trajectory" in record.files:
+            # The digest is checked by `file`; a name that leads elsewhere is refused before it is read.
+            inside(scenario_folder, folder / str(record.files["trajectory"][0]))
+            trajectory = record.file("trajectory", rollout)
+    except (InputError, TypeError, ValueError, IndexError) as error:
+        notes.append(f"no prediction: {error}")
+    try:
+        twin = _twin_of(folder, scenario_folder)
+    except InputError as error:
+        notes.append(f"no twin: {error}")
+    if trajectory is None and not notes:
+        notes.append("no prediction in its record")
+    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, trajectory)
+
+
+def _twin_of(folder: Path, scenario_folder: Path) -> Path | None:
+    """The twin that run.json names, or the one beside it."""
+    path = folder / RUN_RECORD
+    if path.is_file():
+        require_small(path)
+        named = RunRecord.load(path).artifacts.get("twin") or []
+        # The mean of several seeds has several twins, and none of them moves as it does.
+        if len(named) == 1:
+            return inside(scenario_folder, folder / named[0])
+        if named:
+            return None
+    beside = folder / "twin.npz"
+    return inside(scenario_folder, beside) if beside.is_file() else None
+
+
+def _capture(folder: Path, notes: list[str]) -> Capture | None:
+    """The capture in the scenario's folder, if it can be used."""
+    path = folder / "capture" / CAPTURE
+    if not path.is_file():
+        return None
+    try:
+        require_small(path)
+        return Capture.load(path.parent)
+    except InputError as error:
+        notes.append(f"no cameras: {error}")
+        return None
+
+
+def _content(folder: Path) -> str:
+    names = sorted(path.name for path in folder.iterdir())[:8]
+    return ", ".join(names) or "an empty folder"

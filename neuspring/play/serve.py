@@ -1,0 +1,107 @@
+"""A viser server that listens where it is told, at the port it is told, and answers this machine's own pages alone."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import socket
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from neuspring.core.errors import InputError
+from neuspring.perception.annotate.guard import Refused, check_host, check_origin
+
+if TYPE_CHECKING:
+    import viser
+
+LABEL = "NeuSpring"
+INSTALL = "Install it: pip install 'neuspring[play]'."
+
+
+def start(host: str, port: int) -> viser.ViserServer:
+    """A running server at host and port (0: any that is free). Raises InputError where it cannot listen there, or without viser."""
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("neuspring play", "the package viser is required", str(error), INSTALL) from error
+    _require_free(host, port)
+    # viser takes another port from this variable, whatever it is told.
+    os.environ.pop("_VISER_PORT_OVERRIDE", None)
+    with _guarded(host) as used, contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=host, port=port, label=LABEL, verbose=False)
+    if not used:
+        server.stop()
+        raise InputError("viser", "this version cannot be told whom to answer", viser.__version__, "Install viser >=1.1,<2.")
+    if port and server.get_port() != port:
+        server.stop()
+        raise _taken(host, port, "another program has just taken it")
+    # A page could ask viser to publish this server through a tunnel.
+    server.request_share_url = _no_tunnel  # type: ignore[method-assign]
+    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    return server
+
+
+def address(server: viser.ViserServer) -> str:
+    """What to open."""
+    host = server.get_host()
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
+
+
+def _no_tunnel(verbose: bool = True) -> None:
+    return None
+
+
+def _require_free(host: str, port: int) -> None:
+    """Raise InputError where nobody could listen: viser would take the next port, or wait forever."""
+    if not 0 <= port < 65536:
+        raise InputError("--port", "must lie between 0 and 65535", port)
+    try:
+        family, kind, proto, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            "--host", "must be an address of this machine", f"{host}: {error}", "Leave it out for 127.0.0.1."
+        ) from error
+    with socket.socket(family, kind, proto) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(place)
+            probe.listen()
+        except OSError as error:
+            raise _taken(host, port, error.strerror) from error
+
+
+def _taken(host: str, port: int, reason: object) -> InputError:
+    remedy = "Stop the other program, or choose another: --port 0 takes any that is free."
+    return InputError(f"--port {port}", f"it must be possible to listen at {host}:{port}", reason, remedy)
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[list[bool]]:
+    """Servers that are started inside check each request's Host and Origin; the list is empty if none was started.
+
+    viser has no place for such a check. Without it any page of the web that this browser shows could reach the server, by its
+    address or by a name of its own that points here (DNS rebinding).
+    """
+    from websockets.asyncio import server as module
+
+    original, used = module.serve, []
+
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        used.append(True)
+
+        def checked(connection: Any, request: Any) -> Any:
+            try:
+                check_host(request.headers.get("Host"), host)
+                check_origin(request.headers)
+            except Refused as refused:
+                return connection.respond(refused.status, "Open the address that neuspring play printed.\n")
+            return process_request(connection, request)
+
+        return original(*arguments, process_request=checked, **options)
+
+    module.serve = serve  # type: ignore[assignment,misc]
+    try:
+        yield used
+    finally:
+        module.serve = original  # type: ignore[misc]

@@ -1,0 +1,88 @@
+"""What a results folder has to show, and what of a damaged or hostile one is refused."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from neuspring.core.errors import InputError
+from neuspring.play.results import find
+from tests.support.played import results, spoil
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return results(tmp_path)
+
+
+def test_a_scenarios_folder_shows_one_run_of_each_of_two_methods(scenario):
+    found = find([scenario])
+    assert [run.name for run in found.runs] == ["neuspring/0", "baseline/0"]
+    assert found.shown == ("neuspring/0", "baseline/0")
+    assert all(run.twin is not None and run.trajectory is not None and not run.notes for run in found.runs)
+
+
+def test_named_runs_are_the_ones_that_are_there(scenario):
+    assert find([scenario / "baseline" / "0"]).shown == ("baseline/0",)
+    assert find([scenario / "baseline" / "0", scenario / "neuspring" / "0"]).shown == ("neuspring/0", "baseline/0")
+
+
+def test_runs_of_two_scenarios_are_refused(scenario, tmp_path):
+    other = results(tmp_path / "more")
+    with pytest.raises(InputError, match="all runs must be of one scenario"):
+        find([scenario, other])
+
+
+@pytest.mark.parametrize("name", ["nothing_there", "."])
+def test_another_folder_is_refused_with_the_next_move(tmp_path, name):
+    with pytest.raises(InputError, match="Give results/<scenario>"):
+        find([tmp_path / name])
+
+
+def test_an_incomplete_run_says_what_it_lacks(scenario):
+    (scenario / "baseline" / "0" / "trajectory.npz").unlink()
+    run = find([scenario / "baseline" / "0"]).runs[0]
+    assert run.trajectory is None and "no such file" in run.notes[0] and run.twin is not None
+
+
+def test_a_record_of_an_older_format_is_a_note(scenario):
+    spoil(scenario / "baseline" / "0" / "rollout.json", '"format": 1', '"format": 0')
+    assert "reads records of format 1" in find([scenario]).runs[1].notes[0]
+
+
+def test_a_record_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
+    secret = tmp_path / "secret.npz"
+    secret.write_bytes(b"secret")
+    spoil(scenario / "baseline" / "0" / "rollout.json", '"trajectory.npz"', json.dumps("../../../secret.npz"))
+    assert "must lie inside" in find([scenario]).runs[1].notes[0]
+
+
+def test_a_link_out_of_the_folder_is_not_followed(scenario, tmp_path):
+    outside = tmp_path / "outside.npz"
+    twin = scenario / "baseline" / "0" / "twin.npz"
+    twin.rename(outside)
+    twin.symlink_to(outside)
+    run = find([scenario]).runs[1]
+    assert run.twin_path is None and "must lie inside" in run.notes[0]
+
+
+def test_a_header_that_promises_more_than_the_file_is_refused_before_memory_is_taken(scenario):
+    path = scenario / "neuspring" / "0" / "twin.npz"
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, header.getvalue() if name == "material.stiffness.npy" else content)
+    with pytest.raises(InputError, match=r"header of material\.stiffness must agree"):
+        _ = find([scenario]).runs[0].twin
+
+
+def test_a_pickle_is_refused(scenario):
+    path = scenario / "neuspring" / "0" / "twin.npz"
+    np.savez(path, meta=np.array([{"kind": "twin"}], dtype=object))
+    with pytest.raises(InputError, match="must be readable"):
+        _ = find([scenario]).runs[0].twin

@@ -1,0 +1,127 @@
+"""Whom the server answers: this machine's own pages, at the port that was asked for."""
+
+import http.client
+import json
+import socket
+
+import pytest
+
+pytest.importorskip("viser", reason="the extra [play] is not installed")
+
+from neuspring.cli.main import main
+from neuspring.core.errors import InputError
+from neuspring.play.page import Page
+from neuspring.play.results import find
+from neuspring.play.serve import start
+from tests.support.played import results, softer
+
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec-WebSocket-Protocol": "viser-v0",
+}
+
+
+@pytest.fixture(scope="module")
+def server():
+    one = start("127.0.0.1", 0)
+    yield one
+    one.stop()
+
+
+def status(server, path="/", **headers: str) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=20)
+    try:
+        connection.putrequest("GET", path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_the_page_is_served(server):
+    assert status(server) == 200
+
+
+@pytest.mark.parametrize(
+    "path", ["/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc/passwd", "/observations.npz"]
+)
+def test_no_path_leads_to_a_file_of_this_machine(server, path):
+    assert status(server, path) == 404
+
+
+@pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Sec-Fetch-Site": "cross-site"}])
+@pytest.mark.parametrize("upgrade", [{}, UPGRADE], ids=["page", "socket"])
+def test_pages_of_other_sites_are_refused(server, headers, upgrade):
+    assert status(server, **(upgrade | headers)) == 403
+
+
+def test_a_page_cannot_publish_the_server(server):
+    assert server.request_share_url() is None
+
+
+def test_a_port_in_use_is_an_error_with_the_next_move(tmp_path, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["play", str(results(tmp_path)), "--port", str(port)]) == 2
+    assert "--port 0 takes any that is free" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("host", "port"), [("no.such.host.invalid", 0), ("127.0.0.1", 70000)])
+def test_a_place_that_is_none_is_refused(host, port):
+    with pytest.raises(InputError, match=r"--host|--port"):
+        start(host, port)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("play")
+    one = start("127.0.0.1", 0)
+    shown = Page(one, find([results(folder)]), folder / "saved")
+    yield shown
+    shown.close()
+    one.stop()
+
+
+def test_switches_change_the_scene(page):
+    body = page.player._bodies["baseline/0"]
+    page.parts["nodes"].value = False
+    page._changed()
+    assert not body.nodes.visible
+    before = body.springs.colors.copy()
+    page.quantity.value = "strain"
+    page._changed()
+    assert (body.springs.colors != before).any() and "strain" in page.legend.content
+    page.boxes["baseline/0"].value = False
+    page._changed()
+    assert "baseline/0" not in page.player._bodies
+    page.boxes["baseline/0"].value = page.parts["nodes"].value = True
+    page._changed()
+
+
+def test_a_saved_recording_is_compared_and_names_its_twin(page, capsys):
+    import time
+
+    page.panel.start("baseline/0")
+    live = page.panel.live
+    live.hold.take(1, "node", 3, live.simulator.positions[3])
+    live.hold.pull(1, live.simulator.positions[3] + [0.1, 0, 0])
+    end = time.monotonic() + 60
+    while live.simulator.frame < 6 and time.monotonic() < end:
+        time.sleep(0.05)
+    live.hold.release(1)
+    page.panel._save()
+    page.panel.stop()
+    saved = next((page.panel._save_to).glob("controls_small_baseline_0_0.npz"))
+    folder = str(page.found.folder)
+    assert main(["play", folder, "--replay", str(saved), "--compare"]) == 0
+    said = capsys.readouterr().out
+    assert "recorded with baseline/0" in said and "neuspring/0" in said
+    softer(page.player.run("baseline/0").twin, 0.9).save(page.found.folder / "baseline" / "0" / "twin.npz")
+    assert main(["play", folder, "--replay", str(saved), "--compare"]) == 2
+    assert "must be among the runs" in capsys.readouterr().err
+    assert json.dumps(folder) not in said

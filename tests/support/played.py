@@ -1,0 +1,42 @@
+"""A small scenario's results folder with runs that have real twins, as the workflow leaves it: for tests of the playground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.files import write_text
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.twin.rollout import roll_out
+from tests.support import small
+
+
+def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) -> Path:
+    """results/<scenario> of a toy rope whose twins differ in stiffness; returns the scenario's folder."""
+    problem = small.scene()
+    seen, scenario = problem.observations, folder / "small"
+    seen.save(scenario / "observations.npz")
+    for index, method in enumerate(methods):
+        place = scenario / method / "0"
+        twin = softer(problem.truth, 0.7**index)
+        twin.save(place / "twin.npz")
+        trajectory = roll_out(twin, seen.controller_points)
+        trajectory.save(place / "trajectory.npz")
+        files = {"trajectory": ["trajectory.npz", digest_file(place / "trajectory.npz")]}
+        StageRecord(stage="rollout", status="ok", files=files).save(place / "rollout.json")
+    return scenario
+
+
+def softer(twin: Twin, factor: float) -> Twin:
+    """The twin with its stiffness times a factor."""
+    return replace(twin, material=replace(twin.material, stiffness=twin.material.stiffness * np.float32(factor)))
+
+
+def spoil(path: Path, old: str, new: str) -> None:
+    """Replace text in a file that has it."""
+    text = path.read_text()
+    assert old in text
+    write_text(path, text.replace(old, new))
