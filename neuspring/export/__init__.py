@@ -1,0 +1,7 @@
+"""A twin in the formats of other tools. README.md here is the page for users.
+
+| what | modules |
+|---|---|
+| what is exported: a run's folder or a twin | `source` |
+| arrays and a JSON description | `plain` |
+"""
