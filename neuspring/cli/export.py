@@ -10,6 +10,11 @@ from neuspring.core.errors import InputError
 
 FORMATS = {
     "npz": ("neuspring.export.plain", "", "{name}"),
+    "ply": ("neuspring.export.ply", "0", "{name}"),
+    "spz": ("neuspring.export.spz", "0", "{name}"),
+    "newton": ("neuspring.export.newton", "", "{name}"),
+    "mujoco": ("neuspring.export.mujoco", "", "{name}"),
+    "usd": ("neuspring.export.usd", "", "{name}.usdc"),
 }
 """Format -> module, frames by default (all where empty), what is written by default."""
 
