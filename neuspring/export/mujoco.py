@@ -60,7 +60,8 @@ def mjcf(source: Source) -> str:
     names = [f"node{index}" for index in range(len(topology.nodes))] + [f"hand{c}" for c in range(len(topology.controllers))]
     columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot)
     for index, (ends, stiffness, length, dashpot) in enumerate(zip(*columns, strict=True)):
-        law: dict[str, Any] = {"stiffness": _text(float(stiffness) / float(length)), "damping": _text(dashpot), "springlength": _text(length)}
+        force = _text(float(stiffness) / float(length))
+        law: dict[str, Any] = {"stiffness": force, "damping": _text(dashpot), "springlength": _text(length)}
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=_text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
