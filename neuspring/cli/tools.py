@@ -2,6 +2,7 @@
 
 TOOLS = {
     "draw": ("neuspring.stages.draw", "splats and trajectory -> RGBA pictures of any camera"),
+    "export": ("neuspring.cli.export", "a twin -> USD, PLY, SPZ, Newton, MuJoCo, or npz with a JSON description"),
     "fetch": ("neuspring.cli.data", "released archives -> the folders that the readers expect"),
     "make-capture": ("neuspring.cli.intake", "color and depth of a camera -> a capture folder"),
     "check-data": ("neuspring.cli.data", "report how a data folder departs from the expected layout"),

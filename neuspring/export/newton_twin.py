@@ -1,0 +1,89 @@
+"""An exported twin as a model of Newton 1.8. This file is complete: it needs NumPy, Newton and Warp, and the files beside it.
+
+    model = build("my_twin").finalize()         # particles (nodes, then controllers) and springs
+    positions = simulate("my_twin", frames=10)  # [11, N, 3], m
+
+Newton's spring has the force ke (l - l0) + kd dl/dt, so ke = stiffness / rest length and kd = dashpot. Its particles have no drag:
+`simulate` slows them after each step. Ground, collisions between nodes and cubic paths of the hands are left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+
+
+def load(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and settings of an exported twin."""
+    said = json.loads((Path(folder) / "description.json").read_text())
+    if (said["format"], said["version"]) != ("neuspring-plain", 1):
+        raise ValueError(f"{folder}: format neuspring-plain 1 is required, received {said['format']} {said['version']}")
+    with np.load(Path(folder) / "arrays.npz") as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    return arrays, {name: entry["value"] for name, entry in said["settings"].items()}
+
+
+def build(folder: str | Path) -> newton.ModelBuilder:
+    """Nodes as particles, controllers as particles that do not move by themselves, and springs."""
+    arrays, settings = load(folder)
+    down = (0.0, 0.0, -settings["gravity"] * settings["up_sign"])
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=down)
+    for place, velocity, mass in zip(arrays["nodes"], arrays["velocity"], arrays["mass"], strict=True):
+        builder.add_particle(place.tolist(), velocity.tolist(), float(mass), radius=1e-4)
+    for place in arrays["controllers"]:
+        builder.add_particle(place.tolist(), (0.0, 0.0, 0.0), 0.0, radius=1e-4, flags=0)
+    for (i, j), stiffness, length, dashpot in zip(
+        arrays["springs"], arrays["stiffness"], arrays["rest_lengths"], arrays["dashpot"], strict=True
+    ):
+        builder.add_spring(int(i), int(j), float(stiffness / length), float(dashpot), 0.0)
+    builder.spring_rest_length[:] = [float(length) for length in arrays["rest_lengths"]]
+    return builder
+
+
+def simulate(folder: str | Path, frames: int, drag: bool = True, device: str = "cpu") -> np.ndarray:
+    """Positions of nodes [frames + 1, N, 3], m, with SolverSemiImplicit and the twin's own time step, from frame 0.
+
+    The hands move as exported, and stay where their last frame is.
+    """
+    arrays, settings = load(folder)
+    model = build(folder).finalize(device=device)
+    model.particle_grid = None  # Else particles push each other away.
+    solver = newton.solvers.SolverSemiImplicit(model)
+    now: Any = model.state()
+    then: Any = model.state()
+    count, substeps = len(arrays["nodes"]), settings["substeps"]
+    dt = settings["frame_time"] / substeps
+    hands = arrays["hands"]
+    path = np.concatenate([hands, np.repeat(hands[-1:], max(frames + 1 - len(hands), 0), axis=0)]).astype(float)
+    result = [arrays["nodes"]]
+    for begin, end in itertools.pairwise(path[: frames + 1]):
+        for step in range(substeps):
+            places, speeds = now.particle_q.numpy().copy(), now.particle_qd.numpy().copy()
+            places[count:] = begin + (end - begin) * (step + 1) / substeps
+            speeds[count:] = (end - begin) / settings["frame_time"] * settings["controller_velocity"]
+            now.particle_q.assign(places)
+            now.particle_qd.assign(speeds)
+            now.clear_forces()
+            solver.step(now, then, None, None, dt)
+            if drag:
+                fast = then.particle_qd.numpy()[:count].astype(float)
+                slow = slowed(fast, dt, settings["drag"], settings["drag_quadratic"])
+                speeds[:count], places[:count] = slow, places[:count] + dt * slow
+                then.particle_q.assign(places)
+                then.particle_qd.assign(speeds)
+            now, then = then, now
+        result.append(now.particle_q.numpy()[:count].copy())
+    return np.stack(result)
+
+
+def slowed(v: np.ndarray, dt: float, linear: float, quadratic: float) -> np.ndarray:
+    """Velocities [N, 3] after dt of dv/dt = -(linear + quadratic |v|) v."""
+    decay = np.exp(-dt * linear)
+    mean = (1 - decay) / linear if linear else dt
+    slow: np.ndarray = v * decay / (1 + quadratic * mean * np.linalg.norm(v, axis=1, keepdims=True))
+    return slow

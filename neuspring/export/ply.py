@@ -1,0 +1,89 @@
+"""PLY: the spring graph as vertices and edges, and splats in the layout of splat viewers, a file of each per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.core.files import write_atomically
+from neuspring.export.source import Source
+
+VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
+EDGE = [
+    *(("vertex1", "<i4"), ("vertex2", "<i4"), ("stiffness", "<f4"), ("dashpot", "<f4"), ("rest_length", "<f4")),
+    *(("strain", "<f4"), ("bending", "u1")),
+]
+WORDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
+COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
+
+
+def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+    """Write springs_<frame>.ply and, where there are splats, splats_<frame>.ply to the folder `output`."""
+    made = []
+    for frame in frames:
+        made.append(output / f"springs_{frame:05d}.ply")
+        _write_elements(made[-1], {"vertex": vertices(source, frame), "edge": edges(source, frame)})
+    if source.splats is not None:
+        for frame, splats in source.moved_splats(frames):
+            made.append(output / f"splats_{frame:05d}.ply")
+            splats.save(made[-1])
+    return made
+
+
+def points(source: Source, frame: int) -> np.ndarray:
+    """Nodes, then controllers [N + C, 3], m."""
+    return np.concatenate([source.positions[frame], source.hands[frame]])
+
+
+def strains(source: Source, frame: int) -> np.ndarray:
+    """l / l0 - 1 of each spring [S]."""
+    topology, placed = source.twin.topology, points(source, frame)
+    ends = placed[topology.springs]
+    strain: np.ndarray = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / topology.rest_lengths - 1
+    return strain
+
+
+def node_stiffness(source: Source) -> np.ndarray:
+    """The mean stiffness of the springs of each node and controller [N + C], N; 0 where there are none."""
+    springs, stiffness = source.twin.topology.springs, source.twin.material.stiffness
+    count = len(points(source, 0))
+    total, springs_of = np.zeros(count), np.bincount(springs.ravel(), minlength=count)
+    for end in springs.T:
+        np.add.at(total, end, stiffness)
+    mean: np.ndarray = total / np.maximum(springs_of, 1)
+    return mean
+
+
+def vertices(source: Source, frame: int) -> np.ndarray:
+    """A row per node, then per controller; a controller has no mass and region -1."""
+    nodes, placed = len(source.positions[frame]), points(source, frame)
+    table = np.zeros(len(placed), VERTEX)
+    table["x"], table["y"], table["z"] = placed.T
+    table["mass"][:nodes] = source.masses
+    table["region"] = -1
+    table["region"][:nodes] = source.twin.topology.labels
+    table["controller"][nodes:] = 1
+    table["stiffness"] = node_stiffness(source)
+    return table
+
+
+def edges(source: Source, frame: int) -> np.ndarray:
+    """A row per spring."""
+    topology, material = source.twin.topology, source.twin.material
+    table = np.zeros(len(topology.springs), EDGE)
+    table["vertex1"], table["vertex2"] = topology.springs.T
+    table["stiffness"], table["dashpot"], table["rest_length"] = material.stiffness, material.dashpot, topology.rest_lengths
+    table["strain"], table["bending"] = strains(source, frame), topology.is_bending
+    return table
+
+
+def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}"]
+    for name, table in elements.items():
+        lines.append(f"element {name} {len(table)}")
+        lines += [f"property {WORDS[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
+    head = "\n".join([*lines, "end_header", ""]).encode()
+    content = head + b"".join(table.tobytes() for table in elements.values())
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))

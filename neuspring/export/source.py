@@ -1,0 +1,206 @@
+"""What is exported: a twin, its predicted motion, the hands that move it and its splats, from a run's folder or a `twin.npz`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.config.images import Images
+from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.splats.draw import moved
+from neuspring.splats.model import Splats
+from neuspring.splats.train import restricted
+from neuspring.twin.motion import initial_velocity
+
+TWIN_RECORDS = ("fit.json", "search.json")
+"""Records that name a twin, the later stage first."""
+ROLLOUT, OBSERVATIONS, APPEARANCE, RENDER = "rollout.json", "observations.npz", "appearance.json", "render.json"
+WHOLE = "Export from the results folder in which the run was made."
+FRAMES = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A twin and what is known of its motion; F frames, N nodes, C controllers."""
+
+    name: str
+    twin: Twin
+    positions: np.ndarray
+    """Predicted nodes [F, N, 3], m."""
+    hands: np.ndarray
+    """Controllers [F, C, 3], m."""
+    holds: np.ndarray
+    """Whether each controller holds the object [F, C]."""
+    velocity: np.ndarray
+    """Of the nodes in frame 0 [N, 3], m/s."""
+    splats: Splats | None = None
+    """In the shape of frame 0."""
+    made_from: dict[str, str] = field(default_factory=dict)
+    """File name -> SHA-256."""
+    frames: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
+    """The frame of each row of positions, hands and holds [F]."""
+
+    @property
+    def times(self) -> np.ndarray:
+        """Time of each frame since frame 0 [F], s."""
+        return self.frames * self.twin.simulation.frame_time
+
+    @property
+    def masses(self) -> np.ndarray:
+        """Of the nodes [N], kg."""
+        mass = self.twin.material.mass
+        return mass if len(mass) else np.ones(len(self.twin.topology.nodes), np.float32)
+
+    def only(self, frames: Sequence[int]) -> Source:
+        """The same with these of its frames alone."""
+        rows = list(frames)
+        changed = {name: getattr(self, name)[rows] for name in ("positions", "hands", "holds", "frames")}
+        return replace(self, **changed)
+
+    def moved_splats(self, frames: Sequence[int]) -> Iterator[tuple[int, Splats]]:
+        """The splats in these rising frames, as pictures show them. Raises InputError if there are none.
+
+        The source must have all frames: the nodes carry splats from each to the next.
+        """
+        images, wanted = Images(), set(frames)
+        carried = moved(restricted(self.require_splats(), images.opacity), self.positions[: max(frames) + 1], images, "cpu")
+        return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
+
+    def require_splats(self) -> Splats:
+        """The splats of frame 0. Raises InputError if there are none."""
+        if self.splats is None:
+            rule = "splats are required, of a scenario with images"
+            raise InputError(self.name, rule, "none", "Name the folder of a run whose scenario has appearance/<seed>/splats.ply.")
+        return self.splats
+
+
+def read_source(path: Path) -> Source:
+    """A run's folder (results/<scenario>/<method>/<seed>), or a twin.npz, which is known in frame 0 alone.
+
+    Raises InputError for a folder without a twin, one that is incomplete, and a run that failed before it had a twin.
+    """
+    if path.is_file():
+        return _at_rest(path.parent.name or "twin", Twin.load(path), {path.name: digest_file(path)})
+    if not path.is_dir():
+        rule = "must be a run's folder or a twin.npz"
+        raise InputError(path, rule, "no such file or folder", "Name results/<scenario>/<method>/<seed>.")
+    folder = path.resolve()
+    name = "_".join(folder.parts[-3:])
+    if not (folder / ROLLOUT).is_file():
+        return _at_rest(name, *_twin(_own_record(folder)))
+    rollout = StageRecord.load(folder / ROLLOUT)
+    twin, digests = _twin(_record_of(folder, rollout))
+    trajectory = Trajectory.load(rollout.file("trajectory", folder / ROLLOUT))
+    observations = _observations(folder, rollout)
+    if trajectory.diverged_frame is not None:
+        raise InputError(
+            folder,
+            "the motion must be known in all frames",
+            f"a rollout that diverged: {trajectory.reason}",
+            f"Its twin alone can be exported: name {_record_of(folder, rollout).parent / 'twin.npz'}.",
+        )
+    count = len(trajectory.positions)
+    if trajectory.positions.shape[1:] != twin.topology.nodes.shape or count > len(observations.controller_points):
+        rule = f"must have the {len(twin.topology.nodes)} nodes of the twin and the frames of the observations"
+        raise InputError(folder / "trajectory.npz", rule, trajectory.positions.shape, f"Delete {folder / ROLLOUT} and run again.")
+    hands = observations.controller_points[:count]
+    valid = observations.controller_valid
+    return Source(
+        name=name,
+        twin=twin,
+        positions=trajectory.positions,
+        hands=hands,
+        holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),
+        velocity=initial_velocity(observations, twin.simulation.initial_velocity),
+        splats=_splats(folder),
+        made_from=digests | {entry[0]: entry[1] for entry in rollout.files.values()},
+        frames=np.arange(count),
+    )
+
+
+def chosen_frames(text: str | None, source: Source, default: str) -> list[int]:
+    """Frames of FIRST, FIRST:STOP or FIRST:STOP:STEP (STOP is left out); without text `default`, or all where that is empty."""
+    count = len(source.positions)
+    words = text if text is not None else default or f"0:{count}"
+    found = FRAMES.fullmatch(words)
+    first, stop, step = (int(word) if word else None for word in found.groups()) if found else (None, None, None)
+    frames = [] if first is None else list(range(first, first + 1 if stop is None else stop, 1 if step is None else step or count))
+    if not frames or step == 0 or frames[-1] >= count:
+        raise InputError("--frames", f"must be FIRST, FIRST:STOP or FIRST:STOP:STEP, with frames of 0 to {count - 1}", words)
+    return frames
+
+
+def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> Source:
+    topology = twin.topology
+    return Source(
+        name=name,
+        twin=twin,
+        positions=topology.nodes[None],
+        hands=topology.controllers[None],
+        holds=np.ones((1, len(topology.controllers)), bool),
+        velocity=np.zeros(topology.nodes.shape),
+        made_from=digests,
+    )
+
+
+def _own_record(folder: Path) -> Path:
+    for name in TWIN_RECORDS:
+        if (folder / name).is_file():
+            return folder / name
+    if (folder / "train.json").is_file():
+        raise InputError(folder, "must be the run of a twin", "a baseline's model", "Name the run of a method with a search.")
+    rule = f"must hold {ROLLOUT}, or one of {', '.join(TWIN_RECORDS)}"
+    raise InputError(folder, rule, "neither", "Name results/<scenario>/<method>/<seed> of a run that ended, or a twin.npz.")
+
+
+def _record_of(folder: Path, rollout: StageRecord) -> Path:
+    """The record of the twin that was rolled out: in the folder, or in another of the scenario where methods share it."""
+    wanted = {digest for role, digest in rollout.inputs.items() if role.rstrip("0123456789") in ("fit", "search")}
+    if not wanted:
+        raise InputError(folder, "must be the run of a twin", "a baseline's model", "Name the run of a method with a search.")
+    scenario = folder.parent.parent
+    for name in TWIN_RECORDS:
+        for path in (folder / name, *sorted(scenario.glob(f"*/*/{name}"))):
+            if path.is_file() and digest_file(path) in wanted:
+                return path
+    rule = f"the record of its twin must lie in {scenario}, unchanged since {ROLLOUT} was written"
+    raise InputError(folder, rule, "none", WHOLE)
+
+
+def _twin(path: Path) -> tuple[Twin, dict[str, str]]:
+    record = StageRecord.load(path)
+    if record.status == "failed" or "twin" not in record.files:
+        rule, remedy = "must name a twin", "Choose another method or seed, or run this one again."
+        raise InputError(path, rule, f"a failure: {record.reason}" if record.reason else sorted(record.files), remedy)
+    return Twin.load(record.file("twin", path)), {record.files["twin"][0]: record.files["twin"][1]}
+
+
+def _observations(folder: Path, rollout: StageRecord) -> Observations:
+    path = folder.parent.parent / OBSERVATIONS
+    if not path.is_file():
+        raise InputError(path, "the hands' motion must be there", "no such file", WHOLE)
+    if digest_file(path) != rollout.inputs.get("observations"):
+        raise InputError(path, f"must be what {folder / ROLLOUT} was made from", "other content", "Run the workflow again.")
+    return Observations.load(path)
+
+
+def _splats(folder: Path) -> Splats | None:
+    """The splats of the run's pictures, else those of its seed."""
+    scenario, seed = folder.parent.parent, folder.name
+    records = sorted(scenario.glob(f"appearance*/*/{APPEARANCE}"))
+    wanted = StageRecord.load(folder / RENDER).inputs.get("appearance") if (folder / RENDER).is_file() else None
+    if wanted is not None:
+        records = [path for path in records if digest_file(path) == wanted]
+    else:
+        records = [path for path in records if path.parent.name == seed and path.parent.parent.name == "appearance"]
+    for path in records:
+        record = StageRecord.load(path)
+        if record.status == "ok":
+            return Splats.load(record.file("splats", path))
+    return None

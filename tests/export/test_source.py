@@ -1,0 +1,134 @@
+"""What can be exported, and what is said about what cannot."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Trajectory
+from neuspring.core.errors import InputError
+from neuspring.core.records import Recorder, StageRecord
+from neuspring.export.source import chosen_frames, read_source
+from tests.support import exported
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return exported.run_folder(tmp_path / "results")
+
+
+def test_a_run_has_its_motion_hands_and_splats(folder):
+    source = read_source(folder)
+    assert source.name == "scene_neuspring_0"
+    assert source.positions.shape == (exported.FRAMES, exported.NODES, 3)
+    assert np.array_equal(source.positions, Trajectory.load(folder / "trajectory.npz").positions)
+    assert source.hands.shape == (exported.FRAMES, 1, 3) and source.holds.all()
+    moved = dict(source.moved_splats([0, 3]))
+    assert sorted(moved) == [0, 3] and source.splats is not None
+    shift = np.linalg.norm(moved[3].means.mean(0) - moved[0].means.mean(0))
+    assert shift == pytest.approx(np.linalg.norm((source.positions[3] - source.positions[0]).mean(0)), rel=0.5)
+
+
+def test_the_twin_may_be_of_another_folder_of_the_scenario(folder):
+    """Methods with the same fit share it; the run's record names it by digest."""
+    shared = folder.parents[1] / "owner" / "0"
+    shared.mkdir(parents=True)
+    for name in ("fit.json", "twin.npz"):
+        (folder / name).rename(shared / name)
+    assert len(read_source(folder).positions) == exported.FRAMES
+
+
+def test_a_twin_alone_is_known_in_frame_0(folder, tmp_path):
+    (folder / "rollout.json").unlink()
+    for path in (folder, folder / "twin.npz"):
+        source = read_source(path)
+        assert source.positions.shape[0] == 1 and source.splats is None
+
+
+@pytest.mark.parametrize(
+    ("words", "frames"), [(None, list(range(7))), ("2", [2]), ("1:4", [1, 2, 3]), ("0:7:3", [0, 3, 6])], ids=str
+)
+def test_frames(folder, words, frames):
+    assert chosen_frames(words, read_source(folder), "") == frames
+
+
+@pytest.mark.parametrize("words", ["7", "0:8", "3:3", "4:2", "0:5:0", "-1", "a", "", "1:2:3:4"])
+def test_frames_that_are_not_there(folder, words):
+    with pytest.raises(InputError, match="frames of 0 to 6"):
+        chosen_frames(words, read_source(folder), "")
+
+
+def diverged(folder):
+    rollout = folder / "rollout.json"
+    trajectory = Trajectory.load(folder / "trajectory.npz")
+    short = replace(trajectory, positions=trajectory.positions[:3], diverged_frame=3, reason="node 1 left the scene in frame 3")
+    short.save(folder / "trajectory.npz")
+    old = StageRecord.load(rollout)
+    record = Recorder("rollout", rollout)
+    record.inputs = old.inputs
+    record.save({"trajectory": folder / "trajectory.npz"}, failure="rollout: diverged")
+
+
+def failed_fit(folder):
+    Recorder("fit", folder / "fit.json").save(failure="all candidates diverged")
+    (folder / "rollout.json").unlink()
+
+
+def baseline(folder):
+    Recorder("train", folder / "train.json").save()
+    for name in ("fit.json", "rollout.json"):
+        (folder / name).unlink()
+
+
+def older(folder):
+    values = json.loads((folder / "rollout.json").read_text())
+    (folder / "rollout.json").write_text(json.dumps(values | {"format": 0}))
+
+
+def other_observations(folder):
+    with (folder.parents[1] / "observations.npz").open("ab") as stream:
+        stream.write(b"more")
+
+
+BROKEN = {
+    "no folder": (shutil.rmtree, "no such file or folder. Name"),
+    "empty folder": (lambda folder: [path.unlink() for path in folder.iterdir()], "Name results/<scenario>/<method>/<seed>"),
+    "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and run again"),
+    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "Export from the results folder"),
+    "no trajectory": (lambda folder: (folder / "trajectory.npz").unlink(), "Delete .*rollout.json and run again"),
+    "no observations": (lambda folder: (folder.parents[1] / "observations.npz").unlink(), "Export from the results folder"),
+    "other observations": (other_observations, "Run the workflow again"),
+    "diverged": (diverged, "diverged: node 1 left.*name .*twin.npz"),
+    "failed": (failed_fit, "all candidates diverged. Choose another"),
+    "baseline": (baseline, "a baseline's model. Name the run of a method with a search"),
+    "older": (older, "records of format 1. Delete it and run again"),
+    "not a twin": (lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"), "Delete .*fit.json and run again"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_cannot_be_exported(folder, kind):
+    spoil, message = BROKEN[kind]
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        read_source(folder)
+
+
+def test_the_command_says_so_and_writes_nothing(folder, tmp_path, capsys):
+    (folder / "trajectory.npz").unlink()
+    assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 2
+    assert "run again" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_missing_splats_are_named(tmp_path):
+    source = read_source(exported.run_folder(tmp_path, with_splats=False))
+    with pytest.raises(InputError, match=r"splats are required.*appearance/<seed>/splats.ply"):
+        source.require_splats()
+
+
+def test_a_rate_is_for_usd(folder, capsys):
+    assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
+    assert "--rate: is for usd" in capsys.readouterr().err

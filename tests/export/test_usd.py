@@ -1,0 +1,77 @@
+"""USD: read back by pxr, positions are equal bit for bit and everything stands where tools look for it."""
+
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.export import usd
+from neuspring.export.source import read_source
+from tests.support import exported
+
+pxr = pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+
+
+def opened(path):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(path))
+
+
+@pytest.mark.parametrize("suffix", usd.SUFFIXES)
+def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
+    from pxr import UsdGeom, UsdVol
+
+    folder = exported.run_folder(tmp_path)
+    path = tmp_path / f"twin{suffix}"
+    assert main(["export", str(folder), "--to", "usd", "--output", str(path)]) == 0
+    stage, source, twin = opened(path), read_source(folder), Twin.load(folder / "twin.npz")
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 1.0)
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(30) and stage.GetEndTimeCode() == exported.FRAMES - 1
+    assert stage.GetDefaultPrim().GetPath() == usd.ROOT
+    nodes, springs = UsdGeom.Points.Get(stage, "/Twin/Nodes"), UsdGeom.BasisCurves.Get(stage, "/Twin/Springs")
+    splats = UsdVol.ParticleField3DGaussianSplat.Get(stage, "/Twin/Splats")
+    stand_in = UsdGeom.Points.Get(stage, "/Twin/SplatPoints")
+    moved = dict(source.moved_splats(range(exported.FRAMES)))
+    for frame in range(exported.FRAMES):
+        assert np.array_equal(nodes.GetPointsAttr().Get(frame), source.positions[frame])
+        both = np.concatenate([source.positions[frame], source.hands[frame]])
+        assert np.array_equal(np.array(springs.GetPointsAttr().Get(frame)).reshape(-1, 2, 3), both[twin.topology.springs])
+        assert np.array_equal(splats.GetPositionsAttr().Get(frame), moved[frame].means)
+        assert np.array_equal(stand_in.GetPointsAttr().Get(frame), moved[frame].means)
+    ours = moved[3].quaternions / np.linalg.norm(moved[3].quaternions, axis=1, keepdims=True)
+    theirs = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in splats.GetOrientationsAttr().Get(3)])
+    assert np.abs(ours - theirs).max() < 1e-6
+    assert np.allclose(splats.GetScalesAttr().Get(), np.exp(moved[0].log_scales), rtol=1e-6)
+    coefficients = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(moved[0].harmonics.shape)
+    assert np.array_equal(coefficients, moved[0].harmonics) and splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
+    primvars = UsdGeom.PrimvarsAPI(springs)
+    assert np.array_equal(primvars.GetPrimvar("stiffness").Get(), twin.material.stiffness)
+    assert primvars.GetPrimvar("stiffness").GetInterpolation() == "uniform"
+    assert UsdGeom.Imageable(splats).GetPurposeAttr().Get() == "render" and len(splats.GetOpacitiesAttr().Get()) == len(ours)
+
+
+def test_a_rate_changes_codes_and_no_seconds(tmp_path):
+    folder = exported.run_folder(tmp_path, with_splats=False)
+    usd.write(read_source(folder), [0, 2], tmp_path / "twin.usda", rate=24.0)
+    stage = opened(tmp_path / "twin.usda")
+    assert stage.GetTimeCodesPerSecond() == 24 and stage.GetEndTimeCode() == pytest.approx(2 / 30 * 24)
+    assert not stage.GetPrimAtPath("/Twin/Splats")
+
+
+def test_up_is_up(tmp_path):
+    from pxr import Gf, UsdGeom
+
+    folder = exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False)
+    usd.write(read_source(folder), [0], tmp_path / "twin.usda")
+    stage = opened(tmp_path / "twin.usda")
+    matrix = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
+    assert Gf.IsClose(matrix.TransformDir(Gf.Vec3d(0, 0, -1)), Gf.Vec3d(0, 0, 1), 1e-6)
+
+
+@pytest.mark.parametrize(("name", "rate"), [("twin.fbx", None), ("twin.usda", 0.0), ("twin.usda", float("nan"))])
+def test_bad_names_and_rates(tmp_path, name, rate):
+    source = read_source(exported.run_folder(tmp_path, with_splats=False))
+    with pytest.raises(InputError, match=r"--output: must end|--rate: must be a positive"):
+        usd.write(source, [0], tmp_path / name, rate)
