@@ -15,12 +15,13 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.splats.draw import moved
 from neuspring.splats.model import Splats
+from neuspring.splats.of_run import splats_file
 from neuspring.splats.train import restricted
 from neuspring.twin.motion import initial_velocity
 
 TWIN_RECORDS = ("fit.json", "search.json")
 """Records that name a twin, the later stage first."""
-ROLLOUT, OBSERVATIONS, APPEARANCE, RENDER = "rollout.json", "observations.npz", "appearance.json", "render.json"
+ROLLOUT, OBSERVATIONS = "rollout.json", "observations.npz"
 WHOLE = "Export from the results folder in which the run was made."
 FRAMES = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
 
@@ -111,6 +112,7 @@ def read_source(path: Path) -> Source:
         raise InputError(folder / "trajectory.npz", rule, trajectory.positions.shape, f"Delete {folder / ROLLOUT} and run again.")
     hands = observations.controller_points[:count]
     valid = observations.controller_valid
+    splats = splats_file(folder)
     return Source(
         name=name,
         twin=twin,
@@ -118,7 +120,7 @@ def read_source(path: Path) -> Source:
         hands=hands,
         holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),
         velocity=initial_velocity(observations, twin.simulation.initial_velocity),
-        splats=_splats(folder),
+        splats=None if splats is None else Splats.load(splats),
         made_from=digests | {entry[0]: entry[1] for entry in rollout.files.values()},
         frames=np.arange(count),
     )
@@ -188,19 +190,3 @@ def _observations(folder: Path, rollout: StageRecord) -> Observations:
     if digest_file(path) != rollout.inputs.get("observations"):
         raise InputError(path, f"must be what {folder / ROLLOUT} was made from", "other content", "Run the workflow again.")
     return Observations.load(path)
-
-
-def _splats(folder: Path) -> Splats | None:
-    """The splats of the run's pictures, else those of its seed."""
-    scenario, seed = folder.parent.parent, folder.name
-    records = sorted(scenario.glob(f"appearance*/*/{APPEARANCE}"))
-    wanted = StageRecord.load(folder / RENDER).inputs.get("appearance") if (folder / RENDER).is_file() else None
-    if wanted is not None:
-        records = [path for path in records if digest_file(path) == wanted]
-    else:
-        records = [path for path in records if path.parent.name == seed and path.parent.parent.name == "appearance"]
-    for path in records:
-        record = StageRecord.load(path)
-        if record.status == "ok":
-            return Splats.load(record.file("splats", path))
-    return None

@@ -9,6 +9,7 @@ import trimesh
 
 from neuspring.core.artifacts import Twin
 from neuspring.play.colors import OVER, Scale, Springs, node_colors
+from neuspring.play.dress import Dress
 from neuspring.report.figures.views import sample
 
 if TYPE_CHECKING:
@@ -32,8 +33,9 @@ class Body:
         self.parts = Springs.of(twin, sample(len(twin.topology.springs))) if twin and len(twin.topology.springs) else None
         self.root = scene.add_frame(f"/{name}", show_axes=False)
         size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
-        radius = max(SIZE * spacing(nodes), LEAST * size)
+        self.radius = radius = max(SIZE * spacing(nodes), LEAST * size)
         self._reach = max(radius, REACH * size)
+        self.dress: Dress | None = None
         self._handles: Any = None
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, node_colors(twin) if twin else NODE)
         self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND)
@@ -49,11 +51,13 @@ class Body:
         """How many springs are not drawn."""
         return len(self.twin.topology.springs) - len(self.parts.pairs) if self.twin and self.parts else 0
 
-    def show(self, *, nodes: bool, springs: bool, hands: bool) -> None:
+    def show(self, *, nodes: bool, springs: bool, hands: bool, splats: bool = False) -> None:
         """Which parts are seen."""
         self.nodes.visible, self.hands.visible = nodes, hands
         if self.springs is not None:
             self.springs.visible = springs
+        if self.dress is not None:
+            self.dress.show(splats)
 
     def move(self, nodes: np.ndarray, hands: np.ndarray, quantity: str, scale: Scale | None, most: float = np.inf) -> np.ndarray:
         """Draw nodes [N, 3] and hands [C, 3], m; springs stretched beyond `most` are red. Returns the strain of drawn springs."""

@@ -102,8 +102,13 @@ def scale_of(quantity: str, bodies: Sequence[Springs], strains: Sequence[np.ndar
     least = LEAST_STRAIN if quantity == "strain" else LEAST_FORCE
     far = max(float(np.quantile(np.abs(np.concatenate([one.ravel() for one in values])), 0.99)), least)
     if quantity == "strain":
-        return Scale("strain l / l0 − 1 (red: stretched)", -far, far, "1", DIVERGING)
+        return strain_scale(far)
     return Scale("force Y (l / l0 − 1) (red: pulls)", -far, far, "N", DIVERGING)
+
+
+def strain_scale(far: float) -> Scale:
+    """The colors of strains from -far to far."""
+    return Scale("strain l / l0 − 1 (red: stretched)", -far, far, "1", DIVERGING)
 
 
 def node_colors(twin: Twin) -> np.ndarray:

@@ -35,14 +35,14 @@ def require_modest(path: Path, most: int = MOST_BYTES) -> None:
             raise InputError(path, rule, f"shape {shape}", "Delete it and run its step again.")
 
 
-def require_small(path: Path) -> None:
-    """Raise InputError for a record that is larger than any that we write."""
+def require_small(path: Path, most: int = LARGEST_RECORD) -> None:
+    """Raise InputError for a file that is larger than any of its kind that we write."""
     try:
         size = path.stat().st_size
     except OSError as error:
         raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
-    if size > LARGEST_RECORD:
-        raise InputError(path, f"a record has at most {LARGEST_RECORD / 1e6:.0f} MB", f"{size / 1e6:.0f} MB")
+    if size > most:
+        raise InputError(path, f"at most {most / 1e6:.0f} MB are opened", f"{size / 1e6:.0f} MB", "Run its step again.")
 
 
 def inside(folder: Path, path: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,16 @@ class Hold:
 
     def __init__(self, nodes: int, hands: np.ndarray, groups: np.ndarray) -> None:
         self._lock, self._nodes, self._groups = threading.Lock(), nodes, groups
-        self._start = hands.copy()
-        self.reset()
+        self.following = False
+        """Hands follow a recording, so that nobody can take them."""
+        self.asked = 0.0
+        """When a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
+        self.reset(hands)
 
-    def reset(self) -> None:
-        """Let go, hands back to where they were."""
+    def reset(self, hands: np.ndarray) -> None:
+        """Let go; hands are at [C, 3], m."""
         with self._lock:
+            self._start = hands.copy()
             self.owner: int | None = None
             self.node, self._target, self._shift = -1, np.zeros(3, np.float32), np.zeros(3, np.float32)
             self._hand, self._from, self._base = -1, np.zeros(3), self._start
@@ -33,6 +38,8 @@ class Hold:
         with self._lock:
             most = self._nodes if kind == "node" else len(self._groups)
             if self.owner is not None or point is None or not isinstance(index, int) or not 0 <= index < most:
+                return False
+            if kind == "hand" and self.following:
                 return False
             self.owner = client
             if kind == "node":
@@ -49,6 +56,7 @@ class Hold:
             if self.owner != client or point is None:
                 return
             self._target = point + self._shift
+            self.asked = self.asked or time.monotonic()
             if self._hand >= 0:
                 self.wanted = self._base.copy()
                 self.wanted[self._groups == self._hand] += point - self._from
@@ -59,12 +67,26 @@ class Hold:
             if self.owner == client:
                 self.owner, self.node, self._hand = None, -1, -1
 
-    def next(self, seconds: float, hands: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-        """Hands [C, 3], node and target [3] at the end of a frame, from hands and target (`at`) at its begin."""
+    def next(
+        self, seconds: float, hands: np.ndarray, at: np.ndarray, recorded: np.ndarray | None = None
+    ) -> tuple[np.ndarray, int, np.ndarray]:
+        """Hands [C, 3], node and target [3] at the end of a frame, from hands and target (`at`) at its begin.
+
+        `recorded` hands [C, 3] are taken as they are.
+        """
         with self._lock:
+            if recorded is not None:
+                self.wanted = recorded
             wanted, node, target = self.wanted, self.node, self._target
         reach = FASTEST * seconds
-        return hands + _limited(wanted - hands, reach), node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
+        moved = hands + _limited(wanted - hands, reach) if recorded is None else recorded
+        return moved, node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
+
+    def drawn(self) -> float | None:
+        """Seconds since the mouse was moved whose pull has just been drawn; None: it was not moved."""
+        with self._lock:
+            asked, self.asked = self.asked, 0.0
+        return time.monotonic() - asked if asked else None
 
 
 def nearest_to_ray(points: np.ndarray, eye: Any, through: Any) -> int:

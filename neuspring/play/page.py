@@ -12,7 +12,7 @@ import numpy as np
 
 from neuspring.play.clock import SPEEDS
 from neuspring.play.colors import QUANTITIES
-from neuspring.play.live import LivePanel
+from neuspring.play.panel import LivePanel
 from neuspring.play.player import MOST_SHOWN, Player
 from neuspring.play.results import Scene
 
@@ -25,12 +25,23 @@ PARTS = {
     "nodes": "Nodes",
     "springs": "Springs",
     "hands": "Hands",
+    "splats": "Splats",
     "points": "Observed points",
-    "tracks": "Annotated tracks",
+    "tracks": "Tracks",
     "cameras": "Cameras",
     "images": "Camera images",
 }
-KEYS = "Keys: space plays, arrows left and right step, home and end jump."
+KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin."
+SMALL = "margin:0 .8em;font-size:.8em"
+MARKS = (
+    ("#00965a", "observed points"),
+    ("#9600c8", "annotated tracks"),
+    ("#e67800", "where the run predicts them"),
+    ("#d62728", "hands"),
+    ("#ffc800", "the node that is held"),
+    ("#3c3c3c", "cameras"),
+)
+"""Colors of what is not a spring."""
 
 
 class Page:
@@ -42,6 +53,7 @@ class Page:
         server.scene.set_up_direction(scenario.up)
         self.player = Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
+        self._alive, self._before = False, self.player.look.quantity
         self._look_at()
         server.gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
@@ -49,7 +61,7 @@ class Page:
         self._time()
         self._runs()
         self._shown()
-        self.panel = LivePanel(server, self.player, save_to)
+        self.panel = LivePanel(server, self.player, save_to, self._lived)
         self._keys()
         self._thread = threading.Thread(target=self._tick, name="clock", daemon=True)
         self._thread.start()
@@ -75,6 +87,7 @@ class Page:
         gui, clock = self.server.gui, self.player.clock
         with gui.add_folder("Time"):
             self.bar = gui.add_html(clock.bar())
+            self.errors = gui.add_html("")
             last = clock.count - 1
             self.slider = gui.add_slider(
                 "Frame", 0, last, 1, 0, marks=((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
@@ -109,6 +122,8 @@ class Page:
                 self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
             self.quantity = gui.add_dropdown("Springs by", QUANTITIES, initial_value=look.quantity)
             self.legend = gui.add_html("")
+            marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
+            gui.add_html(f"<div style='{SMALL};columns:2'>{marks}</div>")
         for box in self.parts.values():
             box.on_update(lambda _: self._changed())
         self.quantity.on_update(lambda _: self._changed())
@@ -121,11 +136,13 @@ class Page:
             absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
         if not self.found.observations.tracks.size:
             absent["tracks"] = "no tracks were annotated"
+        if not any(run.splats_path for run in self.found.runs):
+            absent["splats"] = "no run here has splats"
         return absent
 
     def _keys(self) -> None:
         gui, clock = self.server.gui, self.player.clock
-        gui.add_html(f"<div style='margin:0 .8em;font-size:.8em'>{KEYS}</div>")
+        gui.add_html(f"<div style='{SMALL}'>{KEYS}</div>")
         for label, key, action in (
             ("Play or pause", "space", self.toggle),
             ("Next frame", "arrowright", lambda: self.show(clock.frame + 1)),
@@ -171,7 +188,24 @@ class Page:
             if len(look.shown) > MOST_SHOWN:
                 notes.append(f"{MOST_SHOWN} runs are shown at once; take some away to see others")
             rows = "<br>".join(escape(note[:400]) for note in [*self.found.notes, *notes])
-            self.notes.content = f"<div style='margin:0 .8em;font-size:.8em'>{rows}</div>"
+            self.notes.content = f"<div style='{SMALL}'>{rows}</div>"
+        self._tell_errors()
+
+    def _lived(self) -> None:
+        """A live twin has begun or ended: it is shown by strain, unless something else was chosen."""
+        live = self.panel.live is not None
+        if live != self._alive:
+            self._alive = live
+            if live:
+                self._before = self.quantity.value
+                self.quantity.value = "strain"
+            elif self.quantity.value == "strain":
+                self.quantity.value = self._before
+        self._changed()
+
+    def _tell_errors(self) -> None:
+        found = self.player.errors()
+        self.errors.content = f"<div style='{SMALL}'>track error in this frame: {escape(found)}</div>" if found else ""
 
     def _tick(self) -> None:
         """Let time pass, and draw what has changed."""
@@ -190,5 +224,6 @@ class Page:
             if now - told > 0.25:
                 told = now
                 self.panel.refresh()
+                self._tell_errors()
             if self.play.label != (wanted := "Pause" if playing else "Play"):
                 self.play.label = wanted

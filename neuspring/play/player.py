@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neuspring.core.artifacts import Twin
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.play.body import Body
 from neuspring.play.clock import Clock
-from neuspring.play.colors import Scale, Springs, region_legend, scale_of
+from neuspring.play.colors import Scale, Springs, region_legend, scale_of, strain_scale
+from neuspring.play.dress import Dress
 from neuspring.play.results import Run, Scene
 from neuspring.play.surroundings import Surroundings
+from neuspring.play.tracked import Tracked
 
 if TYPE_CHECKING:
     import viser
@@ -33,6 +35,7 @@ class Look:
     nodes: bool = True
     springs: bool = True
     hands: bool = True
+    splats: bool = False
     points: bool = True
     tracks: bool = True
     cameras: bool = True
@@ -54,8 +57,10 @@ class Player:
         self.scale: Scale | None = None
         self.notes: dict[str, str] = {}
         """Run -> why it is not shown, or what to know about it."""
-        self._scene, self._bodies = scene, dict[str, Body]()
+        self._scene, self._bodies, self._tracked = scene, dict[str, Body](), dict[str, Tracked]()
         self._hidden = False
+        self.limit: float | None = None
+        """Strain at the end of the colors of a live twin; None: the recording is shown."""
         seen = found.observations
         everything = np.concatenate([seen.object_points[seen.object_visibility], seen.nodes])
         self.low, self.high = everything.min(axis=0), everything.max(axis=0)
@@ -76,13 +81,16 @@ class Player:
             wanted = self.look.shown[:MOST_SHOWN]
             for name in [name for name in self._bodies if name not in wanted]:
                 self._bodies.pop(name).remove()
+                self._tracked.pop(name)
             for name in wanted:
                 if name not in self._bodies:
                     self._add(self.run(name))
             look = self.look
             for index, name in enumerate(name for name in wanted if name in self._bodies):
                 body = self._bodies[name]
-                body.show(nodes=look.nodes, springs=look.springs, hands=look.hands)
+                self.dress(body, self.run(name))
+                body.show(nodes=look.nodes, springs=look.springs, hands=look.hands, splats=look.splats)
+                self._tracked[name].show(look.tracks)
                 body.root.position, body.root.visible = self.offset(index), not self._hidden
             seen = not self._hidden
             self.around.show(
@@ -91,10 +99,21 @@ class Player:
             self.scale = self._scale()
             self.draw()
 
-    def hide(self, hidden: bool) -> None:
-        """Take the recording out of sight, for a live twin; time stands still meanwhile."""
+    def dress(self, body: Body, run: Run) -> None:
+        """Put a run's splats on a body when they are first wanted; what it lacks is a note."""
+        if not self.look.splats or body.dress is not None or run.splats_path is None:
+            return
+        try:
+            if run.splats is not None and run.trajectory is not None:
+                nodes = run.trajectory.positions[0]
+                body.dress = Dress(self._scene, body.name, run.splats, nodes, run.centers)
+        except (InputError, NumericalFailure) as error:
+            self.notes[run.name] = "; ".join(filter(None, [self.notes.get(run.name, ""), f"no splats: {error}"]))
+
+    def hide(self, hidden: bool, limit: float | None = None) -> None:
+        """Take the recording out of sight, for a live twin whose colors end at a strain; time stands still meanwhile."""
         with self.lock:
-            self._hidden = hidden
+            self._hidden, self.limit = hidden, limit
             self.clock.playing = False
             self.apply()
 
@@ -108,7 +127,11 @@ class Player:
             frame = self.clock.frame
             hands = self.found.observations.controller_points[frame]
             for name, body in self._bodies.items():
-                body.move(self._positions(self.run(name), frame), hands, self.look.quantity, self.scale)
+                nodes = self._positions(self.run(name), frame)
+                body.move(nodes, hands, self.look.quantity, self.scale)
+                self._tracked[name].move(nodes, frame)
+                if body.dress is not None:
+                    body.dress.move(nodes, frame)
             self.around.move(frame)
 
     def legend(self) -> str:
@@ -122,6 +145,12 @@ class Player:
         note = f"<div style='margin:0 .6em;font-size:.8em'>{hidden} springs are not drawn</div>" if hidden else ""
         return self.scale.legend() + note
 
+    def errors(self) -> str:
+        """The track error of each shown run in the shown frame, mm, in words; empty without tracks."""
+        with self.lock:
+            found = {name: one.error for name, one in self._tracked.items() if one.error is not None and not self._hidden}
+        return "; ".join(f"{name} {1e3 * error:.1f} mm" for name, error in found.items())
+
     def _add(self, run: Run) -> None:
         """Put a run into the scene; what it lacks is a note."""
         notes = list(run.notes)
@@ -133,7 +162,9 @@ class Player:
             if run.trajectory.diverged_frame is not None:
                 notes.append(f"left the scene in frame {run.trajectory.diverged_frame}; it stays where it was before")
             hands = self.found.observations.controller_points[0]
-            self._bodies[run.name] = Body(self._scene, run.name, twin, run.trajectory.positions[0], hands)
+            nodes = run.trajectory.positions[0]
+            body = self._bodies[run.name] = Body(self._scene, run.name, twin, nodes, hands)
+            self._tracked[run.name] = Tracked(self._scene, run.name, self.found.observations.tracks, nodes, 1.2 * body.radius)
         except InputError as error:
             notes.append(str(error))
         self.notes[run.name] = "; ".join(notes)
@@ -159,6 +190,8 @@ class Player:
         return np.asarray(run.trajectory.positions[min(frame, len(run.trajectory.positions) - 1)])
 
     def _scale(self) -> Scale | None:
+        if self.limit is not None and self.look.quantity == "strain":
+            return strain_scale(self.limit)
         parts: list[Springs] = []
         strains = []
         hands = self.found.observations.controller_points

@@ -8,12 +8,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.config.images import Images
+from neuspring.core.artifacts import Observations, SplatCentres, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.play.guard import inside, require_modest, require_small
+from neuspring.play.guard import MOST_BYTES, inside, require_modest, require_small
+from neuspring.splats.model import Splats
+from neuspring.splats.of_run import APPEARANCE, RENDER, splats_file
+from neuspring.splats.train import restricted
 
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
@@ -35,6 +39,8 @@ class Run:
     """What a viewer must know."""
     twin_path: Path | None = None
     trajectory_path: Path | None = None
+    splats_path: Path | None = None
+    centers_path: Path | None = None
 
     @property
     def name(self) -> str:
@@ -53,6 +59,24 @@ class Run:
             return None
         require_modest(self.trajectory_path)
         return Trajectory.load(self.trajectory_path)
+
+    @cached_property
+    def splats(self) -> Splats | None:
+        """The splats that pictures of this run show, in frame 0, if it has any. Raises InputError."""
+        if self.splats_path is None:
+            return None
+        require_small(self.splats_path, MOST_BYTES)
+        splats = Splats.load(self.splats_path)
+        # As pictures (stages/render.py): where a method's own model moves them, all of them are drawn.
+        return splats if self.centers_path else restricted(splats, Images().opacity)
+
+    @cached_property
+    def centers(self) -> SplatCentres | None:
+        """Where the method's own model puts its splats, if it does. Raises InputError."""
+        if self.centers_path is None:
+            return None
+        require_modest(self.centers_path)
+        return SplatCentres.load(self.centers_path)
 
     @cached_property
     def twin_digest(self) -> str:
@@ -132,26 +156,40 @@ def _first(runs: Sequence[Run]) -> tuple[str, ...]:
 def _run(folder: Path, scenario_folder: Path) -> Run:
     """A run with what can be used of it; a record that cannot be read is a note."""
     notes: list[str] = []
-    twin = trajectory = None
+    twin = trajectory = splats = centers = None
     rollout = folder / ROLLOUT
     try:
         require_small(rollout)
         record = StageRecord.load(rollout)
         if record.status == "failed":
             notes.append(f"failed: {record.reason}")
-        if "trajectory" in record.files:
+        for role in {"trajectory", "centres"} & set(record.files):
             # The digest is checked by `file`; a name that leads elsewhere is refused before it is read.
-            inside(scenario_folder, folder / str(record.files["trajectory"][0]))
-            trajectory = record.file("trajectory", rollout)
+            inside(scenario_folder, folder / str(record.files[role][0]))
+        trajectory, centers = (record.file(role, rollout) if role in record.files else None for role in ("trajectory", "centres"))
     except (InputError, TypeError, ValueError, IndexError) as error:
         notes.append(f"no prediction: {error}")
     try:
         twin = _twin_of(folder, scenario_folder)
     except InputError as error:
         notes.append(f"no twin: {error}")
+    try:
+        splats = _splats_of(folder, scenario_folder)
+    except (InputError, TypeError, ValueError, IndexError) as error:
+        notes.append(f"no splats: {error}")
     if trajectory is None and not notes:
         notes.append("no prediction in its record")
-    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, trajectory)
+    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, trajectory, splats, centers)
+
+
+def _splats_of(folder: Path, scenario_folder: Path) -> Path | None:
+    """The splats of its pictures; records are small, and name files of the scenario."""
+    for record in (folder / RENDER, *scenario_folder.glob(f"appearance*/*/{APPEARANCE}")):
+        if record.is_file():
+            require_small(record)
+            for entry in StageRecord.load(record).files.values():
+                inside(scenario_folder, record.parent / str(entry[0]))
+    return splats_file(folder)
 
 
 def _twin_of(folder: Path, scenario_folder: Path) -> Path | None:

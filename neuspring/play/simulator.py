@@ -7,7 +7,7 @@ and c critical for the node's mass, bounded in the same way. The target is a con
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ import torch
 from neuspring.core.artifacts import Twin
 from neuspring.physics import stability
 from neuspring.physics.autograd import solver_for
+from neuspring.physics.grips import BEGINS
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.rollout import FAR, Diverged
 
@@ -24,53 +25,92 @@ MARGIN = 0.9
 """Part of the stability bound that twin and grab may use together."""
 
 
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The state that a twin begins in. What is None is as in its frame 0: there, at rest, and all hands hold."""
+
+    positions: np.ndarray | None = None
+    """[N, 3], m."""
+    velocity: np.ndarray | None = None
+    """[N, 3], m/s."""
+    hands: np.ndarray | None = None
+    """[C, 3], m."""
+    holds: np.ndarray | None = None
+    """Which hands hold [C], and 2 where one takes hold in this moment (physics/path.py)."""
+    grips: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    """Of hands that took hold earlier: rows [C, 4] of their moments (physics/path.py), and the nodes [N, 3] then."""
+
+
 class Simulator:
     """A twin's state, frame by frame. Equal controls give equal states, bit for bit, on a CPU.
 
     Hands move straight within a frame, whatever path the twin was fitted with: a live hand has no next frame.
     """
 
-    def __init__(self, twin: Twin, device: str = "cpu") -> None:
+    def __init__(self, twin: Twin, device: str = "cpu", start: Start | None = None) -> None:
         stability.check(twin)
         self.twin = replace(twin, simulation=replace(twin.simulation, controller_path="linear"))
+        self._start = start or Start()
         self._device, self._load = device, stability.twin_spectrum(twin).load(twin.simulation.substep)
         self._free = solver_for(self.twin, device, differentiable=False)
         self._held: dict[int, FrameSolver] = {}
         self.reset()
 
     def reset(self) -> None:
-        """Back to frame 0, at rest."""
-        topology = self.twin.topology
+        """Back to the start."""
+        topology, start = self.twin.topology, self._start
         self.frame, self.grabbed = 0, -1
-        self._x = torch.tensor(topology.nodes, device=self._device)
-        self._v = torch.zeros_like(self._x)
-        self.hands = topology.controllers.copy()
+        x = topology.nodes if start.positions is None else start.positions
+        v = np.zeros_like(x) if start.velocity is None else start.velocity
+        self._x, self._v = (torch.tensor(np.asarray(values, np.float32), device=self._device) for values in (x, v))
+        self.hands = (topology.controllers if start.hands is None else start.hands).astype(np.float32)
+        count = len(topology.controllers)
+        self._holds = np.ones(count, np.float32) if start.holds is None else start.holds.astype(np.float32)
+        self._grips = [(np.asarray(row, np.float32), nodes) for row, nodes in start.grips]
         self.target = np.zeros(3, np.float32)
+
+    @property
+    def holds(self) -> np.ndarray:
+        """Which hands hold [C]."""
+        return self._holds > 0
 
     @property
     def positions(self) -> np.ndarray:
         """Nodes [N, 3], m."""
         return np.asarray(self._x.cpu().numpy())
 
-    def step(self, hands: np.ndarray, grabbed: int = -1, target: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, hands: np.ndarray, grabbed: int = -1, target: np.ndarray | None = None, holds: np.ndarray | None = None
+    ) -> np.ndarray:
         """Nodes [N, 3], m, a frame later: hands move to [C, 3], m, and a grabbed node is pulled to `target` [3], m.
 
-        A grab begins where the node is. Raises Diverged, and stays as it was before.
+        A grab begins where the node is. `holds` [C]: which hands hold at the end; none: those that do now. Raises Diverged, and
+        stays as it was before.
         """
         hands = np.asarray(hands, np.float32)
+        now, grips = self._holds, self._grips
+        after = np.minimum(now, 1.0) if holds is None else np.where(holds, np.where(now > 0, 1.0, BEGINS), 0.0).astype(np.float32)
         begin, end = self.hands, hands
+        if grips or (now != 1).any() or (after != 1).any():
+            begin, end = np.column_stack([begin, now]), np.column_stack([end, after])
         solver, aim = self._free, self.target
         if grabbed >= 0:
             aim = np.asarray(target, np.float32)
             start = self.target if grabbed == self.grabbed else self.positions[grabbed]
-            begin, end = np.concatenate([begin, start[None]]), np.concatenate([end, aim[None]])
+            begin, end = (_with_row(rows, place) for rows, place in ((begin, start), (end, aim)))
             solver = self._solver(grabbed)
+        if begin.shape[1] == 4:
+            # Each solver knows the grips of its own frames alone.
+            rows = [_with_row(row, aim) if grabbed >= 0 else row for row, _ in grips]
+            solver.resume(torch.tensor(np.array(rows).reshape(len(rows), *begin.shape)), [nodes for _, nodes in grips])
         ends = (torch.tensor(np.asarray(values, np.float32), device=self._device) for values in (begin, end))
         x, v = solver.forward(self._x, self._v, *ends)
         # NaN compares false.
         if not bool((x.abs() < FAR).all()):
             raise Diverged(self.frame + 1, f"a node left the scene in frame {self.frame + 1}")
-        self._x, self._v, self.hands, self.grabbed, self.target = x, v, hands, grabbed, aim
+        if (now == BEGINS).any():
+            grips.append((np.column_stack([self.hands, now]), self.positions.copy()))
+        self._x, self._v, self.hands, self.grabbed, self.target, self._holds = x, v, hands, grabbed, aim, after
         self.frame += 1
         return self.positions
 
@@ -110,6 +150,11 @@ class Simulator:
         stiffness = np.append(material.stiffness, np.float32(k * REST))
         stronger = replace(material, stiffness=stiffness, dashpot=np.append(material.dashpot, np.float32(c)))
         return replace(self.twin, topology=more, material=stronger)
+
+
+def _with_row(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Controllers [C, 3 or 4] and one more at a place [3], which holds."""
+    return np.concatenate([rows, np.append(place, np.ones(rows.shape[1] - 3))[None]]).astype(np.float32)
 
 
 def hands_of(controllers: np.ndarray, apart: float = 0.15) -> np.ndarray:

@@ -9,7 +9,8 @@ import numpy as np
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
-from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.records import Recorder, StageRecord, digest_file
+from neuspring.splats.model import Splats
 from neuspring.twin.rollout import roll_out
 from tests.support import small
 
@@ -40,3 +41,21 @@ def spoil(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     write_text(path, text.replace(old, new))
+
+
+def dressed(scenario: Path, degree: int = 0, count: int = 300) -> Splats:
+    """Give a scenario of `results` splats of seed 0, around the nodes of frame 0; returns them."""
+    nodes = small.observations().nodes
+    rng = np.random.default_rng(1)
+    splats = Splats(
+        means=nodes[rng.integers(0, len(nodes), count)] + rng.normal(0, 0.004, (count, 3)),
+        quaternions=rng.normal(size=(count, 4)),
+        log_scales=np.log(rng.uniform(0.003, 0.009, (count, 3))),
+        opacity_logits=np.full(count, 3.0),
+        harmonics=np.concatenate([rng.uniform(0.2, 1.2, (count, 1, 3)), np.zeros((count, (degree + 1) ** 2 - 1, 3))], axis=1),
+    )
+    record = Recorder("appearance", scenario / "appearance" / "0" / "appearance.json")
+    files = record.beside(splats="splats.ply")
+    splats.save(files["splats"])
+    record.save(files)
+    return splats

@@ -1,0 +1,114 @@
+"""Splats on a twin in the browser: they follow the nodes, in whatever order frames are shown."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("viser", reason="the extra [play] is not installed")
+
+from neuspring.core.artifacts import SplatCentres
+from neuspring.play.dress import UNIT, Dress, covariances
+from neuspring.play.results import find
+from neuspring.play.serve import start
+from neuspring.splats.harmonics import C0
+from neuspring.splats.model import Gaussians
+from tests.support.played import dressed, results, spoil
+
+ROUNDING = 2e-3
+"""Relative error of 16-bit floats, with a margin."""
+
+
+@pytest.fixture(scope="module")
+def server():
+    one = start("127.0.0.1", 0)
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return results(tmp_path)
+
+
+def test_the_splats_of_its_seed_belong_to_a_run(scenario):
+    assert find([scenario]).runs[0].splats is None
+    splats = dressed(scenario)
+    found = find([scenario]).runs[0]
+    assert np.array_equal(found.splats.means, splats.means)
+
+
+def test_a_record_of_splats_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
+    dressed(scenario)
+    (tmp_path / "secret.ply").write_bytes(b"secret")
+    spoil(scenario / "appearance" / "0" / "appearance.json", '"splats.ply"', '"../../../secret.ply"')
+    run = find([scenario]).runs[0]
+    assert run.splats_path is None and any("must lie inside" in note for note in run.notes)
+
+
+def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
+    from neuspring.play.player import Player
+
+    dressed(scenario)
+    (scenario / "appearance" / "0" / "splats.ply").write_bytes(b"ply\n")
+    run = find([scenario]).runs[0]
+    assert run.splats_path is None and any("no splats" in note for note in run.notes)
+    player = Player(server.scene, find([scenario]))
+    player.look.splats = True
+    player.apply()
+    assert player._bodies["baseline/0"].dress is None
+
+
+def test_they_turn_with_the_body(scenario, server):
+    splats, run = dressed(scenario), find([scenario]).runs[0]
+    nodes = run.trajectory.positions[0]
+    turn, shift = Rotation.from_rotvec([0.3, -0.8, 1.1]), np.array([0.5, 0.1, -0.2])
+    dress = Dress(server.scene, "turned", splats, nodes)
+    means, quaternions = dress.placed(turn.apply(nodes) + shift)
+    assert means == pytest.approx(turn.apply(splats.means) + shift, abs=1e-5)
+    expected = turn.as_matrix() @ covariances(splats.quaternions, np.exp(splats.log_scales)) @ turn.as_matrix().T
+    assert covariances(quaternions, np.exp(splats.log_scales)) == pytest.approx(expected, abs=1e-8)
+
+
+def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
+    splats, run = dressed(scenario, degree=2), find([scenario]).runs[0]
+    dress = Dress(server.scene, "colors", splats, run.trajectory.positions[0])
+    handle = dress.handle
+    assert handle.centers * UNIT == pytest.approx(splats.means, abs=1e-6)
+    gaussians = Gaussians.of(splats)
+    scales = torch.diag_embed(gaussians.scales).numpy()
+    turns = Rotation.from_quat(splats.quaternions, scalar_first=True).as_matrix()
+    expected = turns @ scales @ scales @ turns.transpose(0, 2, 1)
+    assert handle.covariances * UNIT**2 == pytest.approx(expected, abs=ROUNDING * np.abs(expected).max())
+    assert handle.rgbs / 255 == pytest.approx(np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1), abs=1 / 255)
+
+
+def test_frames_may_be_shown_in_any_order_and_hidden_splats_cost_nothing(scenario, server):
+    splats, run = dressed(scenario), find([scenario]).runs[0]
+    x = run.trajectory.positions
+    dress = Dress(server.scene, "order", splats, x[0])
+    before = dress.handle.centers.copy()
+    dress.move(x[5])
+    assert np.array_equal(dress.handle.centers, before)
+    dress.show(True)
+    for frame in (5, 2, 7, 5):
+        dress.move(x[frame])
+    again = Dress(server.scene, "order again", splats, x[0])
+    again.show(True)
+    again.move(x[5])
+    assert np.array_equal(dress.handle.centers, again.handle.centers)
+    assert (dress.handle.centers != before).any()
+
+
+def test_a_model_with_splats_of_its_own_moves_them_itself(scenario, server):
+    splats, run = dressed(scenario), find([scenario]).runs[0]
+    positions = splats.means[None] + np.arange(8)[:, None, None] * np.array([0.01, 0, 0])
+    dress = Dress(server.scene, "own", splats, run.trajectory.positions[0], SplatCentres(positions=positions))
+    assert np.array_equal(dress.placed(run.trajectory.positions[3], 3)[0], positions[3].astype(np.float32))
+
+
+def test_of_too_many_a_sample_is_drawn(scenario, server, monkeypatch):
+    monkeypatch.setattr("neuspring.play.dress.MOST_SPLATS", 100)
+    splats, run = dressed(scenario), find([scenario]).runs[0]
+    dress = Dress(server.scene, "many", splats, run.trajectory.positions[0])
+    assert len(dress.handle.centers) == 100 and dress.left_out == 200
