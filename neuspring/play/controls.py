@@ -58,8 +58,9 @@ class Controls(Artifact):
     @property
     def start(self) -> Start:
         """The state that it began in."""
-        named = (self.start_positions, self.start_velocity, self.start_hands, self.start_holds)
-        return Start(*(value if value.size else None for value in named), tuple(zip(self.grip_rows, self.grip_nodes, strict=True)))
+        named = {name: getattr(self, f"start_{name}") for name in ("positions", "velocity", "hands", "holds")}
+        grips = tuple(zip(self.grip_rows, self.grip_nodes, strict=True))
+        return Start(**{name: value for name, value in named.items() if value.size}, grips=grips)
 
     def row(self, frame: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray | None]:
         """What `Simulator.step` takes for a frame, the first one being 0."""

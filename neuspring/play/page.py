@@ -8,8 +8,6 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from neuspring.play.clock import SPEEDS
 from neuspring.play.colors import QUANTITIES
 from neuspring.play.panel import LivePanel
@@ -73,15 +71,9 @@ class Page:
         self.panel.stop()
 
     def _look_at(self) -> None:
-        """The first view: the whole scene, from the side of its first camera or from the front."""
-        player, camera = self.player, self.server.initial_camera
-        middle = 0.5 * (player.low + player.high)
-        last = np.array(player.offset(max(len(player.look.shown) - 1, 0)))
-        middle, reach = middle + 0.5 * last, player.size + float(np.linalg.norm(last))
-        sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
-        camera.up = (0.0, 0.0, sign)
-        camera.look_at = tuple(middle)
-        camera.position = tuple(middle + 0.65 * reach * np.array([1.0, -0.45, 0.45 * sign]))
+        """The first view: all shown runs, across the row in which they stand."""
+        camera = self.server.initial_camera
+        camera.up, camera.look_at, camera.position = self.player.view()
 
     def _time(self) -> None:
         gui, clock = self.server.gui, self.player.clock
@@ -89,7 +81,7 @@ class Page:
             self.bar = gui.add_html(clock.bar())
             self.errors = gui.add_html("")
             last = clock.count - 1
-            self.slider = gui.add_slider(
+            self.slider: Any = gui.add_slider(
                 "Frame", 0, last, 1, 0, marks=((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
             )
             self.play = gui.add_button("Play")
@@ -120,7 +112,7 @@ class Page:
             for name, title in PARTS.items():
                 hint = absent.get(name)
                 self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
-            self.quantity = gui.add_dropdown("Springs by", QUANTITIES, initial_value=look.quantity)
+            self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=look.quantity)
             self.legend = gui.add_html("")
             marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
             gui.add_html(f"<div style='{SMALL};columns:2'>{marks}</div>")

@@ -44,13 +44,13 @@ class LivePanel:
             self.most = gui.add_slider("Red above", 0.05, 2.0, 0.05, TOO_MUCH, hint="strain l / l0 − 1")
             self.text = gui.add_html("")
         self.switch.on_click(lambda _: self.stop() if self.live else self.start(self.twin.value))
-        self.again.on_click(lambda _: self.live and self.live.reset())
+        self.again.on_click(lambda _: self._reset())
         self.save.on_click(lambda _: self._save())
         self.most.on_update(lambda _: self._limit())
         for choice in (self.twin, self.frame, self.repeat):
             choice.on_update(lambda _: self._chosen())
-        gui.add_command("Reset the live twin", hotkey="R").on_trigger(lambda _: self.live and self.live.reset())
-        server.on_client_disconnect(lambda client: self.live and self.live.hold.release(client.client_id))
+        gui.add_command("Reset the live twin", hotkey="R").on_trigger(lambda _: self._reset())
+        server.on_client_disconnect(lambda client: self._left(client.client_id))
 
     def start(self, name: str, played: Controls | None = None) -> None:
         """Begin with a run's twin, or show what was recorded of it."""
@@ -88,6 +88,15 @@ class LivePanel:
     def _begin(self, name: str) -> Begin:
         run, seen = self._player.run(name), self._player.found.observations
         return begin_at(run, seen, int(self.frame.value), bool(self.repeat.value))
+
+    def _reset(self) -> None:
+        if self.live is not None:
+            self.live.reset()
+
+    def _left(self, client: int) -> None:
+        """A closed page lets go."""
+        if self.live is not None:
+            self.live.hold.release(client)
 
     def _chosen(self) -> None:
         """Another start is another live twin."""

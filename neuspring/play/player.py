@@ -67,8 +67,9 @@ class Player:
         self.size = max(float(np.linalg.norm(self.high - self.low)), 0.05)
         self.around = Surroundings(scene, seen, found.capture, self.size)
         if scenario.ground:
-            floor = {"width": 6 * self.size, "height": 6 * self.size, "cell_size": 0.1, "section_size": 0.5}
-            scene.add_grid("/ground", **floor, position=(*(0.5 * (self.low + self.high))[:2], 0.0))
+            x, y, _ = 0.5 * (self.low + self.high)
+            wide = 6 * self.size
+            scene.add_grid("/ground", width=wide, height=wide, cell_size=0.1, section_size=0.5, position=(float(x), float(y), 0.0))
         self.apply()
 
     def run(self, name: str) -> Run:
@@ -120,6 +121,13 @@ class Player:
     def offset(self, index: int) -> tuple[float, float, float]:
         """Where a run stands: beside the others along y, the first one where it was observed."""
         return (0.0, index * self.look.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
+
+    def view(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Up [3], the middle of the shown runs [3], m, and from where all of them are seen [3], m."""
+        sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
+        last = np.array(self.offset(max(min(len(self.look.shown), MOST_SHOWN) - 1, 0)))
+        middle, reach = 0.5 * (self.low + self.high + last), self.size + float(np.linalg.norm(last))
+        return np.array([0.0, 0.0, sign]), middle, middle + 0.8 * reach * np.array([1.0, -0.35, 0.45 * sign])
 
     def draw(self) -> None:
         """Show the clock's frame."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from neuspring.core.errors import InputError
@@ -16,11 +17,16 @@ if TYPE_CHECKING:
     import viser
 
 LABEL = "NeuSpring"
+VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9}))?")
+"""The page, and a frame of it."""
 INSTALL = "Install it: pip install 'neuspring[play]'."
 
 
-def start(host: str, port: int) -> viser.ViserServer:
-    """A running server at host and port (0: any that is free). Raises InputError where it cannot listen there, or without viser."""
+def start(host: str, port: int, asked: Callable[[int], object] = lambda frame: None) -> viser.ViserServer:
+    """A running server at host and port (0: any that is free); `asked` gets the frame of an address that ends in /?frame=<number>.
+
+    Raises InputError where it cannot listen there, or without viser.
+    """
     try:
         import viser
     except ImportError as error:
@@ -28,7 +34,7 @@ def start(host: str, port: int) -> viser.ViserServer:
     _require_free(host, port)
     # viser takes another port from this variable, whatever it is told.
     os.environ.pop("_VISER_PORT_OVERRIDE", None)
-    with _guarded(host) as used, contextlib.redirect_stdout(io.StringIO()):
+    with _guarded(host, asked) as used, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=LABEL, verbose=False)
     if not used:
         server.stop()
@@ -46,6 +52,22 @@ def address(server: viser.ViserServer) -> str:
     """What to open."""
     host = server.get_host()
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
+
+
+def asked_frame(path: str) -> int | None:
+    """The frame that an address asks for, if it asks for that and for nothing else."""
+    found = VISIT.fullmatch(path)
+    return int(found[1]) if found and found[1] else None
+
+
+def _is_visit(request: Any) -> bool:
+    """Whether a person follows a link to the page, from a report for instance: a window of its own, not a frame of another site.
+
+    Other parameters are refused: viser's page takes from them where it connects to, and shows what it gets from there.
+    """
+    headers = request.headers
+    navigates = (headers.get("Sec-Fetch-Mode"), headers.get("Sec-Fetch-Dest")) == ("navigate", "document")
+    return navigates and "Upgrade" not in headers and VISIT.fullmatch(request.path) is not None
 
 
 def _no_tunnel(verbose: bool = True) -> None:
@@ -77,7 +99,7 @@ def _taken(host: str, port: int, reason: object) -> InputError:
 
 
 @contextlib.contextmanager
-def _guarded(host: str) -> Iterator[list[bool]]:
+def _guarded(host: str, asked: Callable[[int], object]) -> Iterator[list[bool]]:
     """Servers that are started inside check each request's Host and Origin; the list is empty if none was started.
 
     viser has no place for such a check. Without it any page of the web that this browser shows could reach the server, by its
@@ -93,9 +115,13 @@ def _guarded(host: str) -> Iterator[list[bool]]:
         def checked(connection: Any, request: Any) -> Any:
             try:
                 check_host(request.headers.get("Host"), host)
-                check_origin(request.headers)
+                if not _is_visit(request):
+                    check_origin(request.headers)
             except Refused as refused:
                 return connection.respond(refused.status, "Open the address that neuspring play printed.\n")
+            frame = asked_frame(request.path)
+            if frame is not None:
+                asked(frame)
             return process_request(connection, request)
 
         return original(*arguments, process_request=checked, **options)

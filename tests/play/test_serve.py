@@ -125,3 +125,28 @@ def test_a_saved_recording_is_compared_and_names_its_twin(page, capsys):
     assert main(["play", folder, "--replay", str(saved), "--compare"]) == 2
     assert "must be among the runs" in capsys.readouterr().err
     assert json.dumps(folder) not in said
+
+
+LINK = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+
+
+@pytest.mark.parametrize(("path", "answer", "frames"), [("/?frame=5", 200, [5]), ("/", 200, []), ("/?frame=-1", 403, [])])
+def test_a_link_of_a_report_opens_a_frame(path, answer, frames):
+    asked: list[int] = []
+    one = start("127.0.0.1", 0, asked.append)
+    try:
+        assert status(one, path, **LINK) == answer
+        assert asked == frames
+    finally:
+        one.stop()
+
+
+@pytest.mark.parametrize("path", ["/?websocket=ws://evil.example", "/?frame=1&websocket=ws://evil.example", "/assets/x.js"])
+def test_a_link_of_another_site_opens_nothing_else(server, path):
+    assert status(server, path, **LINK) == 403
+
+
+@pytest.mark.parametrize("changes", [{"Sec-Fetch-Dest": "iframe"}, {"Sec-Fetch-Mode": "no-cors"}])
+def test_a_page_of_another_site_shows_no_frame_of_it(server, changes):
+    assert status(server, "/?frame=5", **(LINK | changes)) == 403
+    assert status(server, "/", **(LINK | UPGRADE)) == 403

@@ -1,0 +1,89 @@
+"""A recorded interaction as a video: what is drawn, where, and what is refused."""
+
+import av
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.errors import InputError
+from neuspring.play.controls import Controls
+from neuspring.play.film import HAND, _camera, write_film
+from neuspring.play.results import find
+from tests.support.played import dressed, results
+
+FRAMES, NODE = 5, 4
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return results(tmp_path)
+
+
+def pulled(run, height: float = 0.3) -> Controls:
+    """A pull upwards."""
+    nodes, hands = run.twin.topology.nodes, run.twin.topology.controllers
+    target = nodes[NODE] + np.linspace(0, 1, FRAMES)[:, None] * np.array([0, 0, height])
+    return Controls(
+        hands=np.tile(hands, (FRAMES, 1, 1)),
+        grabbed=np.full(FRAMES, NODE),
+        target=target,
+        scenario="small",
+        method=run.method,
+        seed=run.seed,
+        twin_digest=run.twin_digest,
+    )
+
+
+def read(path) -> np.ndarray:
+    """The pictures of a video [F, H, W, 3]."""
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def test_a_recording_is_written_as_a_video(scenario, tmp_path, capsys):
+    found = find([scenario])
+    pulled(found.runs[-1]).save(tmp_path / "controls.npz")
+    wanted = tmp_path / "film.mp4"
+    assert main(["play", str(scenario), "--replay", str(tmp_path / "controls.npz"), "--video", str(wanted)]) == 0
+    assert f"{FRAMES + 1} frames, nodes and springs" in capsys.readouterr().out
+    pictures = read(wanted)
+    assert pictures.shape == (FRAMES + 1, 720, 960, 3)
+    assert (pictures[0] < 200).any(axis=2).mean() > 0.002 and (pictures[0] != pictures[-1]).mean() > 0.001
+
+
+def test_a_run_with_splats_is_drawn_as_splats(scenario, tmp_path):
+    dressed(scenario)
+    found = find([scenario])
+    film = write_film(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4")
+    assert film.kind == "splats"
+    plain = results(tmp_path / "plain")
+    without = write_film(find([plain]), find([plain]).runs[-1], pulled(found.runs[-1]), tmp_path / "plain.mp4")
+    covered, points = ((read(path)[0] < 230).any(axis=2).mean() for path in (film.path, without.path))
+    assert covered > points > 0
+
+
+def test_the_hands_are_where_the_camera_sees_them(scenario, tmp_path):
+    found = find([scenario])
+    run = found.runs[-1]
+    write_film(found, run, pulled(run), tmp_path / "film.mp4")
+    view = _camera(found, run.twin, None)
+    ((x, y),) = np.round(view.project(run.twin.topology.controllers[:1].astype(float))[0]).astype(int)
+    assert np.abs(read(tmp_path / "film.mp4")[0][y, x].astype(int) - HAND).max() < 60
+
+
+def test_a_camera_that_is_not_there_is_named(scenario, tmp_path):
+    found = find([scenario])
+    with pytest.raises(InputError, match="must be a camera of the capture"):
+        write_film(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4", "7")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize("option", [["--compare"], ["--video", "film.mp4"], ["--camera", "0"]])
+def test_what_needs_a_recording_says_so(scenario, option, capsys):
+    assert main(["play", str(scenario), *option]) == 2
+    assert "Give it with --replay FILE" in capsys.readouterr().err
+
+
+def test_a_frame_that_is_not_there_is_refused(scenario, capsys):
+    assert main(["play", str(scenario), "--frame", "99"]) == 2
+    assert "has the frames 0 to 7" in capsys.readouterr().err
