@@ -10,7 +10,9 @@ import pytest
 from neuspring.core import provenance
 
 PACKAGE = Path(provenance.__file__).parents[1]
-FLOORS = "cli > export experiments play > stages > report > scores baselines > splats perception > data > twin > physics config > core"
+FLOORS = (
+    "cli > export experiments play > stages > report > scores baselines > splats perception > data > twin > physics config > core"
+)
 LIGHT = (
     "",
     ".config",

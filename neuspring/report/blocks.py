@@ -118,6 +118,8 @@ class Picture:
     paper: bool = False
     """Drawn for a white page."""
     size: tuple[int, int] = (0, 0)
+    frames: Sequence[tuple[str, str]] = ()
+    """Text and address of frames in the playground."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +156,8 @@ class Code:
 
     kind: ClassVar[str] = "code"
     text: str
+    whole: bool = False
+    """A click selects all of it, to be copied."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,7 +50,10 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     expected |= {"status": "ok", "reason": "", "commit": "abc123", "data_digest": "d1", "device": "cpu", "logged": "complete"}
     expected |= {"variant.search": "uniform", "variant.fit": "springs", "variant.clusters": "4", "variant.frozen": "False"}
     expected |= {"run_key": json.loads(record.read_text())["run_key"]}
+    # The tag is for copying; the description is what MLflow's page shows first.
+    expected |= {"play": f"neuspring play {record.parent}"}
     assert expected.items() <= run.data.tags.items()
+    assert f"\nneuspring play {record.parent}\n" in run.data.tags["mlflow.note.content"]
     assert "superseded_by" not in run.data.tags
     assert len(run.data.params) == 122
     assert (run.data.params["fit.p7"], run.data.params["fit.betas"], len(run.data.params["long"])) == ("7", "[0.9, 0.99]", 500)

@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 
 from neuspring import config
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.report import gallery
-from neuspring.report.page import Options, studies, write
+from neuspring.report.figures.run import chosen_frames
+from neuspring.report.page import Options, playing, studies, write
 from neuspring.report.page.prose import render
 from neuspring.report.page.words import duration, hours, signed
 from neuspring.scores import paper
@@ -115,10 +117,28 @@ def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
     assert [name for name, count in parser.ids.items() if name and count > 1] == []
     inside = [target for target in parser.targets if target.startswith("#")]
     assert {target[1:] for target in inside} <= set(parser.ids)
-    others = [target for target in parser.targets if not target.startswith(("#", "data:"))]
+    # The playground answers on the reader's own machine, and only where a link is followed.
+    others = [target for target in parser.targets if not target.startswith(("#", "data:", f"{playing.ADDRESS}?frame="))]
     # Links to files beside the page, which are there.
     assert others and all((full / target).exists() for target in others)
-    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/)", page)
+    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/|127\.0\.0\.1:8080/\?frame=\d+\")", page)
+
+
+def test_pictures_lead_to_their_frames_in_the_player_and_a_command_opens_it(page, full):
+    runs = " ".join(str(full / "rope" / method / "0") for method in ("baseline", "neuspring"))
+    assert f'<pre tabindex="0" class="whole">neuspring play {runs}</pre>' in page
+    frames = [
+        int(frame) for frame in re.findall(r'href="http://127\.0\.0\.1:8080/\?frame=(\d+)" target="player">frame \1</a>', page)
+    ]
+    facts = Observations.load(full / "rope" / "observations.npz").scenario
+    assert set(frames) == set(chosen_frames(facts, facts.frame_count))
+
+
+def test_without_observations_pictures_lead_nowhere(tmp_path):
+    results = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0])
+    (results / "rope" / "observations.npz").unlink()
+    text = report(results)
+    assert 'target="player"' not in text and "neuspring play" in text
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")

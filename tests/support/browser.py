@@ -42,8 +42,8 @@ def chromium() -> str | None:
 class Browser:
     """`with Browser() as browser:`; pages are opened without network, or with `served=True` from this machine alone."""
 
-    def __init__(self, *, served: bool = False, webgl: bool = False) -> None:
-        self._served, self._webgl = served, webgl
+    def __init__(self, *, served: bool = False, webgl: bool = False, patience: float = PATIENCE) -> None:
+        self._served, self._webgl, self._patience = served, webgl, patience
 
     def __enter__(self) -> Self:
         program = chromium()
@@ -100,7 +100,7 @@ class Browser:
 
     def _message(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
-            ready, _, _ = select.select([self._read], [], [], PATIENCE)
+            ready, _, _ = select.select([self._read], [], [], self._patience)
             assert ready, "the browser does not answer"
             part = os.read(self._read, 1 << 20)
             assert part, "the browser has ended"
@@ -182,6 +182,7 @@ class Browser:
         """The window as PNG, or from `top` on, CSS pixels, beyond the window."""
         size = self.run("[document.documentElement.clientWidth, document.documentElement.scrollHeight]")
         clip = {"x": 0, "y": top or 0, "width": size[0], "height": min(height, size[1]), "scale": 1}
-        options: dict[str, Any] = {"format": "png", "captureBeyondViewport": True}
+        # A scene that is drawn by software is not drawn again for a picture of the window alone.
+        options: dict[str, Any] = {"format": "png", "captureBeyondViewport": top is not None or not self._webgl}
         answer = self.call("Page.captureScreenshot", **options, clip=clip)
         path.write_bytes(base64.b64decode(answer["data"]))

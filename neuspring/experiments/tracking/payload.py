@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -56,7 +57,7 @@ def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
     metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
     for name in {point.name for point in metrics}:
         _checked_name(run_json, name)
-    return Payload(tags=_tags(record), params=_params(record, run_json), metrics=metrics, files=files)
+    return Payload(tags=_tags(record) | _player(folder), params=_params(record, run_json), metrics=metrics, files=files)
 
 
 def milliseconds(time: str) -> int:
@@ -76,6 +77,13 @@ def _tags(record: RunRecord) -> dict[str, str]:
     if record.commit:
         tags["mlflow.source.git.commit"] = record.commit  # MLflow's pages show this one as the version
     return {name: cut(value, TAG_LENGTH) for name, value in tags.items()}
+
+
+def _player(folder: Path) -> dict[str, str]:
+    """How to look at the run and pull its twin: as a tag, and in the description on MLflow's page."""
+    command = shlex.join(["neuspring", "play", str(folder)])
+    about = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
+    return {"play": cut(command, TAG_LENGTH), "mlflow.note.content": cut(about, TAG_LENGTH)}
 
 
 def _params(record: RunRecord, where: Path) -> list[tuple[str, str]]:

@@ -57,12 +57,21 @@ class Media:
         """Files that were embedded."""
         return len(self._embedded)
 
-    def picture(self, path: Path, caption: str, alt: str, *, wide: bool = False, paper: bool = False) -> Picture:
+    def picture(
+        self,
+        path: Path,
+        caption: str,
+        alt: str,
+        *,
+        wide: bool = False,
+        paper: bool = False,
+        frames: Sequence[tuple[str, str]] = (),
+    ) -> Picture:
         """A picture, or a link if it did not fit."""
         file = self._embedded.get(path)
         if file:
-            return Picture(caption=caption, alt=alt, data=file.uri, size=file.size, wide=wide, paper=paper)
-        return Picture(caption=caption, alt=alt, link=self.link(path), reason=self.damaged.get(path, NO_ROOM))
+            return Picture(caption=caption, alt=alt, data=file.uri, size=file.size, wide=wide, paper=paper, frames=frames)
+        return Picture(caption=caption, alt=alt, link=self.link(path), reason=self.damaged.get(path, NO_ROOM), frames=frames)
 
     def video(self, path: Path, caption: str, *, wide: bool = False) -> Video:
         """A video, or a link if it did not fit."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuspring.report.blocks import Block, Fold, Grid, Section, Text
+from neuspring.report.blocks import Block, Code, Fold, Grid, Section, Text
+from neuspring.report.page import playing
 from neuspring.report.page.media import Media, Wanted
 from neuspring.report.page.sources import Material, Run
 from neuspring.report.page.words import several
@@ -23,16 +25,19 @@ class Kind:
     """Drawn for a white page."""
     least: int = 40
     """Least width in the page, rem."""
+    frames: bool = False
+    """Shows the frames that `playing.links` names."""
 
 
 KINDS = (
-    Kind(artifact="images", stem="images", title="Observed, predicted, difference", width=1100, paper=False),
+    Kind(artifact="images", stem="images", title="Observed, predicted, difference", width=1100, paper=False, frames=True),
     Kind(
         artifact="plots",
         stem="motion",
         title="Motion: predicted nodes and observed points",
         width=1200,
         paper=True,
+        frames=True,
     ),
     Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
     Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
@@ -61,18 +66,22 @@ def section(material: Material, media: Media) -> Section:
     folds: list[Block] = []
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
-        blocks = _scenario(runs, media)
+        blocks = _scenario(runs, media, playing.links(material, scenario))
         if blocks:
+            blocks.append(Code(text=playing.command(material, runs.values()), whole=True))
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
             folds.append(Fold(summary=summary, blocks=blocks, open=not folds))
     if not folds:
         return Section(key="pictures", title="Pictures", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
-    about = "One seed of every scenario, methods side by side. Blue bars stand for training frames, orange ones for the future."
+    about = (
+        "One seed of every scenario, methods side by side. Blue bars stand for training frames, orange ones for the future. The "
+        "command below a scenario's pictures opens its twins in the browser, to be turned and pulled; links to frames lead there."
+    )
     return Section(key="pictures", title="Pictures", about=about, blocks=folds)
 
 
-def _scenario(runs: dict[str, Run], media: Media) -> list[Block]:
+def _scenario(runs: dict[str, Run], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
     blocks: list[Block] = []
     for kind in KINDS:
         figures: list[Block] = []
@@ -80,7 +89,8 @@ def _scenario(runs: dict[str, Run], media: Media) -> list[Block]:
             path = run.file(kind.artifact, kind.stem)
             if path is not None:
                 alt = f"{kind.title}: {run.scenario}, {method}, seed {run.seed}"
-                figures.append(media.picture(path, method, alt, wide=True, paper=kind.paper))
+                shown = frames if kind.frames else ()
+                figures.append(media.picture(path, method, alt, wide=True, paper=kind.paper, frames=shown))
         if figures:
             # The first kind that there is can be seen at once.
             blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=figures, least=kind.least)], open=not blocks))

@@ -1,0 +1,49 @@
+"""The mouse over a scene that viser draws: where a point is in the window, and drags that are held."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.support.browser import Browser
+
+WINDOW = (1200, 800)
+STEPS = 15
+
+
+def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
+    """The value once it is true; a busy machine draws slowly."""
+    end = time.monotonic() + seconds
+    while not (value := what()):
+        assert time.monotonic() < end, "it did not come true"
+        time.sleep(0.05)
+    return value
+
+
+def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
+    """Where a point [3] is in the window."""
+    local = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
+    focal = WINDOW[1] / 2 / np.tan(camera.fov / 2)
+    return WINDOW[0] / 2 + focal * local[0] / local[2], WINDOW[1] / 2 + focal * local[1] / local[2]
+
+
+@contextmanager
+def pull(browser: Browser, x: float, y: float, right: float, down: float) -> Iterator[None]:
+    """Hold the left button from a place on, moved by so many pixels, while the block runs."""
+    press(browser, x, y, right, down)
+    yield
+    browser._mouse("mouseReleased", x + right, y + down, 0)
+
+
+def press(browser: Browser, x: float, y: float, right: float, down: float) -> None:
+    """Press the left button, and move the mouse."""
+    browser._mouse("mouseMoved", x, y, 0)
+    browser._mouse("mousePressed", x, y, 0)
+    for step in range(1, STEPS + 1):
+        browser._mouse("mouseMoved", x + right * step / STEPS, y + down * step / STEPS, 0, buttons=1)
+        time.sleep(0.05)
