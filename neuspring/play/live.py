@@ -157,7 +157,11 @@ class Live:
                 self.factor = self.rate * frame_time
             # A slow machine falls behind, and does not hurry later.
             due = max(due + frame_time, time.monotonic())
-            self._stop.wait(max(due - time.monotonic(), 0.001))
+            self._wait(due - time.monotonic())
+
+    def _wait(self, seconds: float) -> None:
+        """Let real time pass before the next frame, and other threads work."""
+        self._stop.wait(max(seconds, 0.001))
 
     def _restart(self) -> None:
         self._again.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from html import escape
@@ -30,6 +31,8 @@ PARTS = {
     "images": "Camera images",
 }
 KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin."
+OPENING = math.radians(45)
+"""Vertical angle of view."""
 SMALL = "margin:0 .8em;font-size:.8em"
 MARKS = (
     ("#00965a", "observed points"),
@@ -49,6 +52,8 @@ class Page:
         self.server, self.found = server, found
         scenario = found.observations.scenario
         server.scene.set_up_direction(scenario.up)
+        # Beside the scene, not over it.
+        server.gui.main_panel.dock_right()
         self.player = Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
         self._alive, self._before = False, self.player.look.quantity
@@ -56,10 +61,16 @@ class Page:
         server.gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
         )
-        self._time()
-        self._runs()
-        self._shown()
-        self.panel = LivePanel(server, self.player, save_to, self._lived)
+        self._springs()
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Recording"):
+            self._time()
+            self._runs()
+        with tabs.add_tab("Show"):
+            self._shown()
+        with tabs.add_tab("Live"):
+            self.panel = LivePanel(server, self.player, save_to, self._lived)
+        self._changed()
         self._keys()
         self._thread = threading.Thread(target=self._tick, name="clock", daemon=True)
         self._thread.start()
@@ -73,7 +84,14 @@ class Page:
     def _look_at(self) -> None:
         """The first view: all shown runs, across the row in which they stand."""
         camera = self.server.initial_camera
-        camera.up, camera.look_at, camera.position = self.player.view()
+        camera.fov = OPENING
+        camera.up, camera.look_at, camera.position = self.player.view(OPENING)
+
+    def _springs(self) -> None:
+        gui = self.server.gui
+        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self.player.look.quantity)
+        self.legend = gui.add_html("")
+        self.quantity.on_update(lambda _: self._changed())
 
     def _time(self) -> None:
         gui, clock = self.server.gui, self.player.clock
@@ -108,18 +126,13 @@ class Page:
         gui, look = self.server.gui, self.player.look
         absent = self._absent()
         self.parts: dict[str, Any] = {}
-        with gui.add_folder("Show"):
-            for name, title in PARTS.items():
-                hint = absent.get(name)
-                self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
-            self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=look.quantity)
-            self.legend = gui.add_html("")
-            marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
-            gui.add_html(f"<div style='{SMALL};columns:2'>{marks}</div>")
+        for name, title in PARTS.items():
+            hint = absent.get(name)
+            self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
+        marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
+        gui.add_html(f"<div style='{SMALL};margin-top:.6em'>{marks}</div>")
         for box in self.parts.values():
             box.on_update(lambda _: self._changed())
-        self.quantity.on_update(lambda _: self._changed())
-        self._changed()
 
     def _absent(self) -> dict[str, str]:
         """Part -> why it cannot be shown."""

@@ -31,18 +31,17 @@ class LivePanel:
         self._lock = threading.RLock()
         names = [run.name for run in player.found.runs if run.twin_path is not None]
         gui = server.gui
-        with gui.add_folder("Live"):
-            if not names:
-                gui.add_markdown("No run here has a twin, so there is nothing to pull.")
-                return
-            self.twin = gui.add_dropdown("Twin", tuple(names))
-            self.frame = gui.add_slider("From frame", 0, player.clock.count - 1, 1, 0, hint=FROM)
-            self.repeat = gui.add_checkbox("Hands repeat the recording", False, hint=REPEAT)
-            self.switch = gui.add_button("Start", hint=DRAG)
-            self.again = gui.add_button("Reset", disabled=True)
-            self.save = gui.add_button("Save recording", disabled=True, hint="What was done since the last reset")
-            self.most = gui.add_slider("Red above", 0.05, 2.0, 0.05, TOO_MUCH, hint="strain l / l0 − 1")
-            self.text = gui.add_html("")
+        if not names:
+            gui.add_markdown("No run here has a twin, so there is nothing to pull.")
+            return
+        self.twin = gui.add_dropdown("Twin", tuple(names))
+        self.frame = gui.add_slider("From frame", 0, player.clock.count - 1, 1, 0, hint=FROM)
+        self.repeat = gui.add_checkbox("Hands repeat the recording", False, hint=REPEAT)
+        self.switch = gui.add_button("Start", hint=DRAG)
+        self.again = gui.add_button("Reset", disabled=True)
+        self.save = gui.add_button("Save recording", disabled=True, hint="What was done since the last reset")
+        self.most = gui.add_slider("Red above", 0.05, 2.0, 0.05, TOO_MUCH, hint="strain l / l0 − 1")
+        self.text = gui.add_html("")
         self.switch.on_click(lambda _: self.stop() if self.live else self.start(self.twin.value))
         self.again.on_click(lambda _: self._reset())
         self.save.on_click(lambda _: self._save())

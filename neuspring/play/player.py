@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ from neuspring.play.tracked import Tracked
 if TYPE_CHECKING:
     import viser
 
+ROOM = 1.1
+"""The first view shows so much of what the runs fill."""
 SAMPLES = 12
 """Frames that the range of strain and force is taken from."""
 MOST_SHOWN = 8
@@ -122,12 +125,14 @@ class Player:
         """Where a run stands: beside the others along y, the first one where it was observed."""
         return (0.0, index * self.look.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
 
-    def view(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Up [3], the middle of the shown runs [3], m, and from where all of them are seen [3], m."""
+    def view(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Up [3], the middle of the shown runs [3], m, and from where all are seen [3], m, with an angle of view, rad."""
         sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
         last = np.array(self.offset(max(min(len(self.look.shown), MOST_SHOWN) - 1, 0)))
         middle, reach = 0.5 * (self.low + self.high + last), self.size + float(np.linalg.norm(last))
-        return np.array([0.0, 0.0, sign]), middle, middle + 0.8 * reach * np.array([1.0, -0.35, 0.45 * sign])
+        way = np.array([1.0, -0.35, 0.45 * sign])
+        distance = ROOM * 0.5 * reach / math.tan(opening / 2)
+        return np.array([0.0, 0.0, sign]), middle, middle + distance * way / np.linalg.norm(way)
 
     def draw(self) -> None:
         """Show the clock's frame."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import viser
 
 SEEN, TRACK, CAMERA = (0, 150, 90), (150, 0, 200), (60, 60, 60)
+FRUSTUM = 0.12
+"""Length of a camera's pyramid as a part of the scene's size."""
 WIDEST = 480
 """Pixels: larger images are made smaller before they are sent."""
 
@@ -43,7 +45,7 @@ class Surroundings:
                 f"/cameras/{name}",
                 fov=float(2 * np.arctan2(camera.height / 2, camera.intrinsics[1, 1])),
                 aspect=camera.width / camera.height,
-                scale=0.25 * size,
+                scale=FRUSTUM * size,
                 color=CAMERA,
                 thickness=1.5,
                 thickness_units="screen",

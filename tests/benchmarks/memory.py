@@ -13,6 +13,11 @@ def peak_mib() -> float:
     return _status("VmHWM")
 
 
+def resident_mib() -> float:
+    """Resident memory now, MiB."""
+    return _status("VmRSS")
+
+
 def reset_peak() -> None:
     """Count the peak from now on."""
     Path("/proc/self/clear_refs").write_text("5")

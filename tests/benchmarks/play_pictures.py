@@ -22,6 +22,9 @@ from tests.support.pointing import WINDOW, pixel, pull, until
 QUALITY = 82
 """Of JPEG."""
 PATIENCE = 900.0
+SECONDS = 20
+"""That a picture is given."""
+CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach((one) => one.click())"
 
 
 def main() -> None:
@@ -47,35 +50,37 @@ def main() -> None:
 
 def recording(page: Page, browser: Browser, output: Path) -> None:
     """Springs by stiffness, then splats, in a future frame."""
-    page.show(found_frame(page))
-    settle(page)
+    browser.run(CLOSE_NOTES)
+    page.show(future_frame(page))
+    settle()
     save(browser, output / "recording.jpg")
+    browser.run(press_tab("Show"))
     change(page, splats=True, nodes=False, springs=False, points=False)
-    settle(page)
+    settle()
     save(browser, output / "splats.jpg")
     change(page, splats=False, nodes=True, springs=True, points=False)
 
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
     """A twin that is pulled too far."""
-    name = page.player.look.shown[0]
-    page.panel.start(name)
+    browser.run(press_tab("Live"))
+    page.panel.start(page.player.look.shown[0])
     one = page.panel.live
     assert one is not None
     until(lambda: one.simulator.frame > 5, PATIENCE)
     camera = next(iter(server.get_clients().values())).camera
     x = one.simulator.positions
     node = int(np.argmax(x[:, 2]))
-    with pull(browser, *pixel(camera, x[node]), 150, -170):
+    with pull(browser, *pixel(camera, x[node]), 120, -150):
         until(lambda: one.simulator.grabbed >= 0, PATIENCE)
         begun = one.simulator.frame
         until(lambda: one.simulator.frame > begun + 25, PATIENCE)
-        time.sleep(3)
+        settle()
         save(browser, output / "live.jpg")
     page.panel.stop()
 
 
-def found_frame(page: Page) -> int:
+def future_frame(page: Page) -> int:
     """A frame some way behind the border."""
     clock = page.player.clock
     return min(clock.border + (clock.count - clock.border) // 2, clock.count - 1)
@@ -88,9 +93,14 @@ def change(page: Page, **parts: bool) -> None:
     page._changed()
 
 
-def settle(page: Page) -> None:
+def settle() -> None:
     """Wait until a browser that draws by software has drawn."""
-    time.sleep(8)
+    time.sleep(SECONDS)
+
+
+def press_tab(name: str) -> str:
+    """A script that opens a tab of the panel."""
+    return f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r}).click()"
 
 
 def save(browser: Browser, path: Path) -> None:

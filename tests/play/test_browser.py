@@ -1,10 +1,10 @@
-"""The playground in a real browser: it loads, it is scrubbed, and a twin is pulled with the mouse and swings back."""
+"""The playground in a real browser: it loads, switches change the scene, it is scrubbed, and a twin is pulled and swings back."""
 
-import time
+from contextlib import contextmanager
 
+import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 pytest.importorskip("viser", reason="the extra [play] is not installed")
 
@@ -13,64 +13,102 @@ from neuspring.play.results import find
 from neuspring.play.serve import address, start
 from tests.support.browser import Browser, chromium
 from tests.support.played import results
+from tests.support.pointing import WINDOW, pixel, press, pull, until
 
-WIDTH, HEIGHT = 1200, 800
+PATIENCE = 180.0
+RUN = "baseline/0"
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 
 
-def until(what, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "it did not come true"
-        time.sleep(0.05)
+def text(words: str) -> str:
+    """A script that tells whether the page says this."""
+    return f"document.body.innerText.includes({words!r})"
 
 
-def pixel(camera, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [3] is in the window."""
-    local = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
-    focal = HEIGHT / 2 / np.tan(camera.fov / 2)
-    return WIDTH / 2 + focal * local[0] / local[2], HEIGHT / 2 + focal * local[1] / local[2]
+def click(kind: str, words: str) -> str:
+    """A script that clicks the tab or checkbox of a name."""
+    if kind == "tab":
+        return f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {words!r}).click()"
+    label = f"[...document.querySelectorAll('label')].find((one) => one.textContent.trim() === {words!r})"
+    # The label and its box are in one row of the panel.
+    return f"let row = {label}; while (!row.querySelector('input')) row = row.parentElement; row.querySelector('input').click()"
 
 
-def test_the_page_is_scrubbed_and_a_drag_pulls_the_twin(tmp_path):
+@contextmanager
+def opened(folder):
+    """A page with one run, and a browser that shows it."""
     server = start("127.0.0.1", 0)
-    page = Page(server, find([results(tmp_path) / "baseline" / "0"]))
+    page = Page(server, find([results(folder) / "baseline" / "0"]))
     try:
-        with Browser(served=True, webgl=True) as browser:
-            browser.open(address(server), WIDTH, HEIGHT)
+        with Browser(served=True, webgl=True, patience=PATIENCE) as browser:
+            browser.open(address(server), *WINDOW)
             until(server.get_clients)
-            browser.wait("document.body.innerText.includes('training frame 0 of 7')")
-            before = page.player._bodies["baseline/0"].nodes.batched_positions.copy()
-            browser.key("ArrowRight")
-            browser.wait("document.body.innerText.includes('training frame 1 of 7')")
-            assert (page.player._bodies["baseline/0"].nodes.batched_positions != before).any()
-            page.panel.start("baseline/0")
-            live, camera = page.panel.live, next(iter(server.get_clients().values())).camera
-            until(lambda: live.simulator.frame > 30)
-            x, y = pixel(camera, live.simulator.positions[len(live.simulator.positions) // 2])
-            browser._mouse("mouseMoved", x, y, 0)
-            browser._mouse("mousePressed", x, y, 0)
-            for step in range(1, 16):
-                browser._mouse("mouseMoved", x, y - 6 * step, 0, buttons=1)
-                time.sleep(0.05)
-            until(lambda: live.simulator.grabbed >= 0)
-            node = live.simulator.grabbed
-            start_frame = live.simulator.frame
-            until(lambda: live.simulator.frame > start_frame + 30)
-            held = live.simulator.positions[node].copy()
-            browser._mouse("mouseReleased", x, y - 90, 0)
-            until(lambda: live.simulator.grabbed < 0)
-            after = live.simulator.frame
-            until(lambda: live.simulator.frame > after + 30)
-            assert np.linalg.norm(live.simulator.positions[node] - held) > 0.01
-            # A tab that is closed in the middle of a drag lets go.
-            x, y = pixel(camera, live.simulator.positions[node])
-            browser._mouse("mousePressed", x, y, 0)
-            for step in range(1, 10):
-                browser._mouse("mouseMoved", x, y - 6 * step, 0, buttons=1)
-                time.sleep(0.05)
-            until(lambda: live.hold.owner is not None)
-        until(lambda: live.hold.owner is None)
+            browser.wait(text("training frame 0 of 7"), PATIENCE)
+            yield server, page, browser
     finally:
         page.close()
         server.stop()
+
+
+def test_switches_change_what_is_drawn_and_scrubbing_moves_it(tmp_path):
+    with opened(tmp_path) as (server, page, browser):
+        body = page.player._bodies[RUN]
+        before = body.nodes.batched_positions.copy()
+        browser.key("ArrowRight")
+        browser.wait(text("training frame 1 of 7"), PATIENCE)
+        assert (body.nodes.batched_positions != before).any()
+        browser.key("End")
+        browser.wait(text("future frame 7 of 7"), PATIENCE)
+        # The address that a report links to.
+        assert page.player.clock.frame == 7
+        browser.run(click("tab", "Show"))
+        browser.wait(text("Observed points"), PATIENCE)
+        drawn = seen(browser, server, tmp_path / "before.png", lambda count: count > 500)
+        for part in ("Nodes", "Springs", "Observed points"):
+            browser.run(f"{{ {click('box', part)} }}")
+        until(lambda: not (body.nodes.visible or body.springs.visible or page.player.around.points.visible))
+        assert seen(browser, server, tmp_path / "after.png", lambda count: count < 0.6 * drawn)
+
+
+def seen(browser, server, path, enough) -> int:
+    """How many pixels of the scene have a color, once they are so many."""
+    wide = next(iter(server.get_clients().values())).camera.image_width
+
+    def count() -> int:
+        browser.screenshot(path)
+        scene = cv2.imread(str(path))[:, :wide].astype(int)
+        found = int((np.ptp(scene, axis=2) > 40).sum())
+        return found if enough(found) else 0
+
+    return until(count)
+
+
+def test_a_drag_pulls_the_twin_and_a_release_lets_it_swing(tmp_path):
+    with opened(tmp_path) as (server, page, browser):
+        page.panel.start(RUN)
+        live, camera = page.panel.live, next(iter(server.get_clients().values())).camera
+        until(lambda: live.simulator.frame > 30)
+        x, y = pixel(camera, live.simulator.positions[len(live.simulator.positions) // 2])
+        with pull(browser, x, y, 0, -90):
+            until(lambda: live.simulator.grabbed >= 0)
+            node, begun = live.simulator.grabbed, live.simulator.frame
+            until(lambda: live.simulator.frame > begun + 30)
+            held = live.simulator.positions[node].copy()
+            assert live.latency > 0
+        until(lambda: live.simulator.grabbed < 0)
+        released = live.simulator.frame
+        until(lambda: live.simulator.frame > released + 30)
+        assert np.linalg.norm(live.simulator.positions[node] - held) > 0.01
+        # A second browser sees the same, and may not take what the first one holds.
+        with Browser(served=True, webgl=True, patience=PATIENCE) as second:
+            second.open(address(server), *WINDOW)
+            until(lambda: len(server.get_clients()) == 2)
+            press(browser, *pixel(camera, live.simulator.positions[node]), 0, -60)
+            until(lambda: live.hold.owner is not None)
+            owner = live.hold.owner
+            assert not live.hold.take(owner + 1, "node", 0, live.simulator.positions[0])
+        until(lambda: len(server.get_clients()) == 1)
+        assert live.hold.owner == owner
+        # A tab that is closed in the middle of a drag lets go.
+        browser.call("Page.navigate", url="about:blank")
+        until(lambda: live.hold.owner is None)

@@ -26,10 +26,11 @@ def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
 
 
 def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [3] is in the window."""
+    """Where a point [3] is in the window, whose left part is the scene."""
     local = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
-    focal = WINDOW[1] / 2 / np.tan(camera.fov / 2)
-    return WINDOW[0] / 2 + focal * local[0] / local[2], WINDOW[1] / 2 + focal * local[1] / local[2]
+    wide, high = camera.image_width, camera.image_height
+    focal = high / 2 / np.tan(camera.fov / 2)
+    return wide / 2 + focal * local[0] / local[2], high / 2 + focal * local[1] / local[2]
 
 
 @contextmanager
