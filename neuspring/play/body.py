@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from neuspring.core.artifacts import Twin
-from neuspring.play.colors import OVER, Scale, Springs, node_colors
+from neuspring.play.colors import OVER, Scale, Springs, linear, node_colors
 from neuspring.play.dress import Dress
 from neuspring.report.figures.views import sample
 
@@ -74,7 +74,7 @@ class Body:
             colors = self.parts.paint(quantity, scale, strain)
             colors[strain > most] = OVER
             self.springs.points = ends
-            self.springs.colors = np.repeat(colors[:, None], 2, axis=1)
+            self.springs.colors = np.repeat(linear(colors)[:, None], 2, axis=1)
         return strain
 
     def mark(self, node: int | None) -> None:
@@ -83,7 +83,7 @@ class Body:
         if node is not None:
             colors = colors.copy()
             colors[node] = GRABBED
-        self.nodes.batched_colors = colors
+        self.nodes.batched_colors = linear(colors)
 
     def handles(self) -> Any:
         """Unseen balls about the nodes, large enough to be hit with a mouse."""
@@ -115,7 +115,7 @@ def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float,
         ball.faces,
         turns,
         np.asarray(centers, np.float32),
-        batched_colors=colors,
+        batched_colors=linear(np.asarray(colors, np.uint8)),
         opacity=opacity,
         lod="off",
         cast_shadow=False,

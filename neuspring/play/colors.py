@@ -106,6 +106,16 @@ def scale_of(quantity: str, bodies: Sequence[Springs], strains: Sequence[np.ndar
     return Scale("force Y (l / l0 − 1) (red: pulls)", -far, far, "N", DIVERGING)
 
 
+_CODES = np.arange(256) / 255
+LINEAR = np.asarray(255 * np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4) + 0.5, np.uint8)
+"""Linear light of each sRGB code (IEC 61966-2-1), of 255."""
+
+
+def linear(rgb: np.ndarray) -> np.ndarray:
+    """sRGB [..., 3] uint8 as viser takes the colors of single springs and nodes: it shows them as if they were linear light."""
+    return np.asarray(LINEAR[rgb])
+
+
 def strain_scale(far: float) -> Scale:
     """The colors of strains from -far to far."""
     return Scale("strain l / l0 − 1 (red: stretched)", -far, far, "1", DIVERGING)

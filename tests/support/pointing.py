@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.browser import Browser
 
-WINDOW = (1200, 800)
+WINDOW = (1100, 720)
 STEPS = 15
 
 
