@@ -17,7 +17,7 @@ from neuspring.play.page import Page
 from neuspring.play.results import find
 from neuspring.play.serve import address, start
 from tests.support.browser import Browser
-from tests.support.pointing import WINDOW, pixel, pull, until
+from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
 
 QUALITY = 82
 """Of JPEG."""
@@ -52,9 +52,11 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
     """Springs by stiffness, then splats, in a future frame."""
     browser.run(CLOSE_NOTES)
     page.show(future_frame(page))
+    # The page fades in at first.
+    settle()
     settle()
     save(browser, output / "recording.jpg")
-    browser.run(press_tab("Show"))
+    choose_tab(browser, "Show")
     change(page, splats=True, nodes=False, springs=False, points=False)
     settle()
     save(browser, output / "splats.jpg")
@@ -63,7 +65,7 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
     """A twin that is pulled too far."""
-    browser.run(press_tab("Live"))
+    choose_tab(browser, "Live")
     page.panel.start(page.player.look.shown[0])
     one = page.panel.live
     assert one is not None
@@ -96,11 +98,6 @@ def change(page: Page, **parts: bool) -> None:
 def settle() -> None:
     """Wait until a browser that draws by software has drawn."""
     time.sleep(SECONDS)
-
-
-def press_tab(name: str) -> str:
-    """A script that opens a tab of the panel."""
-    return f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r}).click()"
 
 
 def save(browser: Browser, path: Path) -> None:

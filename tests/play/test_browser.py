@@ -13,7 +13,7 @@ from neuspring.play.results import find
 from neuspring.play.serve import address, start
 from tests.support.browser import Browser, chromium
 from tests.support.played import results
-from tests.support.pointing import WINDOW, pixel, press, pull, until
+from tests.support.pointing import WINDOW, choose_tab, pixel, press, pull, until
 
 PATIENCE = 180.0
 RUN = "baseline/0"
@@ -25,13 +25,12 @@ def text(words: str) -> str:
     return f"document.body.innerText.includes({words!r})"
 
 
-def click(kind: str, words: str) -> str:
-    """A script that clicks the tab or checkbox of a name."""
-    if kind == "tab":
-        return f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {words!r}).click()"
+def switch(words: str) -> str:
+    """A script that clicks the checkbox of a name."""
     label = f"[...document.querySelectorAll('label')].find((one) => one.textContent.trim() === {words!r})"
     # The label and its box are in one row of the panel.
-    return f"let row = {label}; while (!row.querySelector('input')) row = row.parentElement; row.querySelector('input').click()"
+    up = "while (!row.querySelector('input')) row = row.parentElement; row.querySelector('input').click()"
+    return f"{{ let row = {label}; {up} }}"
 
 
 @contextmanager
@@ -61,11 +60,11 @@ def test_switches_change_what_is_drawn_and_scrubbing_moves_it(tmp_path):
         browser.wait(text("future frame 7 of 7"), PATIENCE)
         # The address that a report links to.
         assert page.player.clock.frame == 7
-        browser.run(click("tab", "Show"))
+        choose_tab(browser, "Show")
         browser.wait(text("Observed points"), PATIENCE)
         drawn = seen(browser, server, tmp_path / "before.png", lambda count: count > 500)
         for part in ("Nodes", "Springs", "Observed points"):
-            browser.run(f"{{ {click('box', part)} }}")
+            browser.run(switch(part))
         until(lambda: not (body.nodes.visible or body.springs.visible or page.player.around.points.visible))
         assert seen(browser, server, tmp_path / "after.png", lambda count: count < 0.6 * drawn)
 

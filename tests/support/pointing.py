@@ -33,6 +33,13 @@ def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
     return wide / 2 + focal * local[0] / local[2], high / 2 + focal * local[1] / local[2]
 
 
+def choose_tab(browser: Browser, name: str) -> None:
+    """Click a tab of the panel with the mouse; viser's tabs do not listen to a script's clicks."""
+    tab = f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r})"
+    box = browser.run(f"JSON.parse(JSON.stringify({tab}.getBoundingClientRect()))")
+    browser.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+
+
 @contextmanager
 def pull(browser: Browser, x: float, y: float, right: float, down: float) -> Iterator[None]:
     """Hold the left button from a place on, moved by so many pixels, while the block runs."""
