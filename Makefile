@@ -48,6 +48,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench
 	$(BIN)/python -m tests.benchmarks.bench_splats
 	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
+	$(BIN)/python -m tests.benchmarks.bench_play
 	$(BIN)/python -m tests.benchmarks.bench_workflow
 
 # Needs a GPU; `make gpu GPU_OPTIONS=--again` passes options. See tests/benchmarks/GPU.md.
