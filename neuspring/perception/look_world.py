@@ -10,12 +10,9 @@ from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.findings import Finding, finding
+from neuspring.data.plausible.things import place_findings
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
-SIZE = (0.03, 1.0)
-"""m: longest side of the object."""
-BELOW = 0.02
-"""m that a body on a table may reach below it, noise included."""
 VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
@@ -34,12 +31,11 @@ FASTEST = 5.0
 """m/s: no hand that manipulates is faster."""
 NODES = (30, 5000)
 """Structure points that can deform, and that a search can pay for."""
-TABLE = "Table, extrinsics or depth unit may be wrong: `neuspring check-data` looks at them."
 
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1."""
-    return [*_object(lifted, up), *_shape(prior), *_motion(lifted)]
+    return [*place_findings("object in frame 0", [lifted.cloud], up), *_shape(prior), *_motion(lifted)]
 
 
 def look_at_observations(observations: Observations) -> list[Finding]:
@@ -63,24 +59,6 @@ def look_at_observations(observations: Observations) -> list[Finding]:
         value = f"the object moves {1e3 * farthest:.1f} mm in the training frames"
         rule = f"at least {1e3 * STILL:g} mm are needed to learn from; `static` cannot be beaten"
         found.append(finding("object stands still", "warning", where, value, rule, "Film an interaction, or move the split."))
-    return found
-
-
-def _object(lifted: LiftedTracks, up: float) -> list[Finding]:
-    where, found = "object in frame 0", []
-    heights, size = up * lifted.cloud[:, 2], np.ptp(np.quantile(lifted.cloud, (0.01, 0.99), axis=0), axis=0)
-    lowest, highest = np.quantile(heights, (0.01, 0.99))
-    sides = " x ".join(f"{100 * side:.0f}" for side in size)
-    value = f"{sides} cm, from {100 * lowest:.1f} to {100 * highest:.1f} cm above the table"
-    rule = "as its pixels with depth show it"
-    found.append(finding("size of the object", "note", where, value, rule, "Is that what was filmed?"))
-    if not SIZE[0] <= size.max() <= SIZE[1]:
-        rule = f"{100 * SIZE[0]:g} to {100 * SIZE[1]:g} cm are expected"
-        remedy = f"Masks may show more or less than the object. {TABLE}"
-        found.append(finding("implausible size", "warning", where, f"{100 * size.max():.0f} cm long", rule, remedy))
-    if lowest < -BELOW:
-        value, rule = f"it reaches {-100 * lowest:.1f} cm below the table", f"at most {100 * BELOW:g} cm are noise"
-        found.append(finding("object below the table", "warning", where, value, rule, TABLE))
     return found
 
 
