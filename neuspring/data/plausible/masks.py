@@ -31,7 +31,7 @@ BORDERED = 0.1
 JUMP = 2.0
 """Ratio of the object's areas in neighboring frames: no body grows that fast."""
 STEP, STEPS, FEWEST = 1.5, 0.1, 3
-"""A smaller such ratio, and the part and the number of the frames with it from which a mask flickers: what is hidden once and comes back
+"""A smaller such ratio, and the part and number of frames with it from which a mask flickers: what is hidden once and comes back
 jumps twice."""
 FLOOR = 1e-4
 """Part of the image by which areas are enlarged before they are divided: a few pixels of a hidden object are no jump."""
