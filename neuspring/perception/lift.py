@@ -16,7 +16,7 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.controllers import choose_controllers
-from neuspring.perception.release import holding
+from neuspring.perception.release import Body, Holding, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
@@ -63,11 +63,12 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
-    in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    body = (objects.points, objects.visible)
-    holds = holding(controllers, (hands.points, hands.visible), body, in_view, capture.train_end, settings)
-    if len(holds):
-        facts |= {"controllers_let_go": float((~holds[-1]).sum()), "first_let_go": float(np.flatnonzero(~holds.all(axis=1))[0])}
+    holds = _holds(capture, cameras, labels, controllers, hands, objects, settings)
+    if len(holds.valid):
+        first = float(np.flatnonzero(~holds.valid.all(axis=1))[0])
+        facts |= {"controllers_let_go": float((~holds.valid).any(axis=0).sum()), "first_let_go": first}
+    if holds.elsewhere is not None:
+        facts["grip_elsewhere"] = float(holds.elsewhere)
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),
@@ -80,12 +81,36 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_motion_valid=valid,
         object_colours=objects.colours,
         controller_points=controllers,
-        controller_valid=holds,
+        controller_valid=holds.valid,
         cloud=cloud,
         cloud_colours=colors,
         backend="released" if settings.sequential_motion_filter else "vectorised",
         facts=facts,
     )
+
+
+def _holds(
+    capture: Capture,
+    cameras: Mapping[str, Camera],
+    labels: Mapping[str, np.ndarray],
+    controllers: np.ndarray,
+    hands: Seen,
+    objects: Seen,
+    settings: Lift,
+) -> Holding:
+    """When controllers hold. Depth is read again only if hands can let go."""
+    if settings.release is None:
+        return holding(controllers, (hands.points, hands.visible), Body([], objects.points, objects.visible), np.zeros(0), settings)
+    clouds = []
+    for frame in range(capture.train_end):
+        seen = [np.zeros((0, 3))]
+        for name, camera in cameras.items():
+            y, x = np.nonzero(labels[name][frame] == OBJECT)
+            if len(x):
+                seen.append(camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth(name, frame)[y, x]))
+        clouds.append(np.concatenate(seen))
+    in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
+    return holding(controllers, (hands.points, hands.visible), Body(clouds, objects.points, objects.visible), in_view, settings)
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from neuspring.core.findings import Finding, finding
+from neuspring.core.findings import Finding, Level, finding
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.plausible.masks import REMEDY, mask_findings
 from neuspring.data.plausible.things import Sample, depth_findings, hand_findings, sampled
@@ -25,6 +25,8 @@ TRACKS = 50
 """Points on the object in frame 0."""
 ALIVE = 0.1
 """Share of the points of frame 0 that are still followed."""
+OFTEN = 0.1
+"""Share of the frames with fewer, from which that is a warning: a rope that turns away from one camera for two frames is none."""
 
 
 def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
@@ -64,6 +66,7 @@ def look_at_tracks(camera: str, labels: np.ndarray, pixels: np.ndarray, visible:
     alive = visible[:, own].mean(axis=1)
     if low := np.flatnonzero(alive < ALIVE).tolist():
         value = f"{alive.min():.0%} of the object's points are followed in frame {int(alive.argmin())}; few in {len(low)} frames"
+        level: Level = "warning" if len(low) >= OFTEN * len(visible) else "note"
         remedy = f"Look at tracks.png; end the capture before frame {low[0]}, use more light or shorter exposures, or cotracker3."
-        found.append(finding("tracks lost", "warning", where, value, f"at least {ALIVE:.0%} are expected in every frame", remedy))
+        found.append(finding("tracks lost", level, where, value, f"at least {ALIVE:.0%} are expected in every frame", remedy))
     return found

@@ -82,6 +82,11 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
     if share < TRUSTED:
         value, rule = f"{share:.0%} of the object's motions are trusted", f"at least {TRUSTED:.0%} are expected"
         found.append(finding("motion not trusted", "warning", where, value, rule, remedy))
+    if "grip_elsewhere" in lifted.facts:
+        frame = int(lifted.facts["grip_elsewhere"])
+        value = f"in frame {frame} a hand comes back to another part of the object"
+        rule = "springs of hands are made for their place in frame 0, so nothing moves the twin there"
+        found.append(finding("grip elsewhere", "warning", "controllers", value, rule, f"End the capture before frame {frame}."))
     alive = lifted.object_visibility.mean(axis=1)
     if (low := np.flatnonzero(alive < ALIVE)).size:
         value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
@@ -113,9 +118,11 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
             finding("most controllers hold nothing", "note", where, value, rule, "perception.lift.grip: patch takes near ones.")
         )
     holds = observations.controller_valid
-    if len(holds) and (gone := int((~holds[-1]).sum())):
+    if len(holds) and (gone := int((~holds).any(axis=0).sum())):
         value = f"{gone} of {count} let go, first in frame {int(np.flatnonzero(~holds.all(axis=1))[0])}"
-        rule = "from then on their springs do not act (perception.lift.release)"
+        if (again := (holds[1:] & ~holds[:-1]).any(axis=1)).any():
+            value += f", and some take hold again, first in frame {int(again.argmax()) + 1}"
+        rule = "while they do not hold, their springs do not act (perception.lift.release)"
         found.append(finding("hands let go", "note", where, value, rule, "Is that what was filmed?"))
     if (moved := float(np.linalg.norm(controllers - controllers[0], axis=2).max())) < STILL:
         value, rule = f"they move {1e3 * moved:.1f} mm", f"at least {1e3 * STILL:g} mm are expected of hands that move an object"

@@ -179,6 +179,12 @@ def test_distrusted_motion_and_lost_points_are_said():
     assert "End the capture before frame 3." in said
 
 
+def test_a_hand_that_grips_elsewhere_is_said():
+    said = texts(look_at_lifted(replace(lifted(), facts={"grip_elsewhere": 3.0}), no_prior(), 1.0))
+    assert "warning: controllers: grip elsewhere: in frame 3 a hand comes back to another part of the object" in said
+    assert "End the capture before frame 3." in said
+
+
 def observed(hand: np.ndarray, step: np.ndarray, rate: float = 30.0, follows: bool = True) -> Observations:
     """A box of points and three controllers at `hand`, which move by `step` per frame; the box with them if it follows."""
     motion = np.arange(FRAMES)[:, None, None] * step

@@ -133,5 +133,7 @@ def _at_border(shown: Shown, say: Callable[..., None]) -> None:
     cut = shown.frames[shown.rims[shown.frames] >= EDGE]
     if len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames)):
         value = f"the object touches the image border in {len(cut)} frames, first in frame {cut[0]}"
-        remedy = "Move the camera back, or keep other frames (make-capture --frames)."
+        remedy = (
+            "Is it the object? Then move the camera back, or keep other frames (make-capture --frames). If not, mark what it is."
+        )
         say("object at the border", value, "what is outside is neither seen nor carved", remedy)
