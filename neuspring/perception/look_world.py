@@ -17,8 +17,8 @@ VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
-TRUSTED = 0.2
-"""Share of motions that agree with their neighbors."""
+TRUSTED = 0.5
+"""Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
 ALIVE = 0.05
 """Share of the object's points that are seen in a frame."""
 GRIP = 0.04
@@ -77,9 +77,11 @@ def _shape(prior: ShapePrior) -> list[Finding]:
 
 
 def _motion(lifted: LiftedTracks) -> list[Finding]:
-    found, where, share = [], "lifted tracks", float(lifted.object_motion_valid[:-1].mean())
+    found, where = [], "lifted tracks"
+    both = lifted.object_visibility[:-1] & lifted.object_visibility[1:]
+    share = float(lifted.object_motion_valid[:-1].sum() / max(int(both.sum()), 1))
     remedy = "Look at tracks.png and lifted.png; perception.lift has neighbourhood and agreement."
-    if share < TRUSTED:
+    if both.any() and share < TRUSTED:
         value, rule = f"{share:.0%} of the object's motions are trusted", f"at least {TRUSTED:.0%} are expected"
         found.append(finding("motion not trusted", "warning", where, value, rule, remedy))
     if "grip_elsewhere" in lifted.facts:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -26,8 +28,8 @@ def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, f
         "frames_missing": float(len(labels) - len(frames)),
         "object_at_border": shown.bordered,
         "area_jumps": shown.steps,
-        "hands_to_object": float(np.median(areas[HANDS] / np.maximum(areas[OBJECT], 1.0))),
-        "hands_inside": float(np.median([_inside(labels[frame]) for frame in frames])),
+        "hands_to_object": _median(areas[HANDS] / np.maximum(areas[OBJECT], 1.0)),
+        "hands_inside": _median([_inside(labels[frame]) for frame in frames]),
         "flicker": _flicker(capture, camera, labels, frames),
     }
 
@@ -41,10 +43,15 @@ def shown_by(capture: Capture, camera: str, labels: np.ndarray) -> Shown:
     return shown
 
 
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """0 of none: a camera may have no frame."""
+    return float(np.median(values)) if len(values) else 0.0
+
+
 def _flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarray) -> float:
     """Pixels that change their label and not their color from one frame to the next, as part of object and hands."""
     flips = total = 0
-    for index in np.unique(np.linspace(0, max(len(frames) - 2, 0), min(PAIRS, len(frames) - 1)).astype(int)):
+    for index in np.unique(np.linspace(0, max(len(frames) - 2, 0), min(PAIRS, max(len(frames) - 1, 0))).astype(int)):
         here, there = frames[index], frames[index + 1]
         gray = [cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, int(k))), cv2.COLOR_RGB2GRAY) for k in (here, there)]
         still = cv2.blur(cv2.absdiff(*gray), (5, 5)) < STILL

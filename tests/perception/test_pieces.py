@@ -157,3 +157,6 @@ def test_a_single_frame_is_no_error(tmp_path):
     capture, labels = scene(tmp_path)
     one = Capture(capture.folder, replace(capture.description, frame_count=1))
     assert wrong(one, sort_pieces(one, "0", labels[:1], OpenCvSegmentation())) == []
+    camera = replace(capture.description.cameras[0], missing=tuple(range(FRAMES)))
+    none = Capture(capture.folder, replace(capture.description, cameras=(camera,)))
+    assert look_at_masks(none, "0", labels, mask_facts(none, "0", labels)) == []
