@@ -21,6 +21,8 @@ from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbours` is meant for. A longer one shows a surface in more pixels."""
+STRIDE = 3
+"""Of the pixels of object and hands each third says how near they are."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +102,20 @@ def _holds(
 ) -> Holding:
     """When controllers hold. Depth is read again only if hands can let go."""
     if settings.release is None:
-        return holding(controllers, (hands.points, hands.visible), Body([], objects.points, objects.visible), np.zeros(0), settings)
-    clouds = []
+        none = Body([], [], objects.points, objects.visible)
+        return holding(controllers, (hands.points, hands.visible), none, np.zeros(0), settings)
+    clouds: dict[int, list[np.ndarray]] = {OBJECT: [], HANDS: []}
     for frame in range(capture.train_end):
-        seen = [np.zeros((0, 3))]
-        for name, camera in cameras.items():
-            y, x = np.nonzero(labels[name][frame] == OBJECT)
-            if len(x):
-                seen.append(camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth(name, frame)[y, x]))
-        clouds.append(np.concatenate(seen))
+        depths = {name: capture.depth(name, frame) for name in cameras if capture.has(name, frame)}
+        for label, own in clouds.items():
+            seen = [np.zeros((0, 3))]
+            for name, depth in depths.items():
+                y, x = (values[::STRIDE] for values in np.nonzero(labels[name][frame] == label))
+                seen.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
+            own.append(np.concatenate(seen))
     in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    return holding(controllers, (hands.points, hands.visible), Body(clouds, objects.points, objects.visible), in_view, settings)
+    body = Body(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible)
+    return holding(controllers, (hands.points, hands.visible), body, in_view, settings)
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:

@@ -19,10 +19,12 @@ GUIDES = 5
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What is known of the object in the training frames."""
+    """What is known of the object, and what masks show of the hands, in the training frames."""
 
     clouds: Sequence[np.ndarray]
-    """What cameras see of it in each frame [P_t, 3], m."""
+    """What cameras see of the object in each frame [P_t, 3], m."""
+    hands: Sequence[np.ndarray]
+    """What cameras see of all hands in each frame [H_t, 3], m."""
     points: np.ndarray
     """Followed points [T, n, 3], m."""
     visible: np.ndarray
@@ -81,7 +83,11 @@ def holding(
         followed = seen[:, group].sum(axis=1) >= LEAST_FOR_POSE
         apart = np.full(len(points), np.nan)
         for frame in np.flatnonzero(followed[: len(body.clouds)]).tolist():
-            apart[frame] = body.nearest(frame, controllers[frame, members])
+            # Followed points lie anywhere on a hand, and of few of them the pose is rough: what masks show of it counts too.
+            pixels = body.hands[frame]
+            here = np.flatnonzero(seen[frame])
+            own = pixels[label[here[cKDTree(points[frame, here]).query(pixels)[1]]] == number] if len(pixels) else pixels
+            apart[frame] = body.nearest(frame, np.concatenate([controllers[frame, members], own]))
         for begin, end in _gaps(apart <= settings.release, apart > settings.release, in_view, settings.release_after):
             valid[begin:end, members] = False
             if end == len(points):
@@ -99,6 +105,8 @@ def _gaps(near: np.ndarray, away: np.ndarray, in_view: np.ndarray, patience: int
     """Frames [begin, end) in which a hand that was `near` [T] holds no more: until it is near again, or T."""
     gaps: list[tuple[int, int]] = []
     frames = np.flatnonzero(near).tolist()
+    if not frames:
+        return gaps
     for last, again in zip(frames, [*frames[1:], len(near)], strict=True):
         begin = _gone(last, again, away, in_view, patience)
         if begin < again and (again == len(near) or again - begin >= patience):

@@ -34,7 +34,7 @@ def scene(away: np.ndarray):
 def grips(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> Holding:
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
-    body = Body(list(bodies[:train_end]), bodies, changes.get("shown", shown))
+    body = Body(list(bodies[:train_end]), list(points[:train_end]), bodies, changes.get("shown", shown))
     return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, settings)
 
 
@@ -114,6 +114,19 @@ def test_no_hold_is_taken_after_the_training_frames():
     away[24:] = 0.0
     assert held(away)[24:].all()
     assert not held(away, train_end=22)[13:, :2].any()
+
+
+def test_a_hand_that_was_never_near_has_not_let_go():
+    assert held(np.full(FRAMES, 0.3)) is ALWAYS
+
+
+def test_a_hand_is_near_if_what_is_seen_of_it_is():
+    """The pose of the hand is lost, and its controllers with it; masks still show it at the body."""
+    points, seen, bodies, shown, in_view = scene(np.zeros(FRAMES))
+    controllers = points[:, [0, 3, 4]].copy()
+    controllers[12:, :2] += 0.4
+    body = Body(list(bodies), list(points), bodies, shown)
+    assert holding(controllers, (points, seen), body, in_view, SETTINGS).valid is ALWAYS
 
 
 def test_a_hand_out_of_view_lets_go_after_some_frames():
