@@ -123,8 +123,8 @@ def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
     segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
     said = capsys.readouterr().out
-    assert "the object's mask of frame 0 has 2 pieces far apart; two objects become one twin" in said
-    assert "no object in 2 frames, first in frame 4" in said
+    assert "the object's mask of frame 0 has 2 pieces far apart; one object is expected, whose pieces lie together" in said
+    assert "almost nothing of the object in 2 frames, first in frame 4" in said
     facts = StageRecord.load(tmp_path / "masks.json").facts
     assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
 

@@ -16,8 +16,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.document import Document
 from neuspring.perception.annotate.job import Job, Report
+from neuspring.perception.marks.marks import MARKS
 
-MARKS = "marks.json"
 MOST_MARKS = 2000
 """Marks of a camera: a limit for what a browser may send."""
 
@@ -80,7 +80,7 @@ class Masks:
             capture.folder / MARKS, lambda: method.load(capture), lambda marks: method.save(marks, capture)
         )
         self._results: dict[str, Result] = {}
-        self._lock = Lock()
+        self._lock, self._saving = Lock(), Lock()
 
     def plain(self) -> dict[str, Any]:
         """Marks with their revision, the job, and what was carried, as plain values."""
@@ -155,16 +155,19 @@ class Masks:
             results = dict(self._results)
         if not results:
             raise InputError("masks", "there must be masks to save", "none", "Carry the marks through the video first.")
-        for camera, result in results.items():
-            self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
-            with self._lock:
-                if self._results.get(camera) is result:
-                    self._results[camera] = replace(result, saved=True)
+        # Two tabs would write the same files, and the record of one of them would be lost.
+        with self._saving:
+            for camera, result in results.items():
+                self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
+                with self._lock:
+                    if self._results.get(camera) is result:
+                        self._results[camera] = replace(result, saved=True)
         return list(results)
 
     def saved_cameras(self) -> list[str]:
-        """Cameras with a mask of frame 0 in the capture."""
-        return [camera for camera in self.capture.cameras if self.capture.path("mask", camera, 0).exists()]
+        """Cameras with a mask in the capture."""
+        frames = range(self.capture.frame_count)
+        return [c for c in self.capture.cameras if any(self.capture.path("mask", c, frame).exists() for frame in frames)]
 
 
 def digest(values: dict[str, Any], camera: str) -> str:

@@ -52,11 +52,12 @@ class Server(ThreadingHTTPServer):
             super().__init__((host, port), Handler)
         except (OSError, OverflowError) as error:
             raise _unusable(host, port, error) from error
+        self.desk = Desk(capture, masks, Pointing(capture))
         try:
-            self.desk = Desk(capture, masks, Pointing(capture))
             self.desk.pointing.document.read()
         except InputError:
             self.server_close()
+            self.desk.pointing.close()
             raise
 
     @property
