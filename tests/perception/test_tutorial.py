@@ -151,10 +151,11 @@ def test_the_dry_run_tells_the_minutes_and_perception_makes_the_pictures(followe
 
 @pytest.mark.slow
 def test_the_run_ends_in_a_report_with_a_small_budget(followed):
-    """As the page has it, but for a search of 11 rollouts, a fit of 2 epochs, and splats of 40 iterations."""
+    """As the page has it, but with fewer methods, nodes, rollouts, epochs and iterations of splats."""
     project, _, _ = followed
     small = {"search": {"rollouts": 11}, "fit": {"epochs": 2}, "images": {"appearance": {"iterations": 40}}}
     small |= {"perception": {"sample": {"nodes": 150}}, "tracking": {"enabled": False}}
+    small |= {"methods": ["search_only", "neuspring"], "compare_with": "search_only"}
     (project / "small.yaml").write_text(yaml.safe_dump(small))
     [made] = shown("Make the twin")
     output = run(made, project, "small.yaml")
@@ -162,4 +163,5 @@ def test_the_run_ends_in_a_report_with_a_small_budget(followed):
     tables = project / "results" / "own" / "tables"
     for name in re.findall(r"`(?:results/own/tables/)?(\w+\.html)`", step("Read the report")):
         assert (tables / name).exists()
-    assert "neuspring" in (tables / "summary.md").read_text()
+    summary = (tables / "summary.md").read_text()
+    assert all(f"| {method} " in summary for method in ("static", "controller_lbs", "search_only", "neuspring"))

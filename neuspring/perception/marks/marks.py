@@ -97,13 +97,17 @@ class Marks:
         """The marks of one camera."""
         return self.cameras.get(camera, ())
 
-    def require(self, capture: Capture, where: object = MARKS) -> None:
-        """Check cameras, frames and points against a capture, and that some camera has an object. Raises InputError."""
+    def require(self, capture: Capture, where: object = MARKS, *, whole: bool = True) -> None:
+        """Check cameras, frames and points against a capture, and that each marked camera has an object. Raises InputError.
+
+        `whole`: they are all of the marks; while a user still draws, the object may come last.
+        """
         for name, marks in self.cameras.items():
             if name not in capture.cameras:
                 raise InputError(f"{where}, cameras.{name}", "the capture must have this camera", sorted(capture.cameras))
             camera = capture.cameras[name]
-            require_marks(marks, capture.frame_count, (camera.height, camera.width), f"{where}, cameras.{name}")
+            size = camera.height, camera.width
+            require_marks(marks, capture.frame_count, size, f"{where}, cameras.{name}", whole=whole)
             for mark in marks:
                 if not capture.has(name, mark.frame):
                     raise InputError(f"{where}, cameras.{name}", "marks must lie on frames that the camera has", mark.frame)
