@@ -54,7 +54,7 @@ def check_capture(folder: Path) -> list[Departure]:
         case.departures += view_departures(path, capture.cameras, first, description.up)
     case.load(folder / "tracks.json", lambda _: capture.tracks())
     if not description.masks:
-        message = "masks: false: masks are not checked; perception.segment needs another backend than given"
+        message = f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"
         case.departures.append(note(path, message))
     return case.departures
 

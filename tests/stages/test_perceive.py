@@ -110,7 +110,7 @@ def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp
 
 def test_given_masks_must_be_there(tmp_path):
     capture = film(tmp_path / "capture", cameras=1, masks=False)
-    with pytest.raises(InputError, match=r"backend: given needs masks: true.*Choose another backend: opencv"):
+    with pytest.raises(InputError, match=r"backend: given needs masks.*neuspring annotate .*: marks, opencv"):
         segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
 
 

@@ -135,10 +135,9 @@ class Masks:
             result = Result([encode(image) for image in labels], doubt, marks, digest(values, camera))
             with self._lock:
                 self._results[camera] = result
-        names = ", ".join(cameras)
-        return (
-            f"Carried {'camera' if len(cameras) == 1 else 'cameras'} {names}; {doubtful} doubtful frames. Look at them, then save."
-        )
+        names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
+        frames = f"{doubtful or 'no'} very doubtful frame{'' if doubtful == 1 else 's'}"
+        return f"Carried {names}; {frames}. Look at the frames that are listed, then save."
 
     def labels(self, camera: str, frame: int, source: str) -> np.ndarray | None:
         """Labels [H, W] of a frame, `carried` just now or `saved` in the capture; None where there are none."""

@@ -12,7 +12,8 @@ from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.marks import MARKS, Marks, frame_mask
+from neuspring.perception.marks import MARKS, Carried, Marks, frame_mask
+from neuspring.perception.marks.sheet import save_sheet
 from neuspring.perception.marks.store import Made, MadeCamera, carry_camera, film_of, save_masks, source_digest
 
 
@@ -58,8 +59,9 @@ class FromMarks:
         return carried.labels, carried.doubt
 
     def save_masks(self, capture: Capture, camera: str, labels: np.ndarray, doubt: np.ndarray, marks: Marks) -> None:
-        """Write mask/<camera>/, and what they were made from as `neuspring mask` does. Raises InputError."""
+        """Write mask/<camera>/, a picture to look at, and what they were made from, as `neuspring mask` does. Raises InputError."""
         save_masks(capture, camera, labels)
+        save_sheet(capture, camera, Carried(labels, doubt))
         source = source_digest(capture, camera, marks.of(camera), "marks", self.settings)
         made = MadeCamera(source=source, backend="marks", doubt=tuple(round(float(value), 4) for value in doubt))
         Made.of(capture).save(capture, camera, made)

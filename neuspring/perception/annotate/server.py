@@ -23,7 +23,7 @@ from neuspring.perception.annotate.masks import Masks, Method
 from neuspring.perception.annotate.pointing import Foreign, Pointing
 from neuspring.perception.annotate.routes import GET, POST, Desk
 
-SCRIPTS = ("api", "app", "edits", "masks", "messages", "paint", "pen", "timeline", "tracks", "view")
+SCRIPTS = ("api", "app", "doubt", "edits", "masks", "messages", "paint", "pen", "rows", "timeline", "tracks", "view")
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/style.css": ("style.css", "text/css; charset=utf-8"),

@@ -78,6 +78,10 @@ class Marks:
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file, every key, type and count checked. Raises InputError that lists each problem."""
+        if not Path(path).exists():
+            folder = Path(path).parent if Path(path).name == MARKS else "CAPTURE"
+            remedy = f"Draw them in the browser: `neuspring annotate {folder}`."
+            raise InputError(path, "marks of object and hands are required", "no such file", remedy)
         values = load_json(Path(path))
         if not isinstance(values, dict):
             raise InputError(path, "a JSON object is required", type(values).__name__)

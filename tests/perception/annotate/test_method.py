@@ -57,6 +57,7 @@ def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
     page.job.join()
     assert page.job.plain()["state"] == "done", page.job.plain()
     assert page.save() == ["0"]
+    assert (capture.folder / "mask_0.png").exists()
     later = Masks(capture, FromMarks()).plain()
     assert len(later["saved"]["0"]) == FRAMES
     assert Made.of(capture).cameras["0"].backend == "marks"
