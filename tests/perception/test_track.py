@@ -122,7 +122,7 @@ def test_a_point_beside_the_mask_belongs_to_the_nearest_label(video):
     capture, labels = video
     narrow = np.stack([cv2.erode(own, np.ones((13, 13), np.uint8)) for own in labels])
     y, x = np.nonzero(labels[0])
-    point = np.array([[x.min() + 5, (y.min() + y.max()) / 2]], np.float32)
+    point = np.array([[x.max() - 5, (y.min() + y.max()) / 2]], np.float32)
     start = np.concatenate([point, track_opencv.choose(narrow[0], 200, 0)])
     wide, tight = (track_opencv.follow(capture, "0", narrow, start, OpenCvTracking(rim=rim)) for rim in (4.0, 0.0))
     assert wide.visible[1, 0]
