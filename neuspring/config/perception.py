@@ -72,6 +72,8 @@ class OpenCvTracking(Section):
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
     """Smallest correlation of a patch that is found again with the point's patch of frame 0."""
+    rim: NonNegative = 0.0
+    """How far outside of its mask a point may lie, pixels, before it is lost: masks are off by pixels at tips and corners."""
 
 
 @dataclass(frozen=True, kw_only=True)
