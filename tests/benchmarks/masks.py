@@ -3,8 +3,8 @@
     python -m tests.benchmarks.masks plush FOLDER                     real RGBD film, marks in tests/data/marks
     python -m tests.benchmarks.masks captures FOLDER ...              synthetic captures; outlines of frame 0 stand in for a user
 
-FOLDER of `plush` has color/NUMBER.png, depth/NUMBER.png (mm) and masks_250_335. With --pictures FOLDER, frames with masks are drawn to
-look at. Real color film: `tests.benchmarks.footage`.
+FOLDER of `plush` has color/NUMBER.png, depth/NUMBER.png (mm) and masks_250_335. With --pictures FOLDER, frames with masks are drawn
+to look at. Real color film: `tests.benchmarks.footage`.
 """
 
 from __future__ import annotations
