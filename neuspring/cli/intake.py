@@ -75,7 +75,7 @@ def make_capture(a: Namespace) -> int:
     print(f"written: {capture.folder}\nnext:")
     print(f"  neuspring check-data {capture.folder}")
     if not capture.description.masks:
-        print(f"  neuspring mask {capture.folder}")
+        print(f"  neuspring annotate {capture.folder}")
     return 0
 
 

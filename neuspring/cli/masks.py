@@ -55,13 +55,14 @@ def mask(a: Namespace) -> int:
     for name in wanted:
         source = store.source_digest(capture, name, marks.of(name), a.backend, settings)
         if made.holds(capture, name, source) and not a.again:
-            print(f"camera {name}: marks, images and settings are unchanged; its masks are kept")
+            picture = sheet.sheet_of(capture, name)
+            print(f"camera {name}: marks, images and settings are unchanged; its masks are kept; look at {picture}")
         else:
             carried = _carry(capture, name, marks.of(name), a.backend, segmentation, a.device)
             store.save_masks(capture, name, carried.labels)
             doubt = tuple(round(float(value), 4) for value in carried.doubt)
             made = made.save(capture, name, store.MadeCamera(source=source, backend=a.backend, doubt=doubt))
-            picture = sheet.save_sheet(capture, name, carried, a.capture / f"mask_{name}.png")
+            picture = sheet.save_sheet(capture, name, carried)
             print(f"camera {name}: masks are in {a.capture / 'mask' / name}; look at {picture}")
         doubts = made.cameras[name].doubt
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]

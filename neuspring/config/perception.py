@@ -72,6 +72,8 @@ class OpenCvTracking(Section):
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
     """Smallest correlation of a patch that is found again with the point's patch of frame 0."""
+    rim: NonNegative = 0.0
+    """How far outside of its mask a point may lie, pixels, before it is lost: masks are off by pixels at tips and corners."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,10 +138,10 @@ class Lift(Section):
     grip_reach: Positive = 0.03
     """With `grip: patch`: how much farther from the object than a hand's nearest point its controllers may be in frame 0, m."""
     release: Positive | None = None
-    """Distance, m, between hand and object beyond which a hand has let go, if it does not come near again: its springs act no
-    more. null: hands hold to the end, as released."""
+    """Distance, m, between hand and object beyond which a hand has let go: its springs do not act. If it comes near the same part
+    of the object again, it takes hold again. null: hands hold to the end, as released."""
     release_after: Count = 10
-    """With `release`: frames without any hand in view after which hands have let go too."""
+    """With `release`: frames without any hand in view after which hands have let go too, and the fewest that a hand is away."""
     sequential_motion_filter: bool = False
     """Judge motions in the order of the points, each by the motions that were not dropped before it, as released."""
     coordinate_outliers: bool = False

@@ -33,9 +33,9 @@ class Finding:
         return f"{self.level}: {self.where}: {self.name}: {self.text}"
 
 
-def finding(name: str, level: Level, where: str, value: str, rule: str, remedy: str) -> Finding:
+def finding(name: str, level: Level, where: str, value: str, rule: str, remedy: str = "") -> Finding:
     """A finding whose text is `value` (what was received), the `rule`, and the next move."""
-    return Finding(name=name, level=level, where=where, text=f"{value}; {rule}. {remedy}")
+    return Finding(name=name, level=level, where=where, text=f"{value}; {rule}. {remedy}".rstrip())
 
 
 def told(findings: Sequence[Finding]) -> dict[str, Any]:

@@ -10,19 +10,23 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Description, description_departures, read_description
-from neuspring.data.departure import Departure, Inspection, broken, note, unusual
+from neuspring.data.capture import CAPTURE, OBJECT, Capture, Description, description_departures, read_description
+from neuspring.data.departure import Departure, Inspection, broken, note
 from neuspring.data.intake.plane import cloud, planes
 from neuspring.data.intake.units import FAR, FASTEST, NEAR, SLOWEST
-from neuspring.data.plausible.pieces import objects
+from neuspring.data.plausible.masks import Shown, mask_findings
 from neuspring.data.plausible.table import table_departures
-from neuspring.data.plausible.things import Sample, at_border, lifted, thing_departures
+from neuspring.data.plausible.things import (
+    Sample,
+    depth_findings,
+    hand_findings,
+    lifted,
+    place_findings,
+    reach_findings,
+    sampled,
+)
 from neuspring.data.plausible.views import view_departures
 
-SAMPLED = 5
-"""Frames per camera, evenly spaced, that are compared with the world."""
-LEAVES = 0.1
-"""Fraction of its area in frame 0 below which an object has left the view."""
 INSIDE, INSIDE_SHARE = 0.01, 0.05
 """m, and share of the object's points: deeper in an obstacle than depth cameras err, they are inside."""
 LEAST_AROUND = 0.1
@@ -50,7 +54,7 @@ def check_capture(folder: Path) -> list[Departure]:
         case.departures += view_departures(path, capture.cameras, first, description.up)
     case.load(folder / "tracks.json", lambda _: capture.tracks())
     if not description.masks:
-        message = "masks: false: masks are not checked; perception.segment needs another backend than given"
+        message = f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"
         case.departures.append(note(path, message))
     return case.departures
 
@@ -65,13 +69,12 @@ def rate_departures(path: Path, rate: float) -> list[Departure]:
 
 def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: bool) -> dict[int, Sample]:
     """Check every image of a camera, and a few frames against the world; returns these."""
-    depths, areas = [], np.zeros((3, capture.frame_count))
-    touching = np.full(capture.frame_count, np.nan)
+    view = capture.cameras[name]
+    depths, shown = [], Shown(capture.frame_count, (view.width, view.height))
     samples: dict[int, Sample] = {}
-    sampled = set(np.linspace(0, capture.frame_count - 1, SAMPLED).astype(int).tolist())
+    wanted = sampled(capture.frame_count)
     for frame in range(capture.frame_count):
         if not capture.has(name, frame):
-            areas[:, frame] = np.nan
             continue
         try:
             capture.colour(name, frame)
@@ -80,22 +83,21 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
             mask = np.zeros(depth.shape, np.uint8)
             if capture.description.masks:
                 mask = capture.mask(name, frame)
-                areas[:, frame] = np.bincount(mask.ravel(), minlength=3)[:3]
-                touching[frame] = at_border(mask)
-            if frame in sampled:
+                shown.see(frame, mask)
+            if frame in wanted:
                 samples[frame] = Sample(depth, mask)
         except InputError as error:
             case.departures.append(Departure.of_error(error))
     wrong = depth_departures(capture, name, depths)
     case.departures += wrong
     if calibrated and not wrong:
-        case.departures += _world_departures(capture, name, samples, touching)
-    if capture.description.masks:
-        case.departures += mask_departures(capture, name, areas)
+        case.departures += _world_departures(capture, name, samples)
+    masks = capture.folder / "mask" / name
+    case.departures += [Departure.of_finding(masks, one) for one in mask_findings(name, shown)]
     return samples
 
 
-def _world_departures(capture: Capture, name: str, samples: dict[int, Sample], touching: np.ndarray) -> list[Departure]:
+def _world_departures(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Departure]:
     """The table, and object and hands in the masks, of one camera."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
     is_counted = capture.description.depth_format == "png"
@@ -105,10 +107,16 @@ def _world_departures(capture: Capture, name: str, samples: dict[int, Sample], t
     enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
     found = planes(cloud(around, camera.intrinsics)) if enough else []
     departures = table_departures(path, name, found, camera.camera_to_world, up, unit)
-    if capture.description.masks:
-        departures += thing_departures(path, camera, samples, up, touching)
-    if 0 in samples:
-        departures += obstacle_departures(path, capture.description, lifted(camera, samples[0], OBJECT))
+    bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
+    findings = [
+        *depth_findings(camera, samples),
+        *place_findings(f"camera {name}, object", list(bodies.values()), 1.0 if up == "+z" else -1.0),
+        *hand_findings(camera, samples),
+        *reach_findings(camera, samples),
+    ]
+    departures += [Departure.of_finding(path, one) for one in findings]
+    if 0 in bodies:
+        departures += obstacle_departures(path, capture.description, bodies[0])
     return departures
 
 
@@ -136,25 +144,3 @@ def depth_departures(capture: Capture, name: str, medians: list[float]) -> list[
         rule = f"the median depth of camera {name} must lie between {NEAR:g} and {FAR:g} m, with the unit of the images"
         return [broken(path, "depth_unit", rule, f"{unit:g} m per count, which makes it {np.median(depths):.4g} m")]
     return []
-
-
-def mask_departures(capture: Capture, name: str, areas: np.ndarray) -> list[Departure]:
-    """Masks of frame 0 show object and hands, each object once; later frames still show the object."""
-    path, departures = capture.path("mask", name, 0), []
-    for label, thing in ((OBJECT, "the object"), (HANDS, "a hand")):
-        if areas[label, 0] == 0:
-            departures.append(unusual(path, "", f"camera {name} should show {thing} (label {label}) in frame 0", "no such pixel"))
-    if areas[OBJECT, 0]:
-        try:
-            count = objects(capture.mask(name, 0))
-        except InputError:
-            return departures
-        if count > 1:
-            departures.append(
-                unusual(path, "", "label 1 should be one object, whose pieces lie together", f"{count} pieces far apart")
-            )
-        gone = np.flatnonzero(areas[OBJECT] < LEAVES * areas[OBJECT, 0])
-        if len(gone):
-            rule = f"camera {name} should show the object throughout"
-            departures.append(unusual(path, "", rule, f"almost nothing of it in {len(gone)} frames, first in frame {gone[0]}"))
-    return departures

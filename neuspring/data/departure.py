@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neuspring.core.errors import InputError
+from neuspring.core.findings import Finding
 
 Level = Literal["error", "warning", "note"]
 
@@ -26,6 +27,11 @@ class Departure:
         """The error of a reader, or its text, which begins with the file."""
         file, _, message = str(error).partition(": ")
         return cls(Path(file), "error", message)
+
+    @classmethod
+    def of_finding(cls, file: Path, found: Finding) -> Departure:
+        """What a look at the content of `file` found."""
+        return cls(file, found.level, f"{found.where}: {found.name}: {found.text}")
 
 
 def broken(file: Path, key: str, rule: str, value: object = None) -> Departure:

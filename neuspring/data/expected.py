@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
+from neuspring.core.errors import InputError
+from neuspring.data.capture import CAPTURE, read_description
 from neuspring.data.cases import released_cases
 
 
@@ -53,6 +55,15 @@ def _filmed(row: ScenarioRow, config: Config) -> Expected:
     return _resampled(_released(row, config), config)
 
 
+def _captured(row: ScenarioRow, config: Config) -> Expected:
+    """A body like the released ones, in a recording as capture.json describes it."""
+    try:
+        recording = read_description(Path(config.data_root or ".") / row.path / CAPTURE)
+    except InputError:
+        return _filmed(row, config)
+    return replace(_filmed(row, config), frames=recording.frame_count, frame_rate=recording.frame_rate)
+
+
 def _resampled(body: Expected, config: Config) -> Expected:
     """A body with one node per voxel. Most nodes lie on the surface, so their number goes with 1 / spacing^2."""
     voxel, most = config.perception.sample.voxel, config.perception.sample.nodes
@@ -91,7 +102,7 @@ BODIES: dict[str, Callable[[ScenarioRow, Config], Expected]] = {
     "toy": _toy,
     "mocap": _mocap,
     "synthetic": _synthetic,
-    "capture": _filmed,
+    "capture": _captured,
     "phystwin_raw": _filmed,
     "phystwin": _released,
 }

@@ -50,6 +50,8 @@ class Source:
     """Files of its folder that a capture is made from, beside images."""
     images_beside: Callable[[Path], bool] = lambda folder: False
     """Whether images lie beside processed data, so that a capture can be made of them for pictures."""
+    required: Callable[[Path], None] = lambda folder: None
+    """Raises InputError where its folder lacks what no run can do without."""
     frames: Callable[[ScenarioRow, Config], int] = lambda row, config: 1
     """Frames of a scenario as far as they are known before its data are read; 1 otherwise."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
@@ -149,6 +151,20 @@ def _synthetic_frames(row: ScenarioRow, config: Config) -> int:
     return min(frames, config.synthetic.frames or frames)
 
 
+def _required_capture(folder: Path) -> None:
+    if not (folder / capture.CAPTURE).exists():
+        remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
+        raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
+
+
+def _captured_frames(row: ScenarioRow, config: Config) -> int:
+    try:
+        return capture.read_description(location(row, config) / capture.CAPTURE).frame_count
+    except InputError:
+        # Damaged data fail the jobs of their scenario, which say what is wrong.
+        return 1
+
+
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
     return tuple(map(str, range(phystwin_raw.camera_count(folder))))
 
@@ -182,7 +198,13 @@ SOURCES = {
         cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
     ),
     "capture": Source(
-        module="neuspring.data.capture", reads=("data_root",), films=True, own=True, frames=_released_frames, cameras=_described
+        module="neuspring.data.capture",
+        reads=("data_root",),
+        films=True,
+        own=True,
+        required=_required_capture,
+        frames=_captured_frames,
+        cameras=_described,
     ),
     "phystwin_raw": Source(
         module="neuspring.data.phystwin_raw",

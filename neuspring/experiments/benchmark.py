@@ -32,6 +32,7 @@ from neuspring.config.images import Appearance
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, read_scenarios
+from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.studies import Study, read_studies
 
@@ -373,6 +374,9 @@ class Benchmark:
                 )
             if not path.exists():
                 raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+            SOURCES[row.source].required(path)
+            if SOURCES[row.source].films and not SOURCES[row.source].write_capture:
+                BACKENDS["segment"][self.config.perception.segment.backend].require(path)
 
 
 def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], methods: Mapping[str, Method]) -> Config:

@@ -12,8 +12,8 @@
 | findings | `look`, `look_world`: what the steps notice about their own results |
 | look, judge | `figures`: pictures of each step; `judge`: errors against the truth of a synthetic capture |
 
-`marks`: masks from a few marks of a user. `segment_pieces`: pieces of automatic masks over the video. `mask_verdict`: whether masks
-can be right. `backends`: `BACKENDS` declares the backends of segmentation and tracking; `mask_facts`: quality numbers of masks;
-`assemble`: observations. `results` declares what the steps hand on: `Masks`, `PixelTracks`, `LiftedTracks`, `ShapePrior`.
+`marks`: masks from a few marks of a user. `segment_pieces`: pieces of automatic masks over the video. `backends`: `BACKENDS`
+declares the backends of segmentation and tracking; `mask_facts`: quality numbers of masks; `assemble`: observations. `results`
+declares what the steps hand on: `Masks`, `PixelTracks`, `LiftedTracks`, `ShapePrior`.
 `annotate`: the page on which a person makes masks and ground-truth tracks.
 """

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuspring.config.perception import Perception
+from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,6 +32,21 @@ class Backend:
     """Whether it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
     """Whether it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
+
+    given: bool = False
+    """Whether a user gives it something in the capture, which its `require(capture)` asks for."""
+
+    def require(self, folder: Path) -> None:
+        """Raise InputError where a capture lacks what a user must give, before any job runs. Damaged ones fail their own jobs."""
+        from neuspring.data.capture import Capture
+
+        if not self.given:
+            return
+        try:
+            capture = Capture.load(folder)
+        except InputError:
+            return
+        import_module(self.module).require(capture)
 
     def _own(self, section: Any) -> tuple[Any, ...]:
         return (getattr(section, self.section),) if self.section else ()
@@ -54,9 +71,9 @@ class Backend:
 
 BACKENDS = {
     "segment": {
-        "given": Backend(module="neuspring.perception.segment_given"),
+        "given": Backend(module="neuspring.perception.segment_given", given=True),
         "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv"),
-        "marks": Backend(module="neuspring.perception.segment_marks", section="marks"),
+        "marks": Backend(module="neuspring.perception.segment_marks", section="marks", given=True),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },
     "track": {

@@ -16,11 +16,13 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.controllers import choose_controllers
-from neuspring.perception.release import holding
+from neuspring.perception.release import Body, Holding, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbours` is meant for. A longer one shows a surface in more pixels."""
+STRIDE = 3
+"""Of the pixels of object and hands each third says how near they are."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,12 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
-    in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    body = (objects.points, objects.visible)
-    holds = holding(controllers, (hands.points, hands.visible), body, in_view, capture.train_end, settings)
-    if len(holds):
-        facts |= {"controllers_let_go": float((~holds[-1]).sum()), "first_let_go": float(np.flatnonzero(~holds.all(axis=1))[0])}
+    holds = _holds(capture, cameras, labels, controllers, hands, objects, settings)
+    if len(holds.valid):
+        first = float(np.flatnonzero(~holds.valid.all(axis=1))[0])
+        facts |= {"controllers_let_go": float((~holds.valid).any(axis=0).sum()), "first_let_go": first}
+    if holds.elsewhere is not None:
+        facts["grip_elsewhere"] = float(holds.elsewhere)
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),
@@ -80,12 +83,39 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_motion_valid=valid,
         object_colours=objects.colours,
         controller_points=controllers,
-        controller_valid=holds,
+        controller_valid=holds.valid,
         cloud=cloud,
         cloud_colours=colors,
         backend="released" if settings.sequential_motion_filter else "vectorised",
         facts=facts,
     )
+
+
+def _holds(
+    capture: Capture,
+    cameras: Mapping[str, Camera],
+    labels: Mapping[str, np.ndarray],
+    controllers: np.ndarray,
+    hands: Seen,
+    objects: Seen,
+    settings: Lift,
+) -> Holding:
+    """When controllers hold. Depth is read again only if hands can let go."""
+    if settings.release is None:
+        none = Body([], [], objects.points, objects.visible)
+        return holding(controllers, (hands.points, hands.visible), none, np.zeros(0), settings)
+    clouds: dict[int, list[np.ndarray]] = {OBJECT: [], HANDS: []}
+    for frame in range(capture.train_end):
+        depths = {name: capture.depth(name, frame) for name in cameras if capture.has(name, frame)}
+        for label, own in clouds.items():
+            seen = [np.zeros((0, 3))]
+            for name, depth in depths.items():
+                y, x = (values[::STRIDE] for values in np.nonzero(labels[name][frame] == label))
+                seen.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
+            own.append(np.concatenate(seen))
+    in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
+    body = Body(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible)
+    return holding(controllers, (hands.points, hands.visible), body, in_view, settings)
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:

@@ -10,18 +10,15 @@ from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.findings import Finding, finding
+from neuspring.data.plausible.things import place_findings
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
-SIZE = (0.03, 1.0)
-"""m: longest side of the object."""
-BELOW = 0.02
-"""m that a body on a table may reach below it, noise included."""
 VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
-TRUSTED = 0.2
-"""Share of motions that agree with their neighbors."""
+TRUSTED = 0.5
+"""Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
 ALIVE = 0.05
 """Share of the object's points that are seen in a frame."""
 GRIP = 0.04
@@ -34,12 +31,11 @@ FASTEST = 5.0
 """m/s: no hand that manipulates is faster."""
 NODES = (30, 5000)
 """Structure points that can deform, and that a search can pay for."""
-TABLE = "Table, extrinsics or depth unit may be wrong: `neuspring check-data` looks at them."
 
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1."""
-    return [*_object(lifted, up), *_shape(prior), *_motion(lifted)]
+    return [*place_findings("object in frame 0", [lifted.cloud], up), *_shape(prior), *_motion(lifted)]
 
 
 def look_at_observations(observations: Observations) -> list[Finding]:
@@ -66,24 +62,6 @@ def look_at_observations(observations: Observations) -> list[Finding]:
     return found
 
 
-def _object(lifted: LiftedTracks, up: float) -> list[Finding]:
-    where, found = "object in frame 0", []
-    heights, size = up * lifted.cloud[:, 2], np.ptp(np.quantile(lifted.cloud, (0.01, 0.99), axis=0), axis=0)
-    lowest, highest = np.quantile(heights, (0.01, 0.99))
-    sides = " x ".join(f"{100 * side:.0f}" for side in size)
-    value = f"{sides} cm, from {100 * lowest:.1f} to {100 * highest:.1f} cm above the table"
-    rule = "as its pixels with depth show it"
-    found.append(finding("size of the object", "note", where, value, rule, "Is that what was filmed?"))
-    if not SIZE[0] <= size.max() <= SIZE[1]:
-        rule = f"{100 * SIZE[0]:g} to {100 * SIZE[1]:g} cm are expected"
-        remedy = f"Masks may show more or less than the object. {TABLE}"
-        found.append(finding("implausible size", "warning", where, f"{100 * size.max():.0f} cm long", rule, remedy))
-    if lowest < -BELOW:
-        value, rule = f"it reaches {-100 * lowest:.1f} cm below the table", f"at most {100 * BELOW:g} cm are noise"
-        found.append(finding("object below the table", "warning", where, value, rule, TABLE))
-    return found
-
-
 def _shape(prior: ShapePrior) -> list[Finding]:
     found, volume, share = [], prior.facts.get("volume", 0.0), prior.facts.get("invented_share", 0.0)
     if volume > VOLUME:
@@ -99,11 +77,18 @@ def _shape(prior: ShapePrior) -> list[Finding]:
 
 
 def _motion(lifted: LiftedTracks) -> list[Finding]:
-    found, where, share = [], "lifted tracks", float(lifted.object_motion_valid[:-1].mean())
+    found, where = [], "lifted tracks"
+    both = lifted.object_visibility[:-1] & lifted.object_visibility[1:]
+    share = float(lifted.object_motion_valid[:-1].sum() / max(int(both.sum()), 1))
     remedy = "Look at tracks.png and lifted.png; perception.lift has neighbourhood and agreement."
-    if share < TRUSTED:
+    if both.any() and share < TRUSTED:
         value, rule = f"{share:.0%} of the object's motions are trusted", f"at least {TRUSTED:.0%} are expected"
         found.append(finding("motion not trusted", "warning", where, value, rule, remedy))
+    if "grip_elsewhere" in lifted.facts:
+        frame = int(lifted.facts["grip_elsewhere"])
+        value = f"in frame {frame} a hand comes back to another part of the object"
+        rule = "springs of hands are made for their place in frame 0, so nothing moves the twin there"
+        found.append(finding("grip elsewhere", "warning", "controllers", value, rule, f"End the capture before frame {frame}."))
     alive = lifted.object_visibility.mean(axis=1)
     if (low := np.flatnonzero(alive < ALIVE)).size:
         value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
@@ -135,9 +120,11 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
             finding("most controllers hold nothing", "note", where, value, rule, "perception.lift.grip: patch takes near ones.")
         )
     holds = observations.controller_valid
-    if len(holds) and (gone := int((~holds[-1]).sum())):
+    if len(holds) and (gone := int((~holds).any(axis=0).sum())):
         value = f"{gone} of {count} let go, first in frame {int(np.flatnonzero(~holds.all(axis=1))[0])}"
-        rule = "from then on their springs do not act (perception.lift.release)"
+        if (again := (holds[1:] & ~holds[:-1]).any(axis=1)).any():
+            value += f", and some take hold again, first in frame {int(again.argmax()) + 1}"
+        rule = "while they do not hold, their springs do not act (perception.lift.release)"
         found.append(finding("hands let go", "note", where, value, rule, "Is that what was filmed?"))
     if (moved := float(np.linalg.norm(controllers - controllers[0], axis=2).max())) < STILL:
         value, rule = f"they move {1e3 * moved:.1f} mm", f"at least {1e3 * STILL:g} mm are expected of hands that move an object"

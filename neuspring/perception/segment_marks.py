@@ -7,21 +7,28 @@ import numpy as np
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.marks.marks import MARKS, Marks
+from neuspring.perception.marks.marks import MARKS, Mark, Marks
 from neuspring.perception.marks.store import carry_camera
+
+
+def require(capture: Capture) -> None:
+    """Raise InputError if marks.json is not there, is wrong, or lacks a camera."""
+    for camera in capture.cameras:
+        _marks_of(capture, camera)
 
 
 def segment(capture: Capture, camera: str, settings: MarksSegmentation) -> np.ndarray:
     """Labels [T, H, W]. Raises InputError without marks.json, or where it has no marks of this camera."""
+    carried = carry_camera(capture, camera, _marks_of(capture, camera), settings)
+    doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
+    print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
+    return carried.labels
+
+
+def _marks_of(capture: Capture, camera: str) -> tuple[Mark, ...]:
     path = capture.folder / MARKS
-    if not path.exists():
-        remedy = "Mark object and hands with `neuspring annotate`, or write the file by hand: see perception/README.md."
-        raise InputError(path, "perception.segment.backend: marks needs this file", "no such file", remedy)
     marks = Marks.load(path)
     marks.require(capture, path)
     if not marks.of(camera):
         raise InputError(f"{path}, cameras", f"camera {camera} needs marks", sorted(marks.cameras))
-    carried = carry_camera(capture, camera, marks.of(camera), settings)
-    doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
-    print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
-    return carried.labels
+    return marks.of(camera)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.config.perception import OpenCvTracking
-from neuspring.data.capture import Capture
+from neuspring.data.capture import NOTHING, Capture
 
 PATCH = 9
 """Side of compared patches, pixels."""
@@ -55,8 +55,18 @@ class Followed:
 
 def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
     """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
-    start = choose(labels[0], settings.points, seed)
+    return follow(capture, camera, labels, choose(labels[0], settings.points, seed), settings)
+
+
+def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray, settings: OpenCvTracking) -> Followed:
+    """Follow points (x, y) [Q, 2] float32 of frame 0; they belong to its nearest label, and vote on each other's motion.
+
+    `labels` [T, H, W] are masks; frame 0 must show object or hands.
+    """
     own = _labels_at(labels[0], start)
+    beside = own == NOTHING
+    if beside.any():
+        own[beside] = _nearest_label(labels[0], start[beside])
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
     first = before = gray(capture, camera, 0, settings)
@@ -73,7 +83,7 @@ def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTra
         alive &= inside(place, now.shape)
         if settings.reacquire:
             alive |= _reacquire(first, now, start, place, alive, settings)
-        alive &= _labels_at(labels[frame], place) == own
+        alive &= _held(labels[frame], place, own, settings.rim)
         for label in np.unique(own):
             _outvote(start, place, alive, own == label)
         pixels[frame], visible[frame] = np.where(alive[:, None], place, pixels[last]), alive
@@ -160,6 +170,23 @@ def _labels_at(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Labels [n] of the pixels nearest to points (x, y)."""
     x, y = np.round(points).astype(int).T
     return np.asarray(labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)])
+
+
+def _nearest_label(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The label [n], not 0, that is nearest to points (x, y)."""
+    y, x = np.nonzero(labels)
+    return np.asarray(labels[y, x][cKDTree(np.stack([x, y], axis=1)).query(points)[1]])
+
+
+def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:
+    """Whether points (x, y) [n, 2] lie within `rim` pixels of their own labels [n]."""
+    on = _labels_at(labels, points) == own
+    if rim > 0:
+        for label in np.unique(own[~on]):
+            off = np.flatnonzero(~on & (own == label))
+            away = cv2.distanceTransform((labels != label).astype(np.uint8), cv2.DIST_L2, 5)
+            on[off] = _labels_at(away, points[off]) <= rim
+    return on
 
 
 def likeness(first: np.ndarray, now: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:

@@ -13,9 +13,8 @@ from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.look import look_at_masks
+from neuspring.perception.look import WRONG, look_at_masks
 from neuspring.perception.mask_facts import mask_facts
-from neuspring.perception.mask_verdict import verdict
 from neuspring.perception.results import Masks
 from neuspring.stages import options as shared
 
@@ -47,12 +46,13 @@ def run(folder: Path, camera: str, settings: Config, device: str, output: Path) 
     capture.require_camera(camera)
     labels = BACKENDS["segment"][section.backend].segment(capture, camera, settings.perception, device)
     facts = mask_facts(capture, camera, labels)
-    numbers, findings = verdict(capture, camera, labels)
-    if findings and section.verdict == "error":
+    findings = look_at_masks(capture, camera, labels, facts)
+    wrong = [one for one in findings if one.name in WRONG]
+    if wrong and section.verdict == "error":
         rule = "perception.segment.verdict: error asks for masks that can be right"
-        raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(one.text for one in findings))
-    masks = Masks(labels=labels, backend=section.backend, facts=facts | numbers)
+        raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(one.text for one in wrong))
+    masks = Masks(labels=labels, backend=section.backend, facts=facts)
     files = record.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])
-    record.save(files, masks.facts | told([*findings, *look_at_masks(capture, camera, labels)]))
+    record.save(files, masks.facts | told(findings))

@@ -1,11 +1,10 @@
 """How well masks are carried from a few marks: IoU against drawn or rendered masks, as a table.
 
-    python -m tests.benchmarks.masks footage FOLDER [--cases ...]     real color film, marks in frame 0 (tests/data/marks)
     python -m tests.benchmarks.masks plush FOLDER                     real RGBD film, marks in tests/data/marks
     python -m tests.benchmarks.masks captures FOLDER ...              synthetic captures; outlines of frame 0 stand in for a user
 
-FOLDER of `footage` has videos/combine_tracking__CASE.mp4 (the left half is the film) and masks/CASE/FRAME.png. That of `plush` has
-color/NUMBER.png, depth/NUMBER.png (mm) and masks_250_335. With --pictures FOLDER, frames with masks are drawn to look at.
+FOLDER of `plush` has color/NUMBER.png, depth/NUMBER.png (mm) and masks_250_335. With --pictures FOLDER, frames with masks are drawn
+to look at. Real color film: `tests.benchmarks.footage`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -55,9 +54,8 @@ class Frames:
 
 def main() -> None:
     parser = ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kind", choices=["footage", "plush", "captures"])
+    parser.add_argument("kind", choices=["plush", "captures"])
     parser.add_argument("folders", type=Path, nargs="+")
-    parser.add_argument("--cases", nargs="+", help="of footage; all that have marks by default")
     parser.add_argument("--first", type=int, default=160, help="first frame of plush")
     parser.add_argument("--frames", type=int, help="of each film, from its first one; all by default")
     parser.add_argument("--scale", type=float, default=1.0)
@@ -66,28 +64,10 @@ def main() -> None:
     settings = MarksSegmentation(scale=a.scale)
     print(f"{'film':38s} frame  object  hands  doubt", flush=True)
     for folder in a.folders:
-        if a.kind == "footage":
-            for path in sorted((MARKS / "phystwin_camera0").glob("*.json")):
-                if not a.cases or path.stem in a.cases:
-                    _footage(folder, path, settings, a.frames, a.pictures)
-        elif a.kind == "plush":
+        if a.kind == "plush":
             _plush(folder, settings, a.first, a.frames, a.pictures)
         else:
             _capture(folder, settings, a.pictures)
-
-
-def _footage(folder: Path, path: Path, settings: MarksSegmentation, most: int | None, pictures: Path | None) -> None:
-    video = cv2.VideoCapture(str(folder / "videos" / f"combine_tracking__{path.stem}.mp4"))
-    colors = []
-    while most is None or len(colors) < most:
-        ok, frame = video.read()
-        if not ok:
-            break
-        colors.append(np.ascontiguousarray(frame[:, : frame.shape[1] // 2, ::-1]))
-    truth = {int(file.stem): cv2.imread(str(file), 0) for file in sorted((folder / "masks" / path.stem).glob("*.png"))}
-    began = time.perf_counter()
-    carried = carry(Frames(colors), Marks.load(path).of("0"), settings)
-    _tell(path.stem, carried, truth, time.perf_counter() - began, Frames(colors), pictures)
 
 
 def _plush(folder: Path, settings: MarksSegmentation, first: int, most: int | None, pictures: Path | None) -> None:
@@ -107,8 +87,6 @@ def _plush(folder: Path, settings: MarksSegmentation, first: int, most: int | No
 
 
 def _shifted(marks: Iterable[Mark], by: int) -> list[Mark]:
-    from dataclasses import replace
-
     return [replace(own, frame=own.frame - by) for own in marks if own.frame >= by]
 
 

@@ -22,6 +22,7 @@ from neuspring.experiments.inputs import Inputs
 from neuspring.experiments.needs import Needs
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
+from tests.support.captures import describe
 
 ROOT = Path(__file__).parents[2]
 
@@ -176,7 +177,8 @@ def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
 
 
 def benchmark(root: Path, **values: Any) -> Benchmark:
-    write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n")
+    own = "mine\tcapture\ttoy\tmine\tfalse\ttrue\n"
+    write(root / "scenarios.tsv", HEADER + ROW + "cable\tmocap\tcable\tcable.csv\tfalse\ttrue\n" + own)
     write(root / "methods.yaml", METHODS)
     write(root / "searches.yaml", SEARCHES)
     write(root / "studies.yaml", "both: {title: t, reference: null, baseline: Plain, rows: {Plain: full, Later: not_there}}")
@@ -222,6 +224,27 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
 def test_a_benchmark_is_checked_before_any_job(values: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         benchmark(tmp_path, **values)
+
+
+def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tmp_path: Path) -> None:
+    def planned(backend: str) -> Benchmark:
+        chosen = {"perception": {"segment": {"backend": backend}}}
+        return benchmark(tmp_path, scenarios=["mine"], data_root=str(tmp_path), **chosen)
+
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(InputError, match=r"mine: a capture is a folder with capture\.json.*neuspring make-capture"):
+        planned("opencv")
+    write(tmp_path / "mine" / "capture.json", json.dumps(config.plain(describe(masks=False))))
+    assert planned("opencv").scenarios
+    with pytest.raises(InputError, match=r"given needs masks of every camera; received masks: false.*neuspring annotate .*mine`"):
+        planned("given")
+    with pytest.raises(InputError, match=r"marks\.json: marks of object and hands are required.*neuspring annotate .*mine`"):
+        planned("marks")
+    write(tmp_path / "mine" / "marks.json", '{"format": 1, "cameras": {}}')
+    with pytest.raises(InputError, match="camera 0 needs marks"):
+        planned("marks")
+    write(tmp_path / "mine" / "capture.json", "{}")
+    assert planned("given").scenarios, "damaged data fail the jobs of their scenario"
 
 
 @pytest.mark.parametrize("settings", ["{horizont: 0}", "{betas: [2, 2]}"])

@@ -23,6 +23,7 @@ from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.needs import CARRY_OVER, Needs
 from neuspring.twin.search import RELEASED_SUBSTEPS, SearchProblem, candidate
 from tests.support import small
+from tests.support.captures import describe
 from tests.support.project import ROOT, config_with
 from tests.support.scenarios import observations
 
@@ -75,6 +76,17 @@ def test_bodies_follow_the_released_table_and_the_sampling():
     filmed = expected(dataclasses.replace(row, source="phystwin_raw"), settings)
     assert (filmed.nodes, filmed.spacing) == (4532 // 4, 0.01)
     assert expected(dataclasses.replace(row, path="x/mine"), settings) == USUAL
+
+
+def test_a_capture_of_a_user_is_as_long_as_it_says(tmp_path):
+    row = config.ScenarioRow(scenario="a", source="capture", category="cloth", path="mine", self_collision=False, ground=True)
+    settings = config.parse(config.Config, config_with({"data_root": str(tmp_path)}), "test")
+    assert (expected(row, settings), SOURCES["capture"].frames(row, settings)) == (USUAL, 1), "nothing is known"
+    (tmp_path / "mine").mkdir()
+    recording = describe(frame_count=31, frame_rate=15.0)
+    (tmp_path / "mine" / "capture.json").write_text(json.dumps(config.plain(recording)))
+    body = expected(row, settings)
+    assert (body.frames, body.frame_rate, SOURCES["capture"].frames(row, settings)) == (31, 15.0, 31)
 
 
 def test_a_limit_of_nodes_widens_the_spacing_and_never_narrows_it():

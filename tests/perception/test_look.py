@@ -13,6 +13,7 @@ from neuspring.core.records import Recorder
 from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.perception.look import look_at_masks, look_at_tracks
 from neuspring.perception.look_world import look_at_lifted, look_at_observations
+from neuspring.perception.mask_facts import mask_facts
 from neuspring.perception.results import LiftedTracks, ShapePrior
 from neuspring.perception.shape_prior import no_prior
 from tests.support.captures import FRAMES, describe, entry
@@ -23,7 +24,9 @@ SIZE = (90, 120)
 @pytest.fixture
 def capture(tmp_path):
     """A camera with depth everywhere."""
-    writer = Writer(tmp_path, describe(cameras=(entry(width=SIZE[1], height=SIZE[0]),)))
+    intrinsics = ((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0))
+    camera = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=intrinsics)
+    writer = Writer(tmp_path, describe(cameras=(camera,)))
     for frame in range(FRAMES):
         writer.frame("0", frame, np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 800, np.uint16))
     return writer.finish()
@@ -37,12 +40,16 @@ def scene() -> np.ndarray:
     return labels
 
 
+def looked_at(capture, labels: np.ndarray) -> list[Finding]:
+    return look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels))
+
+
 def texts(findings: list[Finding]) -> str:
     return "\n".join(map(str, findings))
 
 
 def test_good_masks_have_no_findings(capture):
-    assert look_at_masks(capture, "0", scene()) == []
+    assert looked_at(capture, scene()) == []
 
 
 def moved_to_the_border(labels):
@@ -62,7 +69,7 @@ def shrunk(labels):
 
 
 def sleeves(labels):
-    labels[:, 62:, :] = HANDS
+    labels[:, :29] = labels[:, 62:] = HANDS
 
 
 def without_hand(labels):
@@ -79,20 +86,20 @@ def tiny(labels):
     [
         (
             moved_to_the_border,
-            "object at the border: the object lies on the image border in 3 frames, first in frame 2; at most 2%",
+            "object at the border: the object touches the image border in 3 frames, first in frame 2; what is outside is neither",
         ),
-        (emptied, "object missing: no object in 2 frames, first in frame 3"),
+        (emptied, "object missing: almost nothing of the object in 2 frames, first in frame 3"),
         (split, "two objects: the object's mask of frame 0 has 2 pieces far apart"),
         (shrunk, "mask jumps: the object's area changes 2.3-fold from frame 1 to 2 (so in 2 frames); less than 2-fold is expected"),
-        (sleeves, "hand larger than the object: the hands are 4.6 times as large as the object; at most 3 times is expected"),
-        (without_hand, "no hand: no hand in frame 0"),
+        (sleeves, "hands too large: hands (label 2) of 2159 cm², 8.4 times the object's pixels; less than 1200 cm² and 12 times"),
+        (without_hand, "no hand in frame 0: no pixel with label 2 in frame 0"),
         (tiny, "small object: 100 pixels of object in frame 0; at least 200 are expected. Film from nearer by."),
     ],
 )
 def test_masks_that_cannot_be_right_are_said(capture, spoil, text):
     labels = scene()
     spoil(labels)
-    assert f"warning: camera 0: {text}" in texts(look_at_masks(capture, "0", labels))
+    assert f"warning: camera 0: {text}" in texts(looked_at(capture, labels))
 
 
 def test_an_object_without_depth_is_said(capture):
@@ -100,7 +107,9 @@ def test_an_object_without_depth_is_said(capture):
         depth = np.full(SIZE, 800, np.uint16)
         depth[30:45, 40:70] = 0
         cv2.imwrite(str(capture.path("depth", "0", frame)), depth)
-    assert "depth holes: 50% of the object's pixels have no depth; at most 20%" in texts(look_at_masks(capture, "0", scene()))
+    assert "depth holes: 50% of the object's pixels have no depth (frame 0: 50%); at most 40% are expected" in texts(
+        looked_at(capture, scene())
+    )
 
 
 def test_lost_and_few_tracks_are_said():
@@ -137,10 +146,10 @@ def lifted(points: np.ndarray = BOX) -> LiftedTracks:
 def test_size_and_place_of_the_object_are_said():
     good = look_at_lifted(lifted(), no_prior(), 1.0)
     assert [one.level for one in good] == ["note"]
-    assert "size of the object: 10 x 10 x 10 cm" in texts(good)
-    assert "implausible size: 98 cm" not in texts(good)
+    assert "size of the object: 9 x 9 x 9 cm" in texts(good)
+    assert "implausible size" not in texts(good)
     large = texts(look_at_lifted(lifted(20.0 * BOX), no_prior(), 1.0))
-    assert "warning: object in frame 0: implausible size: 196 cm long; 3 to 100 cm are expected" in large
+    assert "warning: object in frame 0: implausible size: 18" in large
     below = texts(look_at_lifted(lifted(BOX - [0, 0, 0.06]), no_prior(), 1.0))
     assert "object below the table: it reaches 5." in below
     # The same with z down: above and below are exchanged.
@@ -167,6 +176,12 @@ def test_distrusted_motion_and_lost_points_are_said():
     visible[3:, 2:] = False
     said = texts(look_at_lifted(replace(tracks, object_visibility=visible), no_prior(), 1.0))
     assert "points lost: 1% of the object's points are seen in frame 3; few in 2 frames" in said
+    assert "End the capture before frame 3." in said
+
+
+def test_a_hand_that_grips_elsewhere_is_said():
+    said = texts(look_at_lifted(replace(lifted(), facts={"grip_elsewhere": 3.0}), no_prior(), 1.0))
+    assert "warning: controllers: grip elsewhere: in frame 3 a hand comes back to another part of the object" in said
     assert "End the capture before frame 3." in said
 
 

@@ -1,12 +1,15 @@
-"""Pieces of automatic masks judged over a video, and the verdict on masks."""
+"""Pieces of automatic masks judged over a video, and what is said of masks that cannot be right."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Writer
-from neuspring.perception.mask_verdict import verdict
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.perception.look import WRONG, look_at_masks
+from neuspring.perception.mask_facts import mask_facts
 from neuspring.perception.segment_opencv import _region, _slim, _thin
 from neuspring.perception.segment_pieces import changing, sort_pieces
 from tests.support.captures import describe, entry
@@ -110,11 +113,16 @@ def test_fingers_at_a_thin_rope_are_hand():
     assert (slim[30:38, 5:15] == OBJECT).all(), "what is wide and touches no hand is left alone"
 
 
+def wrong(capture, labels: np.ndarray) -> list[str]:
+    """Names of the findings of masks that cannot be right."""
+    return [one.name for one in look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels)) if one.name in WRONG]
+
+
 def test_masks_that_can_be_right_have_no_findings(tmp_path):
     capture, labels = scene(tmp_path)
     kept = sort_pieces(capture, "0", labels, OpenCvSegmentation(sleeves=True, clutter="drop"))
-    facts, findings = verdict(capture, "0", kept)
-    assert findings == []
+    facts = mask_facts(capture, "0", kept)
+    assert wrong(capture, kept) == []
     assert facts["area_jumps"] == 0
     assert facts["object_at_border"] == 0
 
@@ -124,12 +132,31 @@ def test_masks_that_cannot_be_right_are_found(tmp_path):
     broken = labels.copy()
     broken[:, :3] = OBJECT
     broken[1::2, 5:12, 5:60] = OBJECT
-    facts, findings = verdict(capture, "0", broken)
-    assert [finding.name for finding in findings] == ["object at border", "area jumps", "flicker"]
-    assert facts["object_at_border"] > 0.25
+    assert wrong(capture, broken) == ["background in the mask", "mask flickers", "labels are noise"]
+    assert mask_facts(capture, "0", broken)["object_at_border"] > 0.25
     print_on_toy = np.zeros_like(labels)
     print_on_toy[:, 10:30, 10:40], print_on_toy[:, 15:20, 15:20] = OBJECT, HANDS
-    assert verdict(capture, "0", print_on_toy)[0]["hands_inside"] == 1
+    assert mask_facts(capture, "0", print_on_toy)["hands_inside"] == 1
+    assert wrong(capture, print_on_toy) == ["hands inside the object"]
     mostly_hand = np.full_like(labels, HANDS)
     mostly_hand[:, 10:14, 10:14] = OBJECT
-    assert any("times as much hand as object" in finding.text for finding in verdict(capture, "0", mostly_hand)[1])
+    assert "hands too large" in wrong(capture, mostly_hand)
+
+
+def test_what_is_wrong_is_said_once(tmp_path):
+    capture, labels = scene(tmp_path)
+    broken = labels.copy()
+    broken[:, :3] = OBJECT
+    broken[1::2, 5:12, 5:60] = OBJECT
+    names = [one.name for one in look_at_masks(capture, "0", broken, mask_facts(capture, "0", broken))]
+    assert len(set(names)) == len(names)
+    assert not {"object at the border", "mask jumps"} & set(names)
+
+
+def test_a_single_frame_is_no_error(tmp_path):
+    capture, labels = scene(tmp_path)
+    one = Capture(capture.folder, replace(capture.description, frame_count=1))
+    assert wrong(one, sort_pieces(one, "0", labels[:1], OpenCvSegmentation())) == []
+    camera = replace(capture.description.cameras[0], missing=tuple(range(FRAMES)))
+    none = Capture(capture.folder, replace(capture.description, cameras=(camera,)))
+    assert look_at_masks(none, "0", labels, mask_facts(none, "0", labels)) == []

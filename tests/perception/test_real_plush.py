@@ -8,11 +8,12 @@ from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.lift import clean_masks
 from neuspring.perception.look import look_at_masks
+from neuspring.perception.mask_facts import mask_facts
 from neuspring.perception.results import Masks
 from neuspring.perception.segment_given import segment
 from neuspring.perception.shape_prior import shape_prior
+from tests.support.real import PLUSH
 
-REAL = Path(__file__).parents[2].parent / "shared" / "data" / "rgbd_plush"
 FIRST = 250
 
 
@@ -28,11 +29,12 @@ def assembled(folder: Path, real: Path) -> Capture:
     return Capture.load(folder)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the recording is not part of the repository")
+@pytest.mark.skipif(not PLUSH.is_dir(), reason="the recording is not part of the repository")
 def test_a_real_bear_has_a_round_back(tmp_path):
-    capture = assembled(tmp_path, REAL)
-    masks = {"cam0": Masks(labels=segment(capture, "cam0"), backend="given")}
-    assert look_at_masks(capture, "cam0", masks["cam0"].labels) == []
+    capture = assembled(tmp_path, PLUSH)
+    labels = segment(capture, "cam0")
+    masks = {"cam0": Masks(labels=labels, backend="given")}
+    assert look_at_masks(capture, "cam0", labels, mask_facts(capture, "cam0", labels)) == []
     _, cloud, _ = clean_masks(capture, capture.cameras, masks, Lift(), 1)
     liters, wall = {}, {}
     for how in ("none", "symmetry", "fraction"):

@@ -9,7 +9,7 @@ from neuspring.config.perception import Lift
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.perception.look_world import look_at_observations
-from neuspring.perception.release import ALWAYS, holding
+from neuspring.perception.release import ALWAYS, Body, Holding, holding
 from tests.support.small import observations
 
 FRAMES = 30
@@ -31,10 +31,17 @@ def scene(away: np.ndarray):
     return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
 
 
-def held(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
+def grips(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> Holding:
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
-    return holding(points[:, [0, 3, 4]], (points, seen), (bodies, shown), in_view, train_end, settings)
+    body = Body(list(bodies[:train_end]), list(points[:train_end]), bodies, changes.get("shown", shown))
+    return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, settings)
+
+
+def held(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
+    found = grips(away, settings, train_end, **changes)
+    assert found.elsewhere is None
+    return found.valid
 
 
 def leaving(at: int) -> np.ndarray:
@@ -62,10 +69,64 @@ def test_the_body_is_not_read_after_the_training_frames():
     np.testing.assert_array_equal(held(leaving(10), train_end=18, bodies=spoiled), held(leaving(10), train_end=18))
 
 
-def test_a_hand_that_comes_back_has_not_let_go():
+def test_a_hand_that_comes_back_soon_has_not_let_go():
+    away = leaving(10)
+    away[15:] = 0.0
+    assert held(away) is ALWAYS
+
+
+def test_a_hand_that_comes_back_to_the_same_place_takes_hold_again():
     away = leaving(10)
     away[20:] = 0.0
-    assert held(away) is ALWAYS
+    valid = held(away)
+    first = np.flatnonzero(~valid[:, 0])[0]
+    assert first in (11, 12)
+    assert valid[:first].all() and valid[20:].all()
+    assert not valid[first:20, :2].any()
+    assert valid[:, 2].all()
+
+
+def test_a_hand_may_let_go_and_take_hold_twice():
+    away = np.zeros(FRAMES)
+    away[5:12] = away[18:24] = 0.3
+    valid = held(away)
+    np.testing.assert_array_equal(valid[:, 0], away == 0)
+
+
+def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_same():
+    """The body is turned over while the hand is away, so that another side of it is where the hand comes back."""
+    away = leaving(10)
+    away[20:] = 0.0
+    bodies = scene(away)[2]
+    turned = bodies.copy()
+    turned[15:, :60, 2] *= -1
+    found = grips(away, bodies=turned)
+    assert found.elsewhere == 20
+    assert not found.valid[20:, :2].any()
+    # Without any followed point nobody knows.
+    shown = np.ones(bodies.shape[:2], bool)
+    shown[20, :60] = shown[20, 60:] = False
+    assert grips(away, shown=shown).elsewhere == 20
+
+
+def test_no_hold_is_taken_after_the_training_frames():
+    away = leaving(10)
+    away[24:] = 0.0
+    assert held(away)[24:].all()
+    assert not held(away, train_end=22)[13:, :2].any()
+
+
+def test_a_hand_that_was_never_near_has_not_let_go():
+    assert held(np.full(FRAMES, 0.3)) is ALWAYS
+
+
+def test_a_hand_is_near_if_what_is_seen_of_it_is():
+    """The pose of the hand is lost, and its controllers with it; masks still show it at the body."""
+    points, seen, bodies, shown, in_view = scene(np.zeros(FRAMES))
+    controllers = points[:, [0, 3, 4]].copy()
+    controllers[12:, :2] += 0.4
+    body = Body(list(bodies), list(points), bodies, shown)
+    assert holding(controllers, (points, seen), body, in_view, SETTINGS).valid is ALWAYS
 
 
 def test_a_hand_out_of_view_lets_go_after_some_frames():
@@ -91,6 +152,12 @@ def test_observations_keep_when_controllers_hold_and_older_files_load(tmp_path):
     some.save(tmp_path / "some.npz")
     np.testing.assert_array_equal(Observations.load(tmp_path / "some.npz").controller_valid, valid)
     found = "\n".join(map(str, look_at_observations(some)))
-    assert f"hands let go: {valid.shape[1]} of {valid.shape[1]} let go, first in frame {len(valid) - 1}" in found
+    assert (
+        f"hands let go: {valid.shape[1]} of {valid.shape[1]} let go, first in frame {len(valid) - 1}; while they do not hold"
+        in found
+    )
+    valid[1:3] = False
+    again = "\n".join(map(str, look_at_observations(replace(plain, controller_valid=valid))))
+    assert "let go, first in frame 1, and some take hold again, first in frame 3" in again
     with pytest.raises(InputError, match=r"controller_valid: the shape must be \[T, C\] bool"):
         replace(plain, controller_valid=np.ones((3, 99), bool))

@@ -107,6 +107,29 @@ def test_points_come_back_after_a_frame_without_a_mask(video):
     assert holed[2].sum() > 0.8 * plain[2].sum()
 
 
+def test_points_leave_a_mask_that_stays_behind_unless_its_rim_is_wide(video):
+    capture, labels = video
+    tight, wide = (
+        track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, reacquire=False, rim=rim), 0) for rim in (0.0, 20.0)
+    )
+    places = np.round(wide.pixels[2]).astype(int)
+    outside = wide.visible[2] & (labels[2, places[:, 1], places[:, 0]] == 0)
+    assert outside.sum() > 10
+    assert not tight.visible[2][outside].any()
+
+
+def test_a_point_beside_the_mask_belongs_to_the_nearest_label(video):
+    capture, labels = video
+    narrow = np.stack([cv2.erode(own, np.ones((13, 13), np.uint8)) for own in labels])
+    y, x = np.nonzero(labels[0])
+    point = np.array([[x.max() - 5, (y.min() + y.max()) / 2]], np.float32)
+    start = np.concatenate([point, track_opencv.choose(narrow[0], 200, 0)])
+    wide, tight = (track_opencv.follow(capture, "0", narrow, start, OpenCvTracking(rim=rim)) for rim in (4.0, 0.0))
+    assert wide.visible[1, 0]
+    assert error(wide, 1)[0] < 0.25
+    assert not tight.visible[1:, 0].any()
+
+
 class StandIn:
     """Implements the interface of CoTracker3's online predictor: points move by SHIFT; it insists on windows of 2 step frames."""
 

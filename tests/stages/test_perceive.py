@@ -110,7 +110,7 @@ def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp
 
 def test_given_masks_must_be_there(tmp_path):
     capture = film(tmp_path / "capture", cameras=1, masks=False)
-    with pytest.raises(InputError, match=r"backend: given needs masks: true.*Choose another backend: opencv"):
+    with pytest.raises(InputError, match=r"backend: given needs masks.*neuspring annotate .*: marks, opencv"):
         segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
 
 
@@ -123,8 +123,8 @@ def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
     segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
     said = capsys.readouterr().out
-    assert "the object's mask of frame 0 has 2 pieces far apart; two objects become one twin" in said
-    assert "no object in 2 frames, first in frame 4" in said
+    assert "the object's mask of frame 0 has 2 pieces far apart; one object is expected, whose pieces lie together" in said
+    assert "almost nothing of the object in 2 frames, first in frame 4" in said
     facts = StageRecord.load(tmp_path / "masks.json").facts
     assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
 

@@ -51,7 +51,7 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
         if not match or (match[4] and int(match[4]) < 1) or (match[4] and not match[2]):
             raise InputError("--frames", "ranges like 250-335, 0-, 0-300/2 or 1,5,9-20 are required", repr(part))
         first = int(match[1])
-        last = first if not match[2] else int(match[3]) if match[3] else numbers[-1]
+        last = first if not match[2] else int(match[3]) if match[3] else max(numbers, default=first)
         kept |= {number for number in numbers if first <= number <= last and (number - first) % int(match[4] or 1) == 0}
     return sorted(kept)
 

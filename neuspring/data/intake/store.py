@@ -14,7 +14,7 @@ from neuspring.data.json_file import load_json
 
 RECIPE = ".make-capture.json"
 """What an unfinished folder is made of. It is removed at the end."""
-PRECIOUS = ("mask", "marks.json", TRACKS)
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS)
 """Work of people and of hours, which --force does not remove."""
 
 
@@ -36,7 +36,9 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
             raise InputError(folder, "--output must be a new or empty folder", what, remedy)
         kept = [name for name in PRECIOUS if (folder / name).exists()]
         if kept:
-            raise InputError(folder, "--force does not remove masks, marks or tracks", " and ".join(kept), "Move them away first.")
+            raise InputError(
+                folder, "--force does not remove masks, marks, clicks or tracks", " and ".join(kept), "Move them away first."
+            )
         (folder / CAPTURE).unlink(missing_ok=True)
         for kind in ("color", "depth"):
             if (folder / kind).is_dir():

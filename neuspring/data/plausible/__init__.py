@@ -1,3 +1,3 @@
-"""Plausibility of a capture against the world, before any cost: `table` (z = 0, up, poses, unit), `things` (object and hands in the
-masks), `views` (cameras against each other), `pieces` (how many objects a mask shows).
+"""Plausibility of a capture against the world, before any cost: `table` (z = 0, up, poses, unit), `masks` (object and hands over
+the video), `things` (their size, depth and distance), `views` (cameras against each other).
 """

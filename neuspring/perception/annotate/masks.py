@@ -16,8 +16,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.document import Document
 from neuspring.perception.annotate.job import Job, Report
+from neuspring.perception.marks.marks import MARKS
 
-MARKS = "marks.json"
 MOST_MARKS = 2000
 """Marks of a camera: a limit for what a browser may send."""
 
@@ -80,7 +80,7 @@ class Masks:
             capture.folder / MARKS, lambda: method.load(capture), lambda marks: method.save(marks, capture)
         )
         self._results: dict[str, Result] = {}
-        self._lock = Lock()
+        self._lock, self._saving = Lock(), Lock()
 
     def plain(self) -> dict[str, Any]:
         """Marks with their revision, the job, and what was carried, as plain values."""
@@ -135,10 +135,9 @@ class Masks:
             result = Result([encode(image) for image in labels], doubt, marks, digest(values, camera))
             with self._lock:
                 self._results[camera] = result
-        names = ", ".join(cameras)
-        return (
-            f"Carried {'camera' if len(cameras) == 1 else 'cameras'} {names}; {doubtful} doubtful frames. Look at them, then save."
-        )
+        names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
+        frames = f"{doubtful or 'no'} very doubtful frame{'' if doubtful == 1 else 's'}"
+        return f"Carried {names}; {frames}. Look at the frames that are listed, then save."
 
     def labels(self, camera: str, frame: int, source: str) -> np.ndarray | None:
         """Labels [H, W] of a frame, `carried` just now or `saved` in the capture; None where there are none."""
@@ -155,16 +154,19 @@ class Masks:
             results = dict(self._results)
         if not results:
             raise InputError("masks", "there must be masks to save", "none", "Carry the marks through the video first.")
-        for camera, result in results.items():
-            self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
-            with self._lock:
-                if self._results.get(camera) is result:
-                    self._results[camera] = replace(result, saved=True)
+        # Two tabs would write the same files, and the record of one of them would be lost.
+        with self._saving:
+            for camera, result in results.items():
+                self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
+                with self._lock:
+                    if self._results.get(camera) is result:
+                        self._results[camera] = replace(result, saved=True)
         return list(results)
 
     def saved_cameras(self) -> list[str]:
-        """Cameras with a mask of frame 0 in the capture."""
-        return [camera for camera in self.capture.cameras if self.capture.path("mask", camera, 0).exists()]
+        """Cameras with a mask in the capture."""
+        frames = range(self.capture.frame_count)
+        return [c for c in self.capture.cameras if any(self.capture.path("mask", c, frame).exists() for frame in frames)]
 
 
 def digest(values: dict[str, Any], camera: str) -> str:

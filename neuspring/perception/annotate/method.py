@@ -12,7 +12,8 @@ from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.marks import MARKS, Mark, Marks, frame_mask
+from neuspring.perception.marks import MARKS, Carried, Marks, frame_mask
+from neuspring.perception.marks.sheet import save_sheet
 from neuspring.perception.marks.store import Made, MadeCamera, carry_camera, film_of, save_masks, source_digest
 
 
@@ -32,8 +33,7 @@ class FromMarks:
         if not isinstance(values, dict):
             raise InputError(MARKS, "a JSON object is required", type(values).__name__)
         marks = parse(Marks, values, MARKS)
-        for camera, own in marks.cameras.items():
-            _check(own, capture, camera)
+        marks.require(capture, whole=False)
         return marks
 
     def plain(self, marks: Marks) -> dict[str, Any]:
@@ -59,8 +59,9 @@ class FromMarks:
         return carried.labels, carried.doubt
 
     def save_masks(self, capture: Capture, camera: str, labels: np.ndarray, doubt: np.ndarray, marks: Marks) -> None:
-        """Write mask/<camera>/, and what they were made from as `neuspring mask` does. Raises InputError."""
+        """Write mask/<camera>/, a picture to look at, and what they were made from, as `neuspring mask` does. Raises InputError."""
         save_masks(capture, camera, labels)
+        save_sheet(capture, camera, Carried(labels, doubt))
         source = source_digest(capture, camera, marks.of(camera), "marks", self.settings)
         made = MadeCamera(source=source, backend="marks", doubt=tuple(round(float(value), 4) for value in doubt))
         Made.of(capture).save(capture, camera, made)
@@ -68,16 +69,3 @@ class FromMarks:
     def doubt(self, capture: Capture) -> dict[str, list[float]]:
         """Doubt [T] of the masks that the capture has, by camera, where it is known. Raises InputError."""
         return {camera: list(made.doubt) for camera, made in Made.of(capture).cameras.items()}
-
-
-def _check(marks: tuple[Mark, ...], capture: Capture, camera: str) -> None:
-    where = f"{MARKS}, cameras.{camera}"
-    if camera not in capture.cameras:
-        raise InputError(where, "the capture must have this camera", list(capture.cameras))
-    size = capture.cameras[camera]
-    for mark in marks:
-        if mark.frame >= capture.frame_count or not capture.has(camera, mark.frame):
-            raise InputError(where, "marks must lie on frames that the camera has", mark.frame)
-        outside = [p for p in mark.points if not (-0.5 <= p[0] <= size.width - 0.5 and -0.5 <= p[1] <= size.height - 0.5)]
-        if outside:
-            raise InputError(where, f"points must lie in the image of {size.width} x {size.height} pixels", outside[0])

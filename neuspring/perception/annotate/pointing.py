@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import asdict
 from threading import Condition, Thread
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
 from neuspring.data.capture import TRACKS, Capture, write_tracks
 from neuspring.perception.annotate.annotations import ANNOTATIONS, Annotations, Click, Point
 from neuspring.perception.annotate.document import Document
@@ -35,7 +37,8 @@ class Pointing:
         self._changed = Condition()
         self._wanted, self._done, self._closed, self._failure = 1, 0, False, ""
         self._points: list[tuple[Point, dict[str, Trail], Lifted, list[Note]]] = []
-        self._ours = False
+        self._written = ""
+        """Digest of tracks.json as it was saved here."""
         self._thread = Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -89,11 +92,12 @@ class Pointing:
             raise Busy(failure or "Points are still being followed. Save again in a moment.")
         if not points:
             raise InputError(TRACKS, "a point or more must be clicked", 0)
-        if (self.capture.folder / TRACKS).exists() and not (self._ours or replace):
+        path = self.capture.folder / TRACKS
+        if path.exists() and not replace and digest_file(path) != self._written:
             count = self.capture.tracks().shape[1]
             raise Foreign(f"The capture already has {TRACKS}, with {count} tracks. Saving replaces them.")
         write_tracks(self.capture.folder, np.stack([lifted.track for _, _, lifted, _ in points], axis=1))
-        self._ours = True
+        self._written = digest_file(path)
         return len(points)
 
     def _work(self) -> None:
@@ -107,6 +111,9 @@ class Pointing:
                 failure, points = "", self._follow(lambda wanted=wanted: self._closed or self._wanted != wanted)  # type: ignore[misc]
             except InputError as error:
                 failure, points = str(error), []
+            except Exception as error:  # the thread goes on: the page must hear of it, and the terminal gets the trace
+                logging.getLogger(__name__).exception("following failed")
+                failure, points = f"{type(error).__name__}: {error}. The terminal shows where.", []
             with self._changed:
                 if points is not None:
                     self._points, self._failure, self._done = points, failure, wanted

@@ -23,7 +23,7 @@ from neuspring.perception.annotate.masks import Masks, Method
 from neuspring.perception.annotate.pointing import Foreign, Pointing
 from neuspring.perception.annotate.routes import GET, POST, Desk
 
-SCRIPTS = ("api", "app", "edits", "masks", "messages", "paint", "pen", "timeline", "tracks", "view")
+SCRIPTS = ("api", "app", "doubt", "edits", "masks", "messages", "paint", "pen", "rows", "timeline", "tracks", "view")
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/style.css": ("style.css", "text/css; charset=utf-8"),
@@ -52,11 +52,12 @@ class Server(ThreadingHTTPServer):
             super().__init__((host, port), Handler)
         except (OSError, OverflowError) as error:
             raise _unusable(host, port, error) from error
+        self.desk = Desk(capture, masks, Pointing(capture))
         try:
-            self.desk = Desk(capture, masks, Pointing(capture))
             self.desk.pointing.document.read()
         except InputError:
             self.server_close()
+            self.desk.pointing.close()
             raise
 
     @property

@@ -78,6 +78,10 @@ class Marks:
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file, every key, type and count checked. Raises InputError that lists each problem."""
+        if not Path(path).exists():
+            folder = Path(path).parent if Path(path).name == MARKS else "CAPTURE"
+            remedy = f"Draw them in the browser: `neuspring annotate {folder}`."
+            raise InputError(path, "marks of object and hands are required", "no such file", remedy)
         values = load_json(Path(path))
         if not isinstance(values, dict):
             raise InputError(path, "a JSON object is required", type(values).__name__)
@@ -93,13 +97,16 @@ class Marks:
         """The marks of one camera."""
         return self.cameras.get(camera, ())
 
-    def require(self, capture: Capture, where: object = MARKS) -> None:
-        """Check cameras, frames and points against a capture, and that some camera has an object. Raises InputError."""
+    def require(self, capture: Capture, where: object = MARKS, *, whole: bool = True) -> None:
+        """Check cameras, frames and points against a capture. Raises InputError.
+
+        `whole`: they are all of them, so a camera with marks must have an object among them.
+        """
         for name, marks in self.cameras.items():
             if name not in capture.cameras:
                 raise InputError(f"{where}, cameras.{name}", "the capture must have this camera", sorted(capture.cameras))
             camera = capture.cameras[name]
-            require_marks(marks, capture.frame_count, (camera.height, camera.width), f"{where}, cameras.{name}")
+            require_marks(marks, capture.frame_count, (camera.height, camera.width), f"{where}, cameras.{name}", whole=whole)
             for mark in marks:
                 if not capture.has(name, mark.frame):
                     raise InputError(f"{where}, cameras.{name}", "marks must lie on frames that the camera has", mark.frame)

@@ -31,8 +31,14 @@ def overlay(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return result
 
 
-def save_sheet(capture: Capture, camera: str, carried: Carried, path: Path) -> Path:
-    """Write a PNG: the most doubtful frames first, then frames evenly spaced."""
+def sheet_of(capture: Capture, camera: str) -> Path:
+    """Where the sheet of a camera lies: beside the masks."""
+    return capture.folder / f"mask_{camera}.png"
+
+
+def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
+    """Write `sheet_of` a camera: the most doubtful frames first, then frames evenly spaced."""
+    path = sheet_of(capture, camera)
     frames = np.array([frame for frame in range(capture.frame_count) if capture.has(camera, frame)])
     doubtful = frames[np.argsort(-carried.doubt[frames], kind="stable")][:DOUBTFUL]
     even = frames[np.unique(np.linspace(0, len(frames) - 1, EVEN).astype(int))]

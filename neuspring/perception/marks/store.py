@@ -114,6 +114,8 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
         raise InputError(f"masks of camera {camera}", f"labels must be uint8 of shape {shape}", f"{labels.dtype} {labels.shape}")
     if labels.max(initial=0) > HANDS:
         raise InputError(f"masks of camera {camera}", "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
+    # From here on the masks are no longer what masks.json says, also if this is interrupted.
+    Made.of(capture).forget(capture, camera)
     for frame in range(capture.frame_count):
         if capture.has(camera, frame):
             # A renamed file replaces a link to the original of an imported capture, and leaves the original alone.
@@ -180,6 +182,12 @@ class Made:
         result = replace(self, cameras={**self.cameras, camera: made})
         write_text(capture.folder / MADE, json.dumps(asdict(result)) + "\n")
         return result
+
+    def forget(self, capture: Capture, camera: str) -> None:
+        """Remove this camera from the file."""
+        if camera in self.cameras:
+            kept = replace(self, cameras={name: made for name, made in self.cameras.items() if name != camera})
+            write_text(capture.folder / MADE, json.dumps(asdict(kept)) + "\n")
 
     def holds(self, capture: Capture, camera: str, source: str) -> bool:
         """Whether the camera's masks are there and were made from this source."""

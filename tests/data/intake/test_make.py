@@ -143,7 +143,7 @@ def test_a_capture_is_not_overwritten_and_masks_never(tmp_path):
     assert (capture.folder / CAPTURE).read_text() == before
     assert make_capture(intake(root, rate=15.0, force=True))[0].description.frame_rate == 15.0
     (capture.folder / "mask").mkdir()
-    with pytest.raises(InputError, match="--force does not remove masks, marks or tracks; received mask"):
+    with pytest.raises(InputError, match="--force does not remove masks, marks, clicks or tracks; received mask"):
         make_capture(intake(root, force=True))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()

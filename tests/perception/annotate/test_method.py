@@ -3,6 +3,7 @@
 import json
 import re
 
+import cv2
 import numpy as np
 import pytest
 
@@ -56,12 +57,22 @@ def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
     page.job.join()
     assert page.job.plain()["state"] == "done", page.job.plain()
     assert page.save() == ["0"]
+    assert (capture.folder / "mask_0.png").exists()
     later = Masks(capture, FromMarks()).plain()
     assert len(later["saved"]["0"]) == FRAMES
     assert Made.of(capture).cameras["0"].backend == "marks"
     assert not capture.path("mask", "0", MISSING[0]).exists()
     assert overlap(capture.mask("0", 5) == 1, square(5)) > 0.85
     assert not json.loads((capture.folder / "capture.json").read_text())["masks"]  # camera "covered" has none
+
+
+def test_a_camera_without_frame_0_has_masks_too(tmp_path):
+    capture = moving(tmp_path / "late", missing=(0,), tint=(1.0, 0.6, 0.2))
+    page = Masks(capture, FromMarks())
+    assert page.saved_cameras() == []
+    capture.path("mask", "0", 3).parent.mkdir(parents=True)
+    cv2.imwrite(str(capture.path("mask", "0", 3)), np.zeros((96, 128), np.uint8))
+    assert page.saved_cameras() == ["0"]
 
 
 def test_half_done_work_is_kept(capture):
@@ -78,8 +89,8 @@ def test_half_done_work_is_kept(capture):
         ({"format": 1, "cameras": {}, "more": 1}, "more: unknown key"),
         (marks(box(0), camera="7"), "cameras.7: the capture must have this camera; received ['0', 'covered']"),
         (marks(box(1)), "marks must lie on frames that the camera has; received 1"),
-        (marks(box(12)), "marks must lie on frames that the camera has; received 12"),
-        (marks(box(0, points=[[0, 0], [128, 5]])), "points must lie in the image of 128 x 96 pixels"),
+        (marks(box(12)), "cameras.0[0].frame: must lie below 12, the number of frames; received 12"),
+        (marks(box(0, points=[[0, 0], [128, 5]])), "cameras.0[0].points: must lie in the image of 128 x 96 pixels"),
         (marks(box(0, label="foot")), "cameras.0.0.label"),
         (marks(box(0, points=[[0, 0]])), "a box needs 2 points"),
         (marks(box(0, kind="click", points=[[float("inf"), 0]])), "cameras.0.0.points"),

@@ -7,6 +7,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import TRACKS, Capture, write_tracks
+from neuspring.perception.annotate import pointing
 from neuspring.perception.annotate.annotations import ANNOTATIONS
 from neuspring.perception.annotate.pictures import COLORS, overlay_png
 from neuspring.perception.annotate.server import Server
@@ -127,7 +128,7 @@ def test_marks_are_carried_looked_at_and_saved(client, method):
     masks = client.get("/api/masks")
     assert masks["carried"]["0"]["doubt"] == pytest.approx(np.linspace(0, 1, FRAMES), abs=1e-3)
     assert (masks["carried"]["0"]["stale"], masks["carried"]["0"]["saved"]) == (False, False)
-    assert masks["job"]["message"] == "Carried camera 0; 6 doubtful frames. Look at them, then save."
+    assert masks["job"]["message"] == "Carried camera 0; 6 very doubtful frames. Look at the frames that are listed, then save."
     overlay = client.image("/api/overlay/carried/0/2")
     assert (overlay[..., 3] > 0).sum() == 21 * 21
     assert client.raw("GET", "/api/overlay/carried/0/4")[0] == 404
@@ -229,6 +230,9 @@ def test_tracks_that_were_there_before_are_not_replaced_without_a_word(client, c
     assert client.post("/api/tracks/save", replace="yes")[0] == 428
     assert client.post("/api/tracks/save", replace=True) == (200, {"points": 1})
     assert client.post("/api/tracks/save") == (200, {"points": 1})
+    write_tracks(capture.folder, np.ones((FRAMES, 2, 3)))
+    assert client.post("/api/tracks/save")[0] == 428, "another program wrote them since"
+    assert capture.tracks().shape[1] == 2
 
 
 def test_tracks_need_a_point(client):
@@ -245,6 +249,18 @@ def test_an_image_that_cannot_be_read_is_told_and_work_goes_on(client, capture):
     status, answer = client.post("/api/tracks/save")
     assert (status, "00002.png" in answer["error"]) == (409, True)
     path.write_bytes(image)
+    client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 1))
+    assert followed(client)["failure"] == ""
+
+
+def test_an_error_of_the_program_is_told_and_work_goes_on(client, monkeypatch):
+    def broken(*_):
+        raise ValueError("boom")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pointing, "follow_from", broken)
+        client.post("/api/clicks", revision="none", annotations=clicks(0))
+        assert "ValueError: boom" in followed(client)["failure"]
     client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 1))
     assert followed(client)["failure"] == ""
 

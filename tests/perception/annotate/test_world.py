@@ -129,7 +129,7 @@ def test_tracks_need_a_point(capture):
 
 
 def test_the_script_of_the_page_makes_tracks(tmp_path):
-    text = files("neuspring.perception").joinpath("README.md").read_text().split("### In the browser")[1]
+    text = files("neuspring.perception").joinpath("README.md").read_text().split("## The page of annotate")[1]
     script = re.search("```python\n(.*?)```", text, re.DOTALL)[1]
     capture = moving(tmp_path)
     exec(script.replace("FOLDER", str(tmp_path)), {})

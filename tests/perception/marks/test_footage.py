@@ -11,10 +11,9 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.perception.marks import Marks, carry, frame_mask
 from tests.support.marked import Painted, overlap
+from tests.support.real import FOOTAGE, PLUSH
 
 MARKS = Path(__file__).parents[2] / "data" / "marks"
-DATA = Path(__file__).parents[3].parent / "shared" / "data"
-FOOTAGE, PLUSH = DATA / "phystwin_camera0", DATA / "rgbd_plush"
 LEAST = {
     "double_lift_cloth_1": 0.95,
     "double_lift_sloth": 0.85,

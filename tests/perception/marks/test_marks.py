@@ -24,6 +24,11 @@ def test_marks_come_back_as_they_were(tmp_path):
     assert marks.of("nobody") == ()
 
 
+def test_marks_that_are_not_there_lead_to_the_browser(tmp_path):
+    with pytest.raises(InputError, match=r"no such file. Draw them in the browser: `neuspring annotate .*`"):
+        Marks.load(tmp_path / "marks.json")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

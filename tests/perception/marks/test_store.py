@@ -12,8 +12,8 @@ from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.marks import Marks
-from neuspring.perception.marks.store import Made, film_of, has_masks, save_masks
+from neuspring.perception.marks import Marks, store
+from neuspring.perception.marks.store import Made, MadeCamera, film_of, has_masks, save_masks
 from tests.support.filmed import FRAMES, film
 from tests.support.marked import mark, overlap
 
@@ -94,6 +94,21 @@ def test_masks_are_announced_when_every_camera_has_them(folder):
         save_masks(capture, camera, np.ones((FRAMES, 90, 160), np.uint8))
         assert Capture.load(folder).description.masks == announced
     assert has_masks(capture)
+
+
+def test_masks_that_are_half_written_are_not_taken_for_those_before(folder, monkeypatch):
+    capture, made = Capture.load(folder), MadeCamera(source="sha256:before", backend="marks", doubt=(0.0,) * FRAMES)
+    save_masks(capture, "0", np.ones((FRAMES, 90, 160), np.uint8))
+    Made.of(capture).save(capture, "0", made)
+    assert Made.of(capture).holds(capture, "0", "sha256:before")
+
+    def full(path, write):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(store, "write_atomically", full)
+    with pytest.raises(OSError, match="no space"):
+        save_masks(capture, "0", np.zeros((FRAMES, 90, 160), np.uint8))
+    assert not Made.of(capture).holds(capture, "0", "sha256:before")
 
 
 @pytest.mark.parametrize(

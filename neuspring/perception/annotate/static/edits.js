@@ -1,6 +1,6 @@
 // A document that is kept on the server: every change is sent at once, in order, and can be undone.
 
-import { getJson, post, Problem } from "./api.js";
+import { getJson, post } from "./api.js";
 import { say, saved } from "./messages.js";
 
 export class Edits {
@@ -15,7 +15,7 @@ export class Edits {
 
   take(revision, value) {
     this.revision = revision;
-    this.value = value;
+    this.value = this.stored = value;
   }
 
   change(value) {
@@ -51,11 +51,11 @@ export class Edits {
     try {
       const answer = await post(this.path, { revision: this.revision, [this.key]: value });
       this.revision = answer.revision;
+      this.stored = value;
       saved(`${this.name} saved`);
       this.changed(true);
     } catch (error) {
       saved(`${this.name} NOT saved`);
-      if (!(error instanceof Problem)) throw error;
       if (error.status === 409) {
         say(`${this.name} changed in another tab or program.`, "bad", {
           "Take theirs": () => this.takeTheirs(),
@@ -92,7 +92,8 @@ export class Edits {
     }
   }
 
+  // Whether the server lacks something: it was not sent yet, or could not be kept.
   get dirty() {
-    return this.waiting > 0;
+    return this.value !== this.stored;
   }
 }

@@ -1,10 +1,12 @@
 // The masks mode: marks on frames, previews, carrying, saving.
 
 import { getJson, post, postForImage } from "./api.js";
+import { doubtColor, HIGH, worst } from "./doubt.js";
 import { Edits } from "./edits.js";
 import { guard, say } from "./messages.js";
 import { COLORS, drawMark } from "./paint.js";
 import { Pen } from "./pen.js";
+import { row, swatch } from "./rows.js";
 
 const find = (id) => document.getElementById(id);
 const KINDS = { b: "box", c: "click", s: "scribble", p: "polygon" };
@@ -217,8 +219,8 @@ export class MasksMode {
     this.progress(results.job);
     const carried = results.carried[app.camera];
     find("stale").hidden = !carried?.stale || running;
-    find("doubtful").replaceChildren(...this.doubtful().map(({ frame, doubt }) =>
-      app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > 0.5 ? "high" : "mid")));
+    find("doubtful").replaceChildren(...worst(this.doubt()).map(({ frame, doubt }) =>
+      app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > HIGH ? "high" : "mid")));
     find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
     find("save-masks").disabled = running || !unsaved.length;
@@ -231,25 +233,16 @@ export class MasksMode {
   }
 
   row(mark, index) {
-    const row = document.createElement("li");
-    row.classList.toggle("chosen", index === this.chosen);
-    const swatch = document.createElement("i");
-    swatch.className = `swatch ${mark.label}`;
-    const text = document.createElement("span");
-    text.textContent = `${mark.label}, ${mark.kind}`;
-    const remove = document.createElement("button");
-    remove.textContent = "✕";
-    remove.ariaLabel = `Remove ${mark.label}, ${mark.kind}`;
-    remove.onclick = (event) => {
-      event.stopPropagation();
-      this.remove(mark);
-    };
-    row.append(swatch, text, remove);
-    row.onclick = () => {
-      this.chosen = this.chosen === index ? -1 : index;
-      this.refresh();
-    };
-    return row;
+    return row({
+      sign: swatch(mark.label),
+      text: `${mark.label}, ${mark.kind}`,
+      chosen: index === this.chosen,
+      remove: () => this.remove(mark),
+      pick: () => {
+        this.chosen = this.chosen === index ? -1 : index;
+        this.refresh();
+      },
+    });
   }
 
   progress(job) {
@@ -265,28 +258,14 @@ export class MasksMode {
     return this.results.carried[this.app.camera]?.doubt ?? this.results.saved[this.app.camera] ?? [];
   }
 
-  // The worst frames, a few frames apart from each other.
-  doubtful(most = 12, apart = 4, least = 0.25) {
-    const doubt = this.doubt();
-    const order = doubt.map((value, frame) => ({ frame, doubt: value })).filter((one) => one.doubt >= least)
-      .sort((a, b) => b.doubt - a.doubt);
-    const chosen = [];
-    for (const one of order) {
-      if (chosen.length >= most) break;
-      if (chosen.every((other) => Math.abs(other.frame - one.frame) > apart)) chosen.push(one);
-    }
-    return chosen;
-  }
-
   bars() {
-    const bars = this.doubt().map((doubt, frame) =>
-      ({ frame, height: Math.max(0.8 * doubt, 0.06), color: doubt > 0.5 ? "#ff6b5e" : doubt > 0.25 ? "#e0b03c" : "#3d6b5f" }));
+    const bars = this.doubt().map((doubt, frame) => ({ frame, height: Math.max(0.8 * doubt, 0.06), color: doubtColor(doubt) }));
     for (const mark of this.marksOf()) bars.push({ frame: mark.frame, height: 1, color: COLORS[mark.label] });
     return bars;
   }
 
   legend() {
-    return [[COLORS.object, "object"], [COLORS.hand, "hand"], [COLORS.ignore, "ignore"], ["#ff6b5e", "doubt"]];
+    return [[COLORS.object, "object"], [COLORS.hand, "hand"], [COLORS.ignore, "ignore"], [doubtColor(1), "doubt"]];
   }
 
   key(event) {
@@ -303,7 +282,7 @@ export class MasksMode {
   }
 
   nextDoubtful() {
-    const list = this.doubtful();
+    const list = worst(this.doubt());
     if (!list.length) return this.app.hint("No frame is doubtful.");
     const next = (list.findIndex((one) => one.frame === this.app.frame) + 1) % list.length;
     return this.app.go(list[next].frame);

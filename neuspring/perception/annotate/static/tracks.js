@@ -4,6 +4,7 @@ import { getJson, post } from "./api.js";
 import { Edits } from "./edits.js";
 import { guard, say } from "./messages.js";
 import { drawPoint, drawWay, pointColor } from "./paint.js";
+import { dot, row } from "./rows.js";
 
 const find = (id) => document.getElementById(id);
 const NEAR = 9; // CSS pixels
@@ -184,45 +185,31 @@ export class TracksMode {
   }
 
   row(point, index) {
-    const row = document.createElement("li");
-    row.classList.toggle("chosen", index === this.chosen);
-    const dot = document.createElement("i");
-    dot.className = "dot";
-    dot.style.background = pointColor(index);
-    const name = document.createElement("span");
-    name.textContent = point.name;
-    const count = document.createElement("small");
     const world = this.followed.get(point.name)?.world ?? [];
-    count.textContent = `${world.filter(Boolean).length} of ${this.app.frames} frames`;
-    const remove = document.createElement("button");
-    remove.textContent = "✕";
-    remove.ariaLabel = `Remove ${point.name}`;
-    remove.onclick = (event) => {
-      event.stopPropagation();
-      this.removePoint(index);
-    };
-    row.append(dot, name, count, remove);
-    row.onclick = () => {
-      this.chosen = index;
-      this.refresh();
-    };
-    return row;
+    return row({
+      sign: dot(pointColor(index)),
+      text: point.name,
+      count: `${world.filter(Boolean).length} of ${this.app.frames} frames`,
+      chosen: index === this.chosen,
+      remove: () => this.removePoint(index),
+      pick: () => {
+        this.chosen = index;
+        this.refresh();
+      },
+    });
   }
 
   noteRow(note) {
-    const row = document.createElement("li");
-    const dot = document.createElement("i");
-    dot.className = "dot";
-    dot.style.background = pointColor(this.points.findIndex((point) => point.name === note.point));
-    const text = document.createElement("span");
+    const index = this.points.findIndex((point) => point.name === note.point);
     const frames = note.first === note.last ? `frame ${note.first}` : `frames ${note.first}–${note.last}`;
-    text.textContent = `${note.point}, ${note.camera === null ? "" : `camera ${note.camera}, `}${frames}: ${note.text}`;
-    row.append(dot, text);
-    row.onclick = () => {
-      this.chosen = this.points.findIndex((point) => point.name === note.point);
-      this.app.go(note.frame, note.camera ?? this.app.camera);
-    };
-    return row;
+    return row({
+      sign: dot(pointColor(index)),
+      text: `${note.point}, ${note.camera === null ? "" : `camera ${note.camera}, `}${frames}: ${note.text}`,
+      pick: () => {
+        this.chosen = this.points.findIndex((point) => point.name === note.point);
+        this.app.go(note.frame, note.camera ?? this.app.camera);
+      },
+    });
   }
 
   bars() {

@@ -1,0 +1,154 @@
+"""The commands of the page's tutorial run as they stand there, in their order, on frames as a camera writes them.
+
+What a user does in the browser is done by a stand-in: it draws an outline of the object and a line along the hand.
+"""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from importlib.resources import files
+from io import StringIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.annotate.server import Server
+from neuspring.perception.marks import MARKS, Mark, Marks
+from tests.support.filmed import film
+from tests.support.project import copy_workflow, jobs_in, output_of, start
+
+PAGE = files("neuspring.perception").joinpath("README.md").read_text()
+STEPS = re.split(r"^## \d+\. ", PAGE.split("\n## What to know")[0], flags=re.MULTILINE)[1:]
+"""Each step of the tutorial: its title and text."""
+SIZE = (240, 160)
+OUTLINE = 2.0
+"""How far, pixels, the drawn outline may be off."""
+
+
+def step(title: str) -> str:
+    """The step with this title."""
+    [found] = [step for step in STEPS if step.startswith(title)]
+    return found
+
+
+def blocks(text: str) -> list[str]:
+    """What stands in a step between fences."""
+    return re.findall(r"```\n(.*?)```", text, re.DOTALL)
+
+
+def shown(title: str) -> list[list[str]]:
+    """The commands of a step, in words; a backslash at the end of a line continues it."""
+    return [shlex.split(line) for block in blocks(step(title)) for line in block.replace("\\\n", " ").splitlines()]
+
+
+def camera_files(folder: Path) -> Capture:
+    """What step 1 of the page asks for: color and depth (mm) as numbered PNG, intrinsics; returns the film with its true masks."""
+    filmed = film(folder / "film", cameras=1, sizes=[SIZE])
+    for kind in ("color", "depth"):
+        (folder / "FILES" / kind).mkdir(parents=True)
+    for frame in range(filmed.frame_count):
+        depth = np.round(1000 * filmed.depth("0", frame)).astype(np.uint16)
+        for kind, image in (("color", filmed.colour("0", frame)[..., ::-1]), ("depth", depth)):
+            assert cv2.imwrite(str(folder / "FILES" / kind / f"{frame:06d}.png"), image)
+    k = filmed.cameras["0"].intrinsics
+    named = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
+    (folder / "FILES" / "intrinsics.json").write_text(json.dumps(named))
+    return filmed
+
+
+def draw(folder: Path, mask: np.ndarray) -> None:
+    """Marks on frame 0, as a user draws them: an outline of the object, a line along the hand."""
+    contours, _ = cv2.findContours((mask == OBJECT).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = cv2.approxPolyDP(max(contours, key=cv2.contourArea), OUTLINE, True)[:, 0]
+    hand = np.argwhere(mask == HANDS)[:, ::-1]
+    ends = [np.quantile(hand, share, axis=0) for share in (0.4, 0.6)]
+    marks = [("object", "polygon", outline), ("hand", "scribble", ends)]
+    own = [
+        Mark(frame=0, label=label, kind=kind, points=tuple((float(x), float(y)) for x, y in points), radius=OUTLINE)
+        for label, kind, points in marks
+    ]
+    Marks(cameras={"0": tuple(own)}).save(folder / MARKS)
+
+
+def run(words: list[str], folder: Path) -> str:
+    """Run the workflow as a command of the page says."""
+    assert words[0] == ".venv/bin/snakemake"
+    return output_of(start([sys.executable, "-m", "snakemake", *words[1:]], folder))
+
+
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory):
+    """The project's folder after steps 1 to 7, with what they said."""
+    project = copy_workflow(tmp_path_factory.mktemp("tutorial") / "project")
+    filmed = camera_files(project)
+    said: dict[str, str] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(project)
+        patch.delenv("DISPLAY", raising=False)
+        patch.setattr(Server, "serve_forever", lambda _: draw(project / "captures" / "my_toy", filmed.mask("0", 0)))
+        for title in ("Make a capture", "Check it", "Mark object and hands"):
+            for number, words in enumerate(shown(title)):
+                assert words[0] == ".venv/bin/neuspring"
+                with redirect_stdout(StringIO()) as stream:
+                    status = main(words[1:])
+                said[f"{title} {number}"] = stream.getvalue()
+                assert status == 0, stream.getvalue()
+    # The shell is asked, as the line writes tabs and redirects.
+    [line] = blocks(step("Name the scenario"))
+    subprocess.run(["/bin/sh", "-c", line], check=True, cwd=project)
+    return project, filmed, said
+
+
+def test_every_step_is_tried_here():
+    """A step that is added, or a command in another place, must be tried too."""
+    tried = ("Make a capture", "Check it", "Mark object and hands", "Name the scenario", "Ask what it costs")
+    tried += ("Look at what was perceived", "Make the twin")
+    assert tuple(step.split("\n")[0] for step in STEPS if blocks(step)) == tried
+    assert [words[1] for words in shown("Mark object and hands")] == ["annotate", "mask", "check-data"]
+
+
+def test_the_last_command_is_the_one_that_was_planned_and_begun():
+    """It takes minutes, and is tried in its parts: the dry run and perception below, the rest in tests/dag."""
+    [asked], [look], [made] = (shown(title) for title in ("Ask what it costs", "Look at what was perceived", "Make the twin"))
+    assert asked == [*made, "--dry-run"]
+    assert look == [*made, "--until", "observe"]
+
+
+def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
+    project, filmed, said = followed
+    capture = Capture.load(project / "captures" / "my_toy")
+    assert capture.frame_count == filmed.frame_count
+    height = capture.cameras["0"].camera_to_world[2, 3] - filmed.cameras["0"].camera_to_world[2, 3]
+    assert abs(height) < 2e-3
+    assert "table: " in said["Make a capture 0"] and "depth: " in said["Make a capture 0"]
+    assert "0 errors" in said["Check it 0"] and "neuspring annotate captures/my_toy" in said["Check it 0"]
+    assert "Annotate captures/my_toy at http://127.0.0.1:" in said["Mark object and hands 0"]
+    assert "look at captures/my_toy/mask_0.png" in said["Mark object and hands 1"]
+    assert (capture.folder / "mask_0.png").exists()
+    assert "0 errors" in said["Mark object and hands 2"] and "no masks yet" not in said["Mark object and hands 2"]
+    for frame in range(capture.frame_count):
+        for label in (OBJECT, HANDS):
+            ours, true = (masks.mask("0", frame) == label for masks in (capture, filmed))
+            assert (ours & true).sum() / (ours | true).sum() > 0.9, (frame, label)
+
+
+def test_the_dry_run_tells_the_minutes_and_perception_makes_the_pictures(followed):
+    project, _, _ = followed
+    [asked] = shown("Ask what it costs")
+    output = run(asked, project)
+    assert re.search(r"Expected: \d+ jobs, \d+ CPU-minutes?", output)
+    assert jobs_in(output)["score"] == 5
+    [look] = shown("Look at what was perceived")
+    assert jobs_in(run(look, project)) == {"segment": 1, "track": 1, "lift": 1, "observe": 1}
+    folder = project / "results" / "own" / "my_toy"
+    assert (folder / "observations.npz").exists()
+    pictures = re.findall(r"^\| `([\w/]+\.png)` \|", PAGE, re.MULTILINE)
+    assert set(pictures) == {"0/masks.png", "0/tracks.png", "lifted.png"}
+    assert all((folder / "perception" / name).exists() for name in pictures)
