@@ -19,6 +19,14 @@ if TYPE_CHECKING:
 LABEL = "NeuSpring"
 VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9}))?")
 """The page, and a frame of it."""
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+}
+"""Of every file of the page."""
+PAGE_HEADERS = {"Cache-Control": "no-store"}
+"""Of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
 INSTALL = "Install it: pip install 'neuspring[play]'."
 
 
@@ -122,7 +130,12 @@ def _guarded(host: str, asked: Callable[[int], object]) -> Iterator[list[bool]]:
             frame = asked_frame(request.path)
             if frame is not None:
                 asked(frame)
-            return process_request(connection, request)
+            answer = process_request(connection, request)
+            if answer is not None:
+                answer.headers.update(HEADERS)
+                if answer.headers.get("Content-Type", "").startswith("text/html"):
+                    answer.headers.update(PAGE_HEADERS)
+            return answer
 
         return original(*arguments, process_request=checked, **options)
 

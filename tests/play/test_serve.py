@@ -54,6 +54,14 @@ def test_no_path_leads_to_a_file_of_this_machine(server, path):
     assert status(server, path) == 404
 
 
+def test_a_browser_keeps_no_page_whose_connection_would_go_on(server):
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=20)
+    connection.request("GET", "/")
+    answer = connection.getresponse()
+    connection.close()
+    assert (answer.getheader("Cache-Control"), answer.getheader("X-Frame-Options")) == ("no-store", "DENY")
+
+
 @pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Sec-Fetch-Site": "cross-site"}])
 @pytest.mark.parametrize("upgrade", [{}, UPGRADE], ids=["page", "socket"])
 def test_pages_of_other_sites_are_refused(server, headers, upgrade):

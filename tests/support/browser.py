@@ -67,8 +67,8 @@ class Browser:
         os.close(from_browser)
         self._write, self._read, self._numbers, self._buffer = ours, theirs, itertools.count(1), b""
         self.events: list[dict[str, Any]] = []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
         self.online(self._served)
@@ -125,6 +125,10 @@ class Browser:
         self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self._message()
+
+    def close(self) -> None:
+        """Close the tab as a person does."""
+        self.call("Target.closeTarget", targetId=self._target)
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""

@@ -5,15 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.support.browser import Browser
 
 WINDOW = (1100, 720)
-STEPS = 15
+SMALL = (800, 480)
+"""Pixels; a scene is drawn by software where there is no GPU, so that tests take a small one."""
+STEPS = 6
+COLORED = 40
+"""Least difference of the channels of a pixel that is no shade of gray."""
 
 
 def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
@@ -23,6 +29,19 @@ def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
         assert time.monotonic() < end, "it did not come true"
         time.sleep(0.05)
     return value
+
+
+def settled(server: Any, browser: Browser) -> Any:
+    """The camera of the first browser, once the server knows the view that is drawn: its size, and a place that stays."""
+    camera = next(iter(server.get_clients().values())).camera
+
+    def steady() -> bool:
+        before = (camera.image_width, *camera.position)
+        time.sleep(0.5)
+        return before == (browser.run("document.querySelector('canvas').clientWidth"), *camera.position)
+
+    until(steady)
+    return camera
 
 
 def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
@@ -38,6 +57,20 @@ def choose_tab(browser: Browser, name: str) -> None:
     tab = f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r})"
     box = browser.run(f"JSON.parse(JSON.stringify({tab}.getBoundingClientRect()))")
     browser.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+
+
+def colored(browser: Browser, path: Path) -> np.ndarray:
+    """Which pixels of the window [H, W] have a color, in a picture that is written to a path."""
+    browser.screenshot(path)
+    image = cv2.imread(str(path))
+    assert image is not None
+    return np.ptp(image.astype(int), axis=2) > COLORED
+
+
+def until_drawn(browser: Browser, x: float, y: float, path: Path) -> None:
+    """Wait until something with a color is drawn at a place of the window: a browser draws later than it is told."""
+    rows, columns = (slice(round(value) - 1, round(value) + 2) for value in (y, x))
+    until(lambda: colored(browser, path)[rows, columns].any())
 
 
 @contextmanager
