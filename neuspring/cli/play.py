@@ -59,7 +59,8 @@ def _evaluate(a: Namespace, found: Scene, own: Run, controls: Controls) -> None:
     from neuspring.play.scoring import comparison
 
     if a.compare:
-        print(comparison(found, controls, own))
+        for line in comparison(found, controls, own):
+            print(line, flush=True)
     if a.video:
         film = write_film(found, own, controls, a.video, a.camera)
         print(f"Wrote {film.path}: {film.frames} frames, {film.kind}" + (f" ({film.reason})" if film.reason else ""))

@@ -140,14 +140,17 @@ class Difference:
     """Why one of them ended earlier."""
 
 
-def compare(controls: Controls, own: Twin, other: Twin) -> Difference:
-    """The controls on two twins of one scenario, whose nodes are the same points. Raises InputError where they are not."""
+def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None = None) -> Difference:
+    """The controls on two twins of one scenario, whose nodes are the same points; `seen`: the first one's motion, where it is known.
+
+    Raises InputError where the nodes are others.
+    """
     if own.topology.nodes.shape != other.topology.nodes.shape or not np.allclose(
         own.topology.nodes, other.topology.nodes, atol=1e-5
     ):
         rule = "both twins must have the same nodes in frame 0"
         raise InputError("twins", rule, [len(own.topology.nodes), len(other.topology.nodes)], "Compare twins of one scenario.")
-    first, second = replay(own, controls), replay(other, controls)
+    first, second = seen or replay(own, controls), replay(other, controls)
     frames = min(len(first.positions), len(second.positions))
     distance = np.linalg.norm(first.positions[1:frames].astype(float) - second.positions[1:frames], axis=2)
     if not distance.size:

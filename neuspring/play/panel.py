@@ -17,7 +17,7 @@ from neuspring.play.player import Player
 if TYPE_CHECKING:
     import viser
 
-DRAG = "Drag a node or a hand (red) with the left button; drag beside them to turn"
+DRAG = "Start, then drag a node or a hand (red) with the left button. Drag beside them to turn the view."
 REPEAT = "Hands move as recorded, while you pull elsewhere. Switching begins again."
 FROM = "Begins in the state of the prediction in this frame"
 
@@ -37,7 +37,8 @@ class LivePanel:
         self.twin = gui.add_dropdown("Twin", tuple(names))
         self.frame = gui.add_slider("From frame", 0, player.clock.count - 1, 1, 0, hint=FROM)
         self.repeat = gui.add_checkbox("Hands repeat the recording", False, hint=REPEAT)
-        self.switch = gui.add_button("Start", hint=DRAG)
+        gui.add_html(f"<div style='margin:0 .8em;font-size:.8em'>{DRAG}</div>")
+        self.switch = gui.add_button("Start")
         self.again = gui.add_button("Reset", disabled=True)
         self.save = gui.add_button("Save recording", disabled=True, hint="What was done since the last reset")
         self.most = gui.add_slider("Red above", 0.05, 2.0, 0.05, TOO_MUCH, hint="strain l / l0 − 1")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from neuspring.core.errors import InputError
-from neuspring.play.controls import Controls, compare
+from neuspring.play.controls import Controls, compare, replay
 from neuspring.play.results import Run, Scene
 
 
@@ -21,20 +22,20 @@ def pulled_run(found: Scene, controls: Controls, path: Path) -> Run:
     )
 
 
-def comparison(found: Scene, controls: Controls, own: Run) -> str:
+def comparison(found: Scene, controls: Controls, own: Run) -> Iterator[str]:
     """A line per twin: how far its nodes are from those of the twin that was pulled, under the same controls."""
     assert own.twin is not None
-    lines = [f"{len(controls.grabbed)} frames recorded with {own.name}; distances of nodes to it, mm"]
-    lines.append(f"{'run':32} {'mean':>8} {'last':>8} {'worst':>8}")
+    yield f"{len(controls.grabbed)} frames recorded with {own.name}; distances of nodes to it, mm"
+    yield f"{'run':32} {'mean':>8} {'last':>8} {'worst':>8}"
+    seen = replay(own.twin, controls)
     for run in found.runs:
         if run is own or run.twin_path is None:
             continue
         try:
             assert run.twin is not None
-            result = compare(controls, own.twin, run.twin)
+            result = compare(controls, own.twin, run.twin, seen)
         except InputError as error:
-            lines.append(f"{run.name:32} {error}")
+            yield f"{run.name:32} {error}"
             continue
         numbers = " ".join(f"{1e3 * value:8.1f}" for value in (result.mean, result.last, result.worst))
-        lines.append(f"{run.name:32} {numbers}  {result.diverged}".rstrip())
-    return "\n".join(lines)
+        yield f"{run.name:32} {numbers}  {result.diverged}".rstrip()

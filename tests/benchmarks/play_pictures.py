@@ -65,8 +65,8 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
     """A twin that is pulled too far."""
-    choose_tab(browser, "Live")
     page.panel.start(page.player.look.shown[0])
+    choose_tab(browser, "Live")
     one = page.panel.live
     assert one is not None
     until(lambda: one.simulator.frame > 5, PATIENCE)

@@ -53,10 +53,15 @@ def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
 
 
 def choose_tab(browser: Browser, name: str) -> None:
-    """Click a tab of the panel with the mouse; viser's tabs do not listen to a script's clicks."""
+    """Click a tab of the panel with the mouse, until it is open: viser's tabs do not listen to a script's clicks, and may move."""
     tab = f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r})"
-    box = browser.run(f"JSON.parse(JSON.stringify({tab}.getBoundingClientRect()))")
-    browser.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+
+    def is_open() -> bool:
+        box = browser.run(f"JSON.parse(JSON.stringify({tab}.getBoundingClientRect()))")
+        browser.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+        return bool(browser.run(f"{tab}.getAttribute('aria-selected') === 'true'"))
+
+    until(is_open)
 
 
 def colored(browser: Browser, path: Path) -> np.ndarray:
