@@ -13,7 +13,7 @@ export DO_NOT_TRACK = true
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
-	@echo "Creating .venv with $(PYTHON) (two to four minutes, 2.6 GB)"
+	@echo "Creating .venv with $(PYTHON) (two to four minutes, 2.9 GB)"
 	$(PYTHON) -m venv .venv
 	PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@touch $@
