@@ -101,7 +101,9 @@ class Live:
             self._strain_text(),
             escape(self.message),
         ]
-        return f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{'<br>'.join(line for line in lines if line)}</div>"
+        return (
+            f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{'<br>'.join(line for line in lines if line)}</div>"
+        )
 
     def _strain_text(self) -> str:
         """The largest strain; a warning where it is above what is red."""
