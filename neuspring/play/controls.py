@@ -141,7 +141,7 @@ class Difference:
 
 
 def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None = None) -> Difference:
-    """The controls on two twins of one scenario, whose nodes are the same points; `seen`: the first one's motion, where it is known.
+    """The controls on two twins of one scenario, whose nodes are the same points; `seen`: the motion of `own`, if known.
 
     Raises InputError where the nodes are others.
     """
