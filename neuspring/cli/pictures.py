@@ -37,6 +37,7 @@ class Chosen:
     """The runs of a picture, and how they are drawn."""
 
     found: Found
+    runs: list[Run]
     takes: list[Take]
     images: Images
     device: str
@@ -74,7 +75,7 @@ def twin(a: Namespace) -> None:
     sheet.require_size(a.width, a.dpi)
     chosen = _choose(a, positions=a.frame > 0)
     _frames([a.frame], chosen.found.observations.scenario.frame_count, "--frame")
-    for take, run in zip(chosen.takes, _named(a, chosen.found), strict=True):
+    for take, run in zip(chosen.takes, chosen.runs, strict=True):
         if take.twin is None:
             rule = "must have a twin"
             raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Name methods with a search.")
@@ -97,7 +98,7 @@ def _choose(a: Namespace, *, positions: bool = True) -> Chosen:
     labels = a.labels or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
     if len(labels) != len(runs):
         raise InputError("--labels", f"one name for each of {len(runs)} methods is required", len(labels))
-    return Chosen(found, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], images, device)
+    return Chosen(found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], images, device)
 
 
 def _named(a: Namespace, found: Found) -> list[Run]:
@@ -131,18 +132,25 @@ def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") 
     return list(wanted or ())
 
 
+def _without_splats(chosen: Chosen) -> str:
+    """The runs that have no splats, and why where that is known; empty if all have some."""
+    return "; ".join(", ".join([run.name, *run.notes]) for run in chosen.runs if run.splats is None)
+
+
 def _require_splats(chosen: Chosen, remedy: str) -> None:
-    without = [take.label for take in chosen.takes if take.splats is None]
-    if without:
+    if without := _without_splats(chosen):
         rule = f"needs {chosen.found.folder / 'appearance'}/<seed>/splats.ply, of a scenario with images"
-        raise InputError("--as splats", rule, f"none for {', '.join(without)}", remedy)
+        raise InputError("--as splats", rule, f"none for {without}", remedy)
 
 
 def _painter(a: Namespace, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
     """What paints a strip or a film; `error` is what is drawn where nothing is asked for, None for the best there is."""
     if a.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw nodes.")
-    style: Style = a.style or ("splats" if all(take.splats for take in chosen.takes) else "nodes")
+    without = _without_splats(chosen)
+    style: Style = a.style or ("nodes" if without else "splats")
+    if without and a.style is None and chosen.found.capture is not None:
+        print(f"Nodes are drawn, since there are no splats for {without}")
     scene = _scene(a, chosen, frames, chosen.takes)
     comparable = style == "splats" and scene.has_masks
     if a.error == "color" and not comparable:

@@ -75,5 +75,3 @@ def painter(scenario: Path, frames: Sequence[int], **manner: object) -> Painter:
         scene = Scene.of(seen, seen_from(points, seen.scenario.up, 250.0, 20.0), shown, frames)
     plain = {"style": "nodes", "error": "distance", "ground": "white"}
     return Painter(scene, shown, frames, Manner(**(plain | manner)), Images(), "cpu")
-
-

@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.collections import PathCollection
 
+from neuspring.config.images import Images
 from neuspring.report.paper.cells import ERRORS, MM, Painter, distances
 from neuspring.report.paper.scene import Scene
 from neuspring.report.paper.strip import caption, rows_of, strip_figure
@@ -54,7 +55,7 @@ def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plai
     assert len(lefts) == len(FRAMES)
     # No panel leaves the page, and none lies over another.
     boxes = [axis.get_position() for axis in panels.ravel()]
-    assert all(0 <= box.x0 and box.x1 <= 1 and 0 <= box.y0 and box.y1 <= 1 for box in boxes)
+    assert all(min(box.x0, box.y0) >= 0 and max(box.x1, box.y1) <= 1 for box in boxes)
     assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
     words = [text.get_text() for text in figure.texts]
     assert {"observed", *METHODS, "training", "future", "frame 5, 0.17 s"} <= set(words)
@@ -111,18 +112,12 @@ def test_pictures_that_agree_have_no_difference(video):
 def test_hands_are_gray_and_not_compared(video):
     paints = painter(video, (0,), style="splats", error="color")
     whole = replace(paints.scene, box=(0, 0, paints.scene.camera.width, paints.scene.camera.height))
-    again = Painter(whole, paints.takes, (0,), paints.manner, images(), "cpu")
+    again = Painter(whole, paints.takes, (0,), paints.manner, Images(), "cpu")
     drawn = again._drawn[0][0]
     assert drawn.hands[:12, :12].all() and np.isnan(drawn.difference[:12, :12]).all()
     axis = plt.figure().add_axes((0, 0, 1, 1))
     again.error(axis, 0, 0)
     assert (axis.images[0].get_array()[2, 2] == 200).all()
-
-
-def images():
-    from neuspring.config.images import Images
-
-    return Images()
 
 
 def test_the_observed_row_shows_the_photo_masked_or_whole(video):
@@ -141,7 +136,7 @@ def test_the_observed_row_shows_the_photo_masked_or_whole(video):
 def test_a_frame_that_a_camera_missed_and_one_behind_a_divergence_say_so(tmp_path):
     paints = painter(filmed(tmp_path, missing=(4,)), (0, 4), style="splats", error="color")
     short = replace(paints.takes[1], positions=paints.takes[1].positions[:3])
-    paints = Painter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, images(), "cpu")
+    paints = Painter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, Images(), "cpu")
     panels = grid(strip_figure(paints, 6.0), 5, 2)
     words = [[text.get_text() for text in axis.texts] for axis in panels[:, 1]]
     assert words == [["camera 0 missed it"], [], ["no picture"], ["diverged"], []]
