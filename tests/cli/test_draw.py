@@ -107,7 +107,7 @@ def test_help_names_the_kinds(capsys):
         (["strip", "--methods", "baseline/7"], "received baseline/7"),
         (["strip", "--frames", "0", "8"], "--frames: the scenario has the frames 0 to 7; received 8"),
         (["strip", "--camera", "1"], "--camera: must be a camera of the capture: there is none; received 1. Give --azimuth"),
-        (["strip", "--as", "splats"], "splats.ply, of a scenario with images; received none for neuspring/0; baseline/0. Leave out"),
+        (["strip", "--as", "splats"], "of a scenario with images; received none for neuspring/0; baseline/0. Leave out"),
         (["strip", "--error", "color"], "--error color: needs splats, and photos with masks of the same camera; received nodes"),
         (["strip", "--background", "image"], "--background image: needs a camera of a capture"),
         (["strip", "--labels", "one"], "--labels: one name for each of 2 methods is required; received 1"),

@@ -140,7 +140,7 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     if errors:
         panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
-        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label.replace(" to ", "\nto "), extend="max")
+        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label.replace(" to observed points", ""), extend="max")
     clock = place(figure, EDGE, total - EDGE - CLOCK, width - 2 * EDGE, CLOCK)
     return figure, panels, clock
 

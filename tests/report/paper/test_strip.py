@@ -142,6 +142,20 @@ def test_a_frame_that_a_camera_missed_and_one_behind_a_divergence_say_so(tmp_pat
     assert words == [["camera 0 missed it"], [], ["no picture"], ["diverged"], []]
 
 
+def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):
+    paints = painter(video, (0, 5), style="splats", error="none")
+    take = paints.takes[0]
+    # The nodes stand still; the splats rise by a tenth of the picture.
+    still = replace(take, positions=np.repeat(take.positions[:1], 8, axis=0))
+    up = 0.1 * np.ptp(take.positions[0], axis=0).max() * np.arange(8)[:, None, None] / 5 * np.array([0, 0, 1.0])
+    own = replace(still, centers=(take.splats.means + up).astype(np.float32))
+    rows = []
+    for shown in (still, own):
+        again = Painter(paints.scene, [shown], (0, 5), paints.manner, Images(), "cpu")
+        rows.append([np.flatnonzero((again._drawn[0][frame].rgba[..., 3] > 128).any(axis=1)).mean() for frame in (0, 5)])
+    assert rows[0][0] == rows[0][1] and rows[1][0] == rows[0][0] and rows[1][1] < rows[1][0] - 3
+
+
 def test_a_far_prediction_does_not_shrink_the_picture(plain):
     paints = painter(plain, (0, 7))
     far = replace(paints.takes[1], positions=paints.takes[1].positions + np.float32(50.0))
