@@ -33,8 +33,8 @@ HIDDEN = 200
 """Gray of hands, behind which nothing is compared."""
 LEAST_MM = 1.0
 """Least upper end of a range of distances."""
-NOTE = 7.0
-"""Size of the text in a panel, points."""
+NOTE, SMALLEST = 7.0, 5.0
+"""Size of the text in a panel, points; the smallest is for narrow panels, of which it must not hide much."""
 CORNER = (0.4, 0.2)
 """Width and height of a note, of a panel."""
 MM = 1e3
@@ -202,7 +202,8 @@ class Painter:
         place: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if upper else "bottom"}
         box: dict[str, Any] = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
         x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
-        axis.text(x, y, text, fontsize=NOTE, bbox=box, transform=axis.transAxes, zorder=9, **place)
+        size = float(np.clip(0.075 * points_across(axis), SMALLEST, NOTE))
+        axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
 
     def _points(
         self, axis: Axes, points: np.ndarray, color: str | None = None, *, values: np.ndarray | None = None, alpha: float = 1.0
