@@ -25,6 +25,8 @@ OWN_THREADS = ("search",)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["draw"]:
+        words = importlib.import_module("neuspring.cli.draw").words(words)
     for name in THREADS:
         os.environ.setdefault(name, _threads(words))
     parsed = _parser(words[0] if words else "").parse_args(words)
@@ -66,7 +68,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
 
 def _functions(command: str) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int | None]]:
     """What adds a command's options, and what runs it."""
-    if command in STAGES or command == "draw":
+    if command in STAGES:
         module = importlib.import_module(f"neuspring.stages.{command}")
         return module.options, module.command
     module, name = importlib.import_module(TOOLS[command][0]), command.replace("-", "_")

@@ -1,7 +1,7 @@
 """The commands around the workflow: `TOOLS` names the module that has them, as functions `NAME` and `NAME_options`."""
 
 TOOLS = {
-    "draw": ("neuspring.stages.draw", "splats and trajectory -> RGBA pictures of any camera"),
+    "draw": ("neuspring.cli.draw", "film strips, twins and films of runs, for papers; single frames of splats"),
     "export": ("neuspring.cli.export", "a twin -> USD, PLY, SPZ, Newton, MuJoCo, or npz with a JSON description"),
     "fetch": ("neuspring.cli.data", "released archives -> the folders that the readers expect"),
     "make-capture": ("neuspring.cli.intake", "color and depth of a camera -> a capture folder"),

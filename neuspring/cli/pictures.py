@@ -1,0 +1,201 @@
+"""What `neuspring draw strip`, `twin` and `film` draw: runs are chosen and read here, and what cannot be drawn is refused."""
+
+from __future__ import annotations
+
+import math
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.config.images import Images
+from neuspring.core.device import resolve_device
+from neuspring.core.errors import InputError
+from neuspring.core.records import StageRecord
+from neuspring.data.capture import Camera, Capture
+from neuspring.perception.results import Masks
+from neuspring.play.results import Run, find
+from neuspring.play.results import Scene as Found
+from neuspring.report.figures.run import chosen_frames
+from neuspring.report.paper import sheet
+from neuspring.report.paper.body import Body, body_figure
+from neuspring.report.paper.cells import Error, Manner, Painter, Style
+from neuspring.report.paper.film import write_film
+from neuspring.report.paper.look import broad_side, seen_from
+from neuspring.report.paper.scene import Scene, Take, shown_points
+from neuspring.report.paper.strip import caption, strip_figure
+from neuspring.stages import options as shared
+
+ELEVATION = 25.0
+"""Degrees above the horizon of a view that is not asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The runs of a picture, and how they are drawn."""
+
+    found: Found
+    runs: list[Run]
+    takes: list[Take]
+    images: Images
+    device: str
+
+
+def strip(a: Namespace) -> None:
+    """`neuspring draw strip`."""
+    sheet.require_ending(a.output, sheet.PICTURES)
+    sheet.require_size(a.width, a.dpi)
+    chosen = _choose(a)
+    scenario = chosen.found.observations.scenario
+    frames = sorted(set(_frames(a.frames, scenario.frame_count) or chosen_frames(scenario, scenario.frame_count)))
+    painter = _painter(a, chosen, frames, None)
+    figure = strip_figure(painter, a.width)
+    width, height = figure.get_size_inches()
+    sheet.save(figure, a.output, a.dpi)
+    print(f"Wrote {a.output}: {len(frames)} frames, {width:.2f} x {height:.2f} inches, {painter.manner.style}")
+    print(f"Caption: {caption(painter)}")
+
+
+def film(a: Namespace) -> None:
+    """`neuspring draw film`."""
+    sheet.require_ending(a.output, sheet.FILMS)
+    chosen = _choose(a)
+    count = chosen.found.observations.scenario.frame_count
+    frames = sorted(set(_frames(a.frames, count) or range(count)))
+    painter = _painter(a, chosen, frames, "none")
+    made = write_film(painter, a.output, a.width, a.speed, a.megabytes)
+    print(f"Wrote {a.output}: {made}, {painter.manner.style}")
+
+
+def twin(a: Namespace) -> None:
+    """`neuspring draw twin`."""
+    sheet.require_ending(a.output, sheet.PICTURES)
+    sheet.require_size(a.width, a.dpi)
+    chosen = _choose(a, positions=a.frame > 0)
+    _frames([a.frame], chosen.found.observations.scenario.frame_count, "--frame")
+    for take, run in zip(chosen.takes, chosen.runs, strict=True):
+        if take.twin is None:
+            rule = "must have a twin"
+            raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Name methods with a search.")
+        if a.frame >= len(take.positions):
+            raise InputError("--frame", f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged", a.frame)
+    if a.style == "splats":
+        _require_splats(chosen, "Leave out --as splats to draw springs.")
+    scene = _scene(a, chosen, [a.frame], chosen.takes)
+    if a.background == "image" and scene.photo(a.frame) is None:
+        raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
+    body = Body(scene, chosen.takes, a.frame, tuple(dict.fromkeys(a.by)), a.style, a.background, chosen.images, chosen.device)
+    sheet.save(body_figure(body, a.width), a.output, a.dpi)
+    print(f"Wrote {a.output}: {', '.join(take.label for take in chosen.takes)}, frame {a.frame}, camera {scene.camera.name}")
+
+
+def _choose(a: Namespace, *, positions: bool = True) -> Chosen:
+    """The runs that are named, read. Raises InputError."""
+    device, images, found = resolve_device(a.device), shared.read_settings(a.settings).images, find(a.results)
+    runs = _named(a, found)
+    labels = a.labels or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
+    if len(labels) != len(runs):
+        raise InputError("--labels", f"one name for each of {len(runs)} methods is required", len(labels))
+    return Chosen(found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], images, device)
+
+
+def _named(a: Namespace, found: Found) -> list[Run]:
+    """The runs of --methods in their order; of a method without seed the first one. Without --methods those to begin with."""
+    by_name = {run.name: run for run in found.runs}
+    if not a.methods:
+        return [by_name[name] for name in found.shown]
+    first: dict[str, Run] = {}
+    for run in found.runs:
+        first.setdefault(run.method, run)
+    chosen = [by_name.get(name) or first.get(name) for name in a.methods]
+    unknown = [name for name, run in zip(a.methods, chosen, strict=True) if run is None]
+    if unknown:
+        rule = f"{found.folder} has the methods {', '.join(first)}"
+        raise InputError("--methods", rule, ", ".join(unknown), "Name METHOD or METHOD/SEED.")
+    return [run for run in chosen if run is not None]
+
+
+def _take(run: Run, label: str, positions: bool) -> Take:
+    if run.trajectory is None or not len(run.trajectory.positions):
+        if positions or run.twin is None:
+            raise InputError(f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Name another run.")
+        return Take(label, run.twin.topology.nodes[None], run.twin)
+    return Take(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
+
+
+def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") -> list[int]:
+    beyond = [frame for frame in wanted or () if not 0 <= frame < count]
+    if beyond:
+        raise InputError(option, f"the scenario has the frames 0 to {count - 1}", ", ".join(map(str, beyond)))
+    return list(wanted or ())
+
+
+def _without_splats(chosen: Chosen) -> str:
+    """The runs that have no splats, and why where that is known; empty if all have some."""
+    return "; ".join(", ".join([run.name, *run.notes]) for run in chosen.runs if run.splats is None)
+
+
+def _require_splats(chosen: Chosen, remedy: str) -> None:
+    if without := _without_splats(chosen):
+        rule = f"needs {chosen.found.folder / 'appearance'}/<seed>/splats.ply, of a scenario with images"
+        raise InputError("--as splats", rule, f"none for {without}", remedy)
+
+
+def _painter(a: Namespace, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
+    """What paints a strip or a film; `error` is what is drawn where nothing is asked for, None for the best there is."""
+    if a.style == "splats":
+        _require_splats(chosen, "Leave out --as splats to draw nodes.")
+    without = _without_splats(chosen)
+    style: Style = a.style or ("nodes" if without else "splats")
+    if without and a.style is None and chosen.found.capture is not None:
+        print(f"Nodes are drawn, since there are no splats for {without}")
+    scene = _scene(a, chosen, frames, chosen.takes)
+    comparable = style == "splats" and scene.has_masks
+    if a.error == "color" and not comparable:
+        what = "nodes" if style == "nodes" else f"camera {scene.camera.name} without photos or masks"
+        rule = "needs splats, and photos with masks of the same camera"
+        raise InputError("--error color", rule, what, "Take --error distance.")
+    if a.most is not None and not (math.isfinite(a.most) and a.most > 0):
+        raise InputError("--most", "must be above 0", a.most)
+    if a.background == "image" and scene.capture is None:
+        raise InputError("--background image", "needs a camera of a capture", scene.camera.name, "Leave it out.")
+    manner = Manner(
+        style=style,
+        error=a.error or error or ("color" if comparable else "distance"),
+        ground=a.background or ("image" if style == "nodes" else "white"),
+        most=a.most,
+    )
+    return Painter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
+
+
+def _scene(a: Namespace, chosen: Chosen, frames: list[int], takes: list[Take]) -> Scene:
+    """The scene from the camera that is asked for. Raises InputError."""
+    found, observations = chosen.found, chosen.found.observations
+    cameras = found.capture.cameras if found.capture else {}
+    turned = a.azimuth is not None or a.elevation is not None
+    if a.camera is not None and turned:
+        raise InputError("--camera", "excludes --azimuth and --elevation", a.camera, "Give one or the other.")
+    if a.camera is not None and a.camera not in cameras:
+        rule = f"must be a camera of the capture: {', '.join(cameras) or 'there is none'}"
+        raise InputError("--camera", rule, a.camera, "Give --azimuth and --elevation for any other view.")
+    if cameras and not turned:
+        camera = cameras[a.camera or next(iter(cameras))]
+        return Scene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
+    points = shown_points(observations, takes, frames)
+    azimuth = broad_side(points, observations.scenario.up) if a.azimuth is None else a.azimuth
+    elevation = ELEVATION if a.elevation is None else a.elevation
+    return Scene.of(observations, seen_from(points, observations.scenario.up, azimuth, elevation), takes, frames)
+
+
+def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:
+    """The camera's perceived masks [T, H, W], where the capture has none of its own and they were found."""
+    path = folder / "perception" / camera.name / "masks.json"
+    if capture is None or capture.description.masks or not path.is_file():
+        return None
+    labels = Masks.load(StageRecord.load(path).file("masks", path)).labels
+    shape = (capture.frame_count, camera.height, camera.width)
+    if labels.shape != shape:
+        raise InputError(path, f"masks must have the frames and size of camera {camera.name}: {shape}", labels.shape)
+    return labels

@@ -1,0 +1,255 @@
+"""What stands in one panel: the observed frame, a prediction, or its error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+
+from neuspring.config.images import Images
+from neuspring.core.artifacts import Observations
+from neuspring.report.figures.images import WORST
+from neuspring.report.figures.twin import CONTROLLER
+from neuspring.report.paper.scene import Scene, Take, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.paper.sheet import points_across
+from neuspring.scores.images import psnr
+from neuspring.scores.pictures import Pair
+from neuspring.splats.draw import COVERED, picture, view_of
+from neuspring.splats.rasterise import choose_backend
+
+Style = Literal["splats", "nodes"]
+Error = Literal["color", "distance", "none"]
+Ground = Literal["white", "image"]
+ERRORS = "magma_r"
+"""Light for no error, on white paper; rising in darkness."""
+SEEN, PREDICTED, UNKNOWN = "tab:blue", "#303030", "#d5d5d5"
+"""Observed points; predicted nodes; nodes whose error is not known."""
+HIDDEN = 200
+"""Gray of hands, behind which nothing is compared."""
+LEAST_MM = 1.0
+"""Least upper end of a range of distances."""
+NOTE, SMALLEST = 7.0, 5.0
+"""Size of the text in a panel, points; the smallest is for narrow panels, of which it must not hide much."""
+CORNER = (0.4, 0.2)
+"""Width and height of a note, of a panel."""
+MM = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A prediction as splats in one frame, the shown part of the picture."""
+
+    rgba: np.ndarray
+    """[h, w, 4] uint8, over black."""
+    difference: np.ndarray | None = None
+    """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
+    hands: np.ndarray | None = None
+    psnr: float = float("nan")
+    """Of the whole picture, as in the tables, dB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manner:
+    """How predictions and errors are drawn."""
+
+    style: Style
+    error: Error
+    ground: Ground
+    most: float | None = None
+    """Upper end of the range of errors: of 1 for colors, mm for distances; None: from the data."""
+
+
+def distances(take: Take, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [P] whose point is seen in a frame, and their distances [P], m, to it. Node i is tracked point i."""
+    seen = np.flatnonzero(observations.object_visibility[frame])
+    gap = take.positions[frame][seen].astype(float) - observations.object_points[frame][seen]
+    return seen, np.linalg.norm(gap, axis=1)
+
+
+class Painter:
+    """Paints panels of one scene; all panels share the range of errors."""
+
+    def __init__(
+        self, scene: Scene, takes: Sequence[Take], frames: Sequence[int], manner: Manner, images: Images, device: str
+    ) -> None:
+        self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
+        self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
+        self.norm = Normalize(0, self._most())
+        self._corner = self._free_corner()
+
+    def _splats(self, take: Take, images: Images, device: str) -> dict[int, Drawn]:
+        view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
+        made = {}
+        for frame, gaussians in take.gaussians(self.frames, images, device):
+            rgba = picture(gaussians, view, backend)
+            made[frame] = self._compared(rgba, frame) if self.manner.error == "color" else Drawn(self.scene.cut(rgba))
+        return made
+
+    def _compared(self, rgba: np.ndarray, frame: int) -> Drawn:
+        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        if photo is None or labels is None:
+            return Drawn(self.scene.cut(rgba))
+        pair = Pair.of(photo, rgba, *object_and_hands(labels), COVERED)
+        difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
+        shows = pair.silhouettes[0] | pair.silhouettes[1]
+        cut = self.scene.cut
+        part = cut(np.where(shows & ~pair.hands, difference, np.nan))
+        return Drawn(cut(rgba), part, cut(pair.hands), float(psnr(pair.prediction, pair.truth)))
+
+    def _most(self) -> float:
+        if self.manner.most is not None:
+            return self.manner.most
+        if self.manner.error != "distance":
+            return WORST
+        kept = [
+            distances(take, self.scene.observations, frame)[1]
+            for take in self.takes
+            for frame in self.frames
+            if frame < len(take.positions)
+        ]
+        values = np.concatenate(kept) if kept else np.zeros(0)
+        return _rounded(max(MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
+
+    @property
+    def error_label(self) -> str:
+        """For the color bar."""
+        return "color difference" if self.manner.error == "color" else "distance to observed points [mm]"
+
+    def observed(self, axis: Axes, frame: int) -> None:
+        """The photo, or the observed points where the camera has none."""
+        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        self._empty(axis)
+        if photo is not None:
+            whole = self.manner.ground == "image" or labels is None
+            self._image(axis, photo if whole or labels is None else masked(photo, labels))
+            return
+        if self.scene.capture is not None:
+            self._note(axis, f"camera {self.scene.camera.name} missed it")
+        observations = self.scene.observations
+        self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
+        self._hands(axis, frame)
+
+    def predicted(self, axis: Axes, which: int, frame: int) -> None:
+        """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
+        take, photo = self.takes[which], self.scene.photo(frame)
+        self._empty(axis)
+        below = faded(photo) if photo is not None and self.manner.ground == "image" else None
+        if frame >= len(take.positions):
+            self._note(axis, "diverged")
+            return
+        if self.manner.style == "splats":
+            part = None if below is None else self.scene.cut(below)
+            self._image(axis, over_white(self._drawn[which][frame].rgba, part), cut=False)
+            return
+        if below is not None:
+            self._image(axis, below)
+        else:
+            observations = self.scene.observations
+            self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN, alpha=0.5)
+        self._points(axis, take.positions[frame], PREDICTED)
+        self._hands(axis, frame)
+
+    def error(self, axis: Axes, which: int, frame: int) -> None:
+        """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
+        self._empty(axis)
+        take = self.takes[which]
+        if frame >= len(take.positions):
+            return
+        if self.manner.error == "color":
+            self._difference(axis, self._drawn[which][frame])
+            return
+        seen, distance = distances(take, self.scene.observations, frame)
+        nodes = take.positions[frame]
+        others = np.setdiff1d(np.arange(len(nodes)), seen)
+        self._points(axis, nodes[others], UNKNOWN)
+        pairs = np.stack([self.scene.observations.object_points[frame][seen], nodes[seen]], axis=1)
+        flat = self.scene.view.project(pairs.astype(float))[0]
+        axis.add_collection(LineCollection(list(flat), colors="0.6", linewidths=0.4, zorder=2))
+        self._points(axis, nodes[seen], values=MM * distance)
+        if len(distance):
+            self._note(axis, f"{MM * distance.mean():.1f} mm")
+
+    def _difference(self, axis: Axes, drawn: Drawn) -> None:
+        if drawn.difference is None or drawn.hands is None:
+            self._note(axis, "no picture")
+            return
+        ground = np.full((*drawn.hands.shape, 3), 255, np.uint8)
+        ground[drawn.hands] = HIDDEN
+        self._image(axis, ground, cut=False)
+        shape = drawn.hands.shape
+        axis.imshow(drawn.difference, cmap=ERRORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
+        self._note(axis, f"{drawn.psnr:.1f} dB" if np.isfinite(drawn.psnr) else "equal")
+
+    def _free_corner(self) -> tuple[float, float]:
+        """The corner of all panels (0 or 1 to the right, 0 or 1 upwards) that fewest points of any frame reach into."""
+        view = self.scene.view
+        flat = view.project(shown_points(self.scene.observations, self.takes, self.frames))[0]
+        part = flat / [view.width, view.height]
+        x, y = part[:, 0], 1 - part[:, 1]
+
+        def inside(corner: tuple[float, float]) -> int:
+            return int(((np.abs(x - corner[0]) < CORNER[0]) & (np.abs(y - corner[1]) < CORNER[1])).sum())
+
+        return min(((1.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)), key=inside)
+
+    def _note(self, axis: Axes, text: str) -> None:
+        right, upper = self._corner
+        place: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if upper else "bottom"}
+        box: dict[str, Any] = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
+        x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
+        size = float(np.clip(0.075 * points_across(axis), SMALLEST, NOTE))
+        axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
+
+    def _points(
+        self, axis: Axes, points: np.ndarray, color: str | None = None, *, values: np.ndarray | None = None, alpha: float = 1.0
+    ) -> None:
+        """Points [P, 3], m, as dots, the nearest on top; of one color, or colored by values [P]."""
+        observations = self.scene.observations
+        flat, depth = self.scene.view.project(np.asarray(points, float))
+        order = np.argsort(-depth)
+        order = order[depth[order] > 0]
+        style = {"color": color} if values is None else {"c": values[order], "cmap": ERRORS, "norm": self.norm}
+        edge = {"linewidths": 0.0} if values is None else {"linewidths": 0.25, "edgecolors": "0.45"}
+        # All frames have dots of one size, however many points are seen.
+        nodes = color in (PREDICTED, UNKNOWN)
+        size = self._size(axis, len(observations.nodes) if nodes else observations.object_points.shape[1])
+        axis.scatter(flat[order, 0], flat[order, 1], s=size, alpha=alpha, zorder=3, **style, **edge)
+
+    def _hands(self, axis: Axes, frame: int) -> None:
+        flat, depth = self.scene.view.project(self.scene.hands(frame).astype(float))
+        flat, size = flat[depth > 0], 0.6 * self._size(axis, 100)
+        axis.scatter(flat[:, 0], flat[:, 1], s=size, marker="D", color=CONTROLLER, edgecolors="white", linewidths=0.25, zorder=4)
+
+    def _size(self, axis: Axes, count: int) -> float:
+        """Area of a dot, points^2: a third of what this many dots have if they fill the panel, within what can be seen."""
+        width = points_across(axis)
+        return float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
+
+    def _image(self, axis: Axes, rgb: np.ndarray, *, cut: bool = True) -> None:
+        shown = self.scene.cut(rgb) if cut else rgb
+        axis.imshow(shown, extent=_extent(shown.shape), interpolation="antialiased")
+
+    def _empty(self, axis: Axes) -> None:
+        """A panel of the size of the shown part, its pixel centers at whole coordinates."""
+        view = self.scene.view
+        axis.set(
+            xticks=[], yticks=[], xlim=(-0.5, view.width - 0.5), ylim=(view.height - 0.5, -0.5), aspect="auto", facecolor="white"
+        )
+        axis.set_autoscale_on(False)
+        for side in axis.spines.values():
+            side.set(linewidth=0.5, color="0.7")
+
+
+def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
+    return (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+
+
+def _rounded(value: float) -> float:
+    """The next 1, 2, 3, 5 or 8 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step for step in (1, 2, 3, 5, 8, 10) if step * power >= value * (1 - 1e-9)) * power)

@@ -1,0 +1,210 @@
+"""Short films for a README: observed beside predicted, as MP4 or as GIF that loops, within a size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_atomically
+from neuspring.report.figures.images import FUTURE, TRAINING
+from neuspring.report.figures.views import place
+from neuspring.report.paper.cells import ERRORS, Painter
+from neuspring.report.paper.sheet import TEXT, color_bar, rgb
+from neuspring.report.video import Video
+
+DOTS = 110
+"""Dots per inch at full width, so that text is as tall on a screen as on paper."""
+HEAD, GAP, EDGE, BAR, CLOCK = 0.24, 0.04, 0.03, 0.62, 0.15
+"""Room for names, between panels, at the edges, for the color bar, and for the bar of time, inches."""
+PIXELS, SLOWEST, FASTEST = (160, 1920), 0.05, 8.0
+"""Least and greatest width, and speed."""
+HOLD = 0.8
+"""How long a GIF shows its last frame before it begins again, s."""
+CENTISECOND, SHORTEST = 100, 2
+"""Of a second; browsers take a shorter time of a frame for 10."""
+LARGEST = 100.0
+"""Megabytes."""
+CLOSE = 12
+"""Colors of a palette that differ by no more than this from an exact one are left out."""
+KEYS = 8
+"""Frames from which the colors of a GIF are chosen."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """How coarse a film is: a part of its width, every how manieth frame, and colors (GIF) or the rate factor (MP4)."""
+
+    scale: float
+    every: int
+    quality: int
+
+
+GIF = (Step(1, 1, 128), Step(1, 2, 64), Step(0.75, 2, 64), Step(0.6, 2, 48), Step(0.5, 3, 32), Step(0.35, 4, 32))
+MP4 = (Step(1, 1, 22), Step(1, 1, 28), Step(0.75, 1, 30), Step(0.6, 2, 34), Step(0.4, 2, 38))
+"""The finest first."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was written."""
+
+    frames: int
+    width: int
+    height: int
+    rate: float
+    bytes: int
+    coarser: bool
+
+    def __str__(self) -> str:
+        size = f"{self.bytes / 1e6:.2f} MB" if self.bytes >= 1e5 else f"{self.bytes / 1e3:.0f} kB"
+        text = f"{self.frames} frames of {self.width} x {self.height} pixels, {self.rate:.3g} per second, {size}"
+        return text + (" (coarser than asked for, to fit --megabytes)" if self.coarser else "")
+
+
+def write_film(painter: Painter, path: Path, width: int, speed: float = 1.0, megabytes: float = 2.0) -> Made:
+    """Write the film, coarser by steps until it fits. Raises InputError for a bad size or speed, and where nothing fits."""
+    _require(width, speed, megabytes)
+    rate = painter.scene.observations.scenario.frame_rate * speed
+    gif = path.suffix.lower() == ".gif"
+    smallest = math.inf
+    for number, step in enumerate(GIF if gif else MP4):
+        frames = painter.frames[:: step.every]
+        pictures = list(film_pictures(painter, frames, max(round(step.scale * width), 80)))
+        made = path.with_name(f".{path.name}.try{path.suffix}")
+        try:
+            write = _write_gif if gif else _write_mp4
+            write(made, pictures, rate / step.every, step.quality)
+            size = made.stat().st_size
+            smallest = min(smallest, size)
+            if size <= 1e6 * megabytes:
+                write_atomically(path, made.replace)
+                high, wide = pictures[0].shape[:2]
+                return Made(len(pictures), wide, high, rate / step.every, size, number > 0)
+        finally:
+            made.unlink(missing_ok=True)
+    remedy = "Name fewer --frames or methods, or write .mp4." if gif else "Name fewer --frames or methods."
+    raise InputError("--megabytes", f"the coarsest film has {smallest / 1e6:.2g} MB", megabytes, remedy)
+
+
+def _require(width: int, speed: float, megabytes: float) -> None:
+    for name, value, least, most in (
+        ("--width", width, *PIXELS),
+        ("--speed", speed, SLOWEST, FASTEST),
+        ("--megabytes", megabytes, 0.0, LARGEST),
+    ):
+        if not (least <= value <= most and value > 0):
+            raise InputError(name, f"must be {least:g} to {most:g}" if least else f"must be above 0, at most {most:g}", value)
+
+
+def film_pictures(painter: Painter, frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
+    """Pictures [H, W, 3] uint8, both sides even: observed and the methods side by side, errors below, time on top."""
+    inches = max(width / DOTS, 1.5)
+    figure, panels, clock = _layout(painter, inches)
+    figure.set_dpi(width / inches)
+    canvas = FigureCanvasAgg(figure)
+    try:
+        for frame in frames:
+            _fill(painter, panels, frame)
+            _tell(painter, clock, frame)
+            canvas.draw()
+            shown = np.asarray(canvas.buffer_rgba())[..., :3]
+            yield np.ascontiguousarray(shown[: shown.shape[0] // 2 * 2, : shown.shape[1] // 2 * 2])
+    finally:
+        plt.close(figure)
+
+
+def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], Axes]:
+    """The figure, its panels (observed and methods; below, errors of methods), and the bar of time."""
+    view, columns, errors = painter.scene.view, 1 + len(painter.takes), painter.manner.error != "none"
+    right = BAR if errors else EDGE
+    across = (width - EDGE - right - GAP * (columns - 1)) / columns
+    high = across * view.height / view.width
+    total = EDGE + CLOCK + HEAD + high * (1 + errors) + GAP * errors + EDGE
+    figure = plt.figure(figsize=(width, total), facecolor="white")
+    top = total - EDGE - CLOCK - HEAD
+    lefts = [EDGE + k * (across + GAP) for k in range(columns)]
+    panels = [[place(figure, left, top - high, across, high) for left in lefts]]
+    for left, name in zip(lefts, ["observed", *(take.label for take in painter.takes)], strict=True):
+        figure.text((left + across / 2) / width, (top + 0.05) / total, name, ha="center", va="bottom", fontsize=TEXT)
+    if errors:
+        panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
+        cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
+        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label.replace(" to observed points", ""), extend="max")
+    clock = place(figure, EDGE, total - EDGE - CLOCK, width - 2 * EDGE, CLOCK)
+    return figure, panels, clock
+
+
+def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
+    for row, axes in enumerate(panels):
+        for column, axis in enumerate(axes):
+            axis.clear()
+            if row:
+                painter.error(axis, column, frame)
+            elif column:
+                painter.predicted(axis, column - 1, frame)
+            else:
+                painter.observed(axis, frame)
+
+
+def _tell(painter: Painter, clock: Axes, frame: int) -> None:
+    """The bar of time, filled up to the frame: training and future in their colors, the border in black."""
+    scenario = painter.scene.observations.scenario
+    clock.clear()
+    clock.set(xticks=[], yticks=[], xlim=(0, scenario.frame_count), ylim=(0, 1))
+    style: dict[str, Any] = {"height": 1.0, "align": "center", "linewidth": 0}
+    for start, stop, color in ((0, scenario.train_end, TRAINING), (scenario.train_end, scenario.frame_count, FUTURE)):
+        clock.barh(0.5, stop - start, left=start, color=rgb(color), alpha=0.25, **style)
+        if frame >= start:
+            clock.barh(0.5, min(stop, frame + 1) - start, left=start, color=rgb(color), **style)
+    clock.axvline(scenario.train_end, color="black", linewidth=1.0)
+    words: dict[str, Any] = {"fontsize": TEXT - 1.5, "va": "center_baseline"}
+    margin = 0.006 * scenario.frame_count
+    clock.text(margin, 0.5, "training", ha="left", **words)
+    if scenario.train_end < scenario.frame_count:
+        clock.text(scenario.train_end + margin, 0.5, "future", ha="left", **words)
+    clock.text(scenario.frame_count - margin, 0.5, f"{frame / scenario.frame_rate:.2f} s", ha="right", **words)
+    for side in clock.spines.values():
+        side.set_visible(False)
+
+
+def _write_mp4(path: Path, pictures: Sequence[np.ndarray], rate: float, quality: int) -> None:
+    with Video(path, rate, quality) as video:
+        for picture in pictures:
+            video.add(picture)
+
+
+def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float, colors: int) -> None:
+    """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
+    palette = _palette(pictures, colors)
+    frames = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    ends = np.round(CENTISECOND * np.arange(len(frames) + 1) / rate).astype(int)
+    times = 10 * np.maximum(np.diff(ends), SHORTEST)
+    times[-1] = max(times[-1], round(1000 * HOLD))
+    more = {"duration": times.tolist(), "loop": 0, "optimize": False, "disposal": 1}
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **more)
+
+
+def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
+    """One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
+
+    Paper, text and the bar of time keep their colors exactly; what is close to them is left out, else it might be taken for them.
+    """
+    exact = np.array([(255, 255, 255), (0, 0, 0), TRAINING, FUTURE])
+    keys = np.unique(np.linspace(0, len(pictures) - 1, KEYS).astype(int))
+    every = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(colors - len(exact), method=Image.Quantize.MEDIANCUT)
+    found = np.array(every.getpalette()).reshape(-1, 3)
+    far = np.abs(found[:, None] - exact).max(axis=2).min(axis=1) > CLOSE
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([exact, found[far]]).ravel().tolist())
+    return palette

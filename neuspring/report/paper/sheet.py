@@ -1,0 +1,83 @@
+"""What all pictures for papers share: sizes of text and margins, color bars, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_atomically
+
+TEXT = 8.0
+"""Size of text, points, at the width that the picture is made for."""
+LABEL, HEAD = 0.22, 0.4
+"""Room for the names of rows, and for the head of columns, inches."""
+PICTURES, FILMS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
+WIDTHS, RESOLUTIONS = (1.5, 20.0), (50.0, 1200.0)
+"""Least and greatest width, inches, and dots per inch."""
+JPEG = 90
+
+
+def require_ending(path: Path, endings: Sequence[str]) -> None:
+    """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
+    if path.suffix.lower() not in endings:
+        rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
+        other = FILMS if endings == PICTURES else PICTURES
+        kind = "neuspring draw film" if other == FILMS else "neuspring draw strip"
+        remedy = f"{kind} writes {path.suffix}." if path.suffix.lower() in other else ""
+        raise InputError("--output", rule, path.name, remedy)
+    if path.is_dir():
+        raise InputError("--output", "must be a file", f"the folder {path}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(path.parent, "this folder must be writable", error.strerror, "Choose another --output.") from error
+
+
+def require_size(width: float, dpi: float) -> None:
+    """Raise InputError for a size that no page has."""
+    for name, value, (least, most) in (("--width", width, WIDTHS), ("--dpi", dpi, RESOLUTIONS)):
+        if not least <= value <= most:
+            raise InputError(name, f"must be {least:g} to {most:g}", value)
+
+
+def rgb(color: Sequence[int], shade: float = 1.0) -> tuple[float, float, float]:
+    """A color of 0 to 255 as matplotlib takes it, darker by a factor."""
+    red, green, blue = (shade * value / 255 for value in color)
+    return red, green, blue
+
+
+def points_across(axis: Axes) -> float:
+    """Width of a panel, points."""
+    figure = axis.get_figure(root=True)
+    assert figure is not None
+    return 72 * figure.get_figwidth() * axis.get_position().width
+
+
+def color_bar(figure: Figure, axis: Axes, norm: Normalize, colors: str, label: str, extend: str = "neither") -> None:
+    """A color bar with thin lines and small numbers."""
+    bar = figure.colorbar(ScalarMappable(norm, colors), cax=axis, extend=extend, extendfrac=0.03)
+    bar.set_label(label, fontsize=TEXT - 1, labelpad=2)
+    bar.outline.set_linewidth(0.4)
+    axis.tick_params(labelsize=TEXT - 1.5, width=0.4, length=2, pad=1.5, which="both")
+
+
+def save(figure: Figure, path: Path, dpi: float) -> Path:
+    """Write a figure as its ending says, atomically and the same each time, and close it; PDF with TrueType text."""
+    kind = path.suffix.lower().removeprefix(".")
+    # A date would make two equal pictures differ.
+    facts = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+    more = {"pil_kwargs": {"quality": JPEG}} if kind == "jpg" else {"metadata": facts} if facts else {}
+    try:
+        with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "neuspring"}):
+            write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=dpi, format=kind, **more))
+    finally:
+        plt.close(figure)
+    return path

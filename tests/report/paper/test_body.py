@@ -1,0 +1,111 @@
+"""Twins in color: stiffer springs are lighter on one scale for all, regions have the colors of the report, near covers far."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.collections import LineCollection, PathCollection
+
+from neuspring.report.figures.twin import CONTROLLER, region_colours
+from neuspring.report.paper.body import CROSSING, Body, body_figure, node_stiffness
+from tests.support.played import results
+from tests.support.shown import METHODS, filmed, painter
+
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return results(tmp_path_factory.mktemp("plain"), METHODS)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def uneven(scenario):
+    """The scenario's scene and runs: springs from 100 N to 10 kN, nodes in three regions along the rope."""
+    paints = painter(scenario, (0,))
+    takes = []
+    for take in paints.takes:
+        twin = take.twin
+        stiffness = np.geomspace(100, 1e4, len(twin.topology.springs)).astype(np.float32)
+        order = np.argsort(np.argsort(twin.topology.nodes[:, 0]))
+        labels = (3 * order // len(order)).astype(np.int32)
+        changed = replace(
+            twin, material=replace(twin.material, stiffness=stiffness), topology=replace(twin.topology, labels=labels)
+        )
+        takes.append(replace(take, twin=changed))
+    return paints.scene, takes
+
+
+def test_stiffer_springs_are_lighter(plain):
+    scene, takes = uneven(plain)
+    body = Body(scene, takes, 0, ("stiffness",))
+    light = body.spring_colors(takes[0], "stiffness")[:, :3] @ LUMA
+    inside = takes[0].twin.material.stiffness[: len(light)]
+    assert (np.diff(light) >= -1e-9).all() and light[-1] > light[0] + 0.5
+    assert body.norm.vmin >= 90 and body.norm.vmax <= 1.1 * inside.max()
+
+
+def test_all_twins_share_one_scale(plain):
+    scene, takes = uneven(plain)
+    soft = replace(
+        takes[1],
+        twin=replace(takes[1].twin, material=replace(takes[1].twin.material, stiffness=takes[1].twin.material.stiffness / 10)),
+    )
+    body = Body(scene, [takes[0], soft], 0, ("stiffness",))
+    assert body.norm.vmin < 20 and body.norm.vmax > 5e3
+    first, second = (body.spring_colors(take, "stiffness")[:, :3] @ LUMA for take in (takes[0], soft))
+    assert (second <= first).all() and (second < first).any()
+
+
+def test_a_node_has_the_mean_of_its_springs(plain):
+    twin = uneven(plain)[1][0].twin
+    count = twin.topology.object_spring_count
+    own = (twin.topology.springs[:count] == 3).any(axis=1)
+    expected = np.exp(np.log(twin.material.stiffness[:count][own].astype(float)).mean())
+    assert node_stiffness(twin)[3] == pytest.approx(expected)
+
+
+def test_regions_have_a_color_each_and_springs_between_them_are_dark(plain):
+    scene, takes = uneven(plain)
+    body, labels = Body(scene, takes, 0, ("region",)), takes[0].twin.topology.labels
+    assert np.array_equal(body.node_colors(takes[0], "region"), region_colours(3)[labels])
+    ends = labels[takes[0].twin.topology.springs[: takes[0].twin.topology.object_spring_count]]
+    colors, same = body.spring_colors(takes[0], "region"), ends[:, 0] == ends[:, 1]
+    assert np.array_equal(colors[same], region_colours(3)[ends[same, 0]])
+    assert (~same).any() and (colors[~same] == CROSSING).all()
+
+
+def test_columns_of_methods_rows_of_quantities_and_a_legend_for_each(plain):
+    scene, takes = uneven(plain)
+    figure = body_figure(Body(scene, takes, 0, ("stiffness", "region")), 5.0)
+    panels = [axis for axis in figure.axes if axis.get_xlim()[0] == -0.5]
+    assert len(panels) == 4 and figure.get_figwidth() == pytest.approx(5.0)
+    (bar,) = (axis for axis in figure.axes if axis not in panels)
+    assert bar.get_ylabel() == "stiffness [N]" and bar.get_yscale() == "log"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.texts] == ["region 0", "region 1", "region 2", "between"]
+    # Dots are where the camera sees the nodes, the nearest drawn last; hands are red.
+    dots, hands = (found for found in panels[2].collections if isinstance(found, PathCollection))
+    depth = scene.view.project(takes[0].positions[0].astype(float))[1]
+    expected = scene.view.project(takes[0].positions[0][np.argsort(-depth)].astype(float))[0]
+    assert np.allclose(dots.get_offsets(), expected)
+    assert np.allclose(hands.get_facecolor()[0], plt.matplotlib.colors.to_rgba(CONTROLLER))
+    (lines,) = (found for found in panels[0].collections if isinstance(found, LineCollection))
+    assert len(lines.get_segments()) == takes[0].twin.topology.object_spring_count
+
+
+def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
+    scenario = filmed(tmp_path)
+    scene, takes = uneven(scenario)
+    axis = plt.figure().add_axes((0, 0, 1, 1))
+    Body(scene, takes, 4, ("region",), style="splats").paint(axis, takes[0], "region")
+    shown = np.asarray(axis.images[0].get_array())
+    opaque = np.unique(shown.reshape(-1, 3), axis=0).astype(float) / 255
+    for color in region_colours(3)[:, :3]:
+        assert np.abs(opaque - color).max(axis=1).min() < 0.05

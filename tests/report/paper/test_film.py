@@ -1,0 +1,109 @@
+"""Films are read back: number, size and time of frames, colors of the paper, the limit of their size, what is refused."""
+
+import av
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from PIL import Image
+
+from neuspring.core.errors import InputError
+from neuspring.report.figures.images import FUTURE, TRAINING
+from neuspring.report.paper.film import HOLD, film_pictures, write_film
+from tests.support.played import results
+from tests.support.shown import METHODS, filmed, painter
+
+ALL = range(8)
+RATE = 30.0
+COLOR_DIFFERENCE = 12
+"""Of 255, what H.264 changes in a plain area."""
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return filmed(tmp_path_factory.mktemp("video"))
+
+
+def gif(path) -> tuple[list[np.ndarray], list[int], int]:
+    """Pictures, times in ms, and how often it repeats (0: for ever)."""
+    with Image.open(path) as found:
+        pictures, times = [], []
+        for frame in range(found.n_frames):
+            found.seek(frame)
+            pictures.append(np.asarray(found.convert("RGB")))
+            times.append(found.info["duration"])
+        return pictures, times, found.info["loop"]
+
+
+def mp4(path) -> tuple[list[np.ndarray], float]:
+    with av.open(str(path)) as container:
+        rate = float(container.streams.video[0].average_rate)
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], rate
+
+
+def test_a_gif_loops_keeps_the_time_and_holds_its_end(video, tmp_path):
+    made = write_film(painter(video, ALL, style="splats", error="none"), tmp_path / "film.gif", 320)
+    pictures, times, loop = gif(tmp_path / "film.gif")
+    assert (len(pictures), loop, made.frames, made.width) == (8, 0, 8, 320)
+    assert pictures[0].shape == (made.height, 320, 3)
+    # 7 of 30 frames per second take 0.23 s, in hundredths.
+    assert sum(times[:-1]) == pytest.approx(1000 * 7 / RATE, abs=10) and times[-1] == 1000 * HOLD
+    assert (tmp_path / "film.gif").stat().st_size == made.bytes
+    # Paper is white, and the bar of time has its two colors, in all frames.
+    assert all((picture[-20:, 1] == 255).all() for picture in pictures)
+    assert tuple(pictures[-1][6, 310]) == FUTURE and tuple(pictures[-1][6, 120]) == TRAINING
+    assert tuple(pictures[0][6, 310]) != FUTURE
+    assert not any(name.name.startswith(".") for name in tmp_path.iterdir())
+    assert not plt.get_fignums()
+
+
+def test_an_mp4_has_all_frames_at_its_speed(video, tmp_path):
+    paints = painter(video, ALL, style="splats", error="color")
+    made = write_film(paints, tmp_path / "film.mp4", 400, speed=0.5)
+    pictures, rate = mp4(tmp_path / "film.mp4")
+    assert (len(pictures), rate, made.rate) == (8, RATE / 2, RATE / 2)
+    expected = list(film_pictures(paints, ALL, 400))
+    assert pictures[0].shape == expected[0].shape and expected[0].shape[1] == 400
+    difference = np.abs(pictures[3].astype(int) - expected[3])
+    assert np.median(difference) <= 2 and np.quantile(difference, 0.9) < COLOR_DIFFERENCE
+
+
+def test_the_panels_move_and_the_observed_is_the_photo(video):
+    first, last = (next(film_pictures(painter(video, ALL, style="splats", error="none"), (k,), 480)) for k in (0, 7))
+    third = first.shape[1] // 3
+    for panel in range(3):
+        part = slice(panel * third + 4, (panel + 1) * third - 4)
+        assert (first[40:, part] != last[40:, part]).any()
+
+
+def test_a_film_that_is_too_large_is_made_coarser_or_refused(video, tmp_path):
+    paints = painter(video, (0, 3, 7), style="splats", error="none")
+    whole = write_film(paints, tmp_path / "whole.gif", 240)
+    limit = 0.6 * whole.bytes / 1e6
+    small = write_film(paints, tmp_path / "small.gif", 240, megabytes=limit)
+    assert small.bytes <= 1e6 * limit and small.coarser and not whole.coarser and "coarser" in str(small)
+    assert len(gif(tmp_path / "small.gif")[0]) == small.frames
+    with pytest.raises(InputError, match=r"the coarsest film has .* Name fewer --frames or methods, or write \.mp4"):
+        write_film(paints, tmp_path / "none.gif", 240, megabytes=1e-5)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["small.gif", "whole.gif"]
+
+
+def test_a_scene_without_video_is_filmed_as_points(tmp_path):
+    paints = painter(results(tmp_path, METHODS), (0, 4, 7))
+    pictures = list(film_pictures(paints, (0, 4, 7), 300))
+    assert len(pictures) == 3 and all(side % 2 == 0 for side in pictures[0].shape[:2])
+    blue = (np.abs(pictures[0].astype(int) - [31, 119, 180]).max(axis=2) < 30)[40:, :100]
+    assert blue.any()
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"width": 40}, "--width: must be 160 to 1920; received 40"),
+        ({"width": 300, "speed": 0.0}, "--speed: must be 0.05 to 8"),
+        ({"width": 300, "megabytes": 0.0}, "--megabytes: must be above 0, at most 100"),
+        ({"width": 300, "megabytes": float("nan")}, "--megabytes"),
+    ],
+)
+def test_sizes_that_no_film_has(video, tmp_path, values, text):
+    with pytest.raises(InputError, match=text):
+        write_film(painter(video, (0,), style="splats", error="none"), tmp_path / "film.gif", **values)

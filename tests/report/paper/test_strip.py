@@ -1,0 +1,170 @@
+"""Film strips: rows and columns, an error that is zero where prediction and observation agree, borders and captions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from matplotlib import pyplot as plt
+from matplotlib.collections import PathCollection
+
+from neuspring.config.images import Images
+from neuspring.report.paper.cells import ERRORS, MM, Painter, distances
+from neuspring.report.paper.scene import Scene
+from neuspring.report.paper.strip import caption, rows_of, strip_figure
+from tests.support.played import results
+from tests.support.shown import METHODS, filmed, observed, painter, takes
+
+FRAMES = (0, 3, 5, 7)
+EXACT = 1e-3
+"""mm: the first method is the scene's own twin, simulated in single precision."""
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return results(tmp_path_factory.mktemp("plain"), METHODS)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return filmed(tmp_path_factory.mktemp("video"))
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def grid(figure, rows: int, columns: int) -> np.ndarray:
+    """Panels [rows, columns], in the order of the picture."""
+    panels = [axis for axis in figure.axes if axis.get_xlim()[0] == -0.5]
+    assert len(panels) == rows * columns
+    placed = sorted(panels, key=lambda axis: (-round(axis.get_position().y0, 4), axis.get_position().x0))
+    return np.array(placed, object).reshape(rows, columns)
+
+
+@pytest.mark.parametrize(("error", "rows"), [("distance", 5), ("none", 3)])
+def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plain, error, rows):
+    paints = painter(plain, FRAMES, error=error)
+    assert [row.which for row in rows_of(paints)] == ([None, 0, 0, 1, 1] if rows == 5 else [None, 0, 1])
+    figure = strip_figure(paints, 6.0)
+    panels = grid(figure, rows, len(FRAMES))
+    assert figure.get_figwidth() == pytest.approx(6.0)
+    lefts = {round(axis.get_position().x0, 6) for axis in panels.ravel()}
+    assert len(lefts) == len(FRAMES)
+    # No panel leaves the page, and none lies over another.
+    boxes = [axis.get_position() for axis in panels.ravel()]
+    assert all(min(box.x0, box.y0) >= 0 and max(box.x1, box.y1) <= 1 for box in boxes)
+    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    words = [text.get_text() for text in figure.texts]
+    assert {"observed", *METHODS, "training", "future", "frame 5, 0.17 s"} <= set(words)
+
+
+def test_distances_are_zero_for_the_twin_that_moves_as_was_observed(plain):
+    paints = painter(plain, FRAMES)
+    exact, softer = ([distances(take, observed(plain), frame)[1].max() * MM for frame in FRAMES] for take in paints.takes)
+    assert max(exact) < EXACT < softer[-1]
+    panels = grid(strip_figure(paints, 6.0), 5, len(FRAMES))
+    told = [[float(axis.texts[0].get_text().split()[0]) for axis in panels[row]] for row in (2, 4)]
+    assert told[0] == [0.0] * len(FRAMES) and told[1][0] == 0.0 < told[1][-1]
+
+
+def test_distances_are_those_of_points_that_are_seen(plain):
+    seen = observed(plain)
+    visible = seen.object_visibility.copy()
+    visible[5:, 2] = False
+    take = takes(plain)[1]
+    hidden = replace(seen, object_visibility=visible)
+    nodes, values = distances(take, hidden, 5)
+    assert 2 not in nodes and len(nodes) == visible.shape[1] - 1
+    assert values[2] == pytest.approx(np.linalg.norm(take.positions[5, 3].astype(float) - seen.object_points[5, 3]))
+
+
+def test_one_range_for_all_panels_and_darker_is_farther(plain):
+    paints = painter(plain, FRAMES, most=4.0)
+    assert paints.norm.vmax == 4.0
+    figure = strip_figure(paints, 6.0)
+    dots = [
+        found
+        for axis in grid(figure, 5, len(FRAMES))[[2, 4]].ravel()
+        for found in axis.collections
+        if isinstance(found, PathCollection) and found.get_array() is not None
+    ]
+    assert len(dots) == 2 * len(FRAMES) and {found.norm.vmax for found in dots} == {4.0}
+    lightness = colormaps[ERRORS](np.linspace(0, 1, 64))[:, :3] @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness) < 0).all()
+
+
+def test_pictures_that_agree_have_no_difference(video):
+    paints = painter(video, (0, 4, 7), style="splats", error="color")
+    same, other = (paints._drawn[which][7] for which in (0, 1))
+    inside = ~np.isnan(same.difference)
+    assert inside.sum() > 50 and np.nanmax(same.difference) == 0
+    assert np.nanmax(other.difference) > 0.1
+    # Pixels outside of the object are left out of the row; they count in the PSNR, as in the tables.
+    assert same.psnr > other.psnr
+    panels = grid(strip_figure(paints, 6.0), 5, 3)
+    shown = [np.ma.filled(axis.images[-1].get_array(), np.nan) for axis in panels[2]]
+    assert all(np.nanmax(values) == 0 for values in shown)
+
+
+def test_hands_are_gray_and_not_compared(video):
+    paints = painter(video, (0,), style="splats", error="color")
+    whole = replace(paints.scene, box=(0, 0, paints.scene.camera.width, paints.scene.camera.height))
+    again = Painter(whole, paints.takes, (0,), paints.manner, Images(), "cpu")
+    drawn = again._drawn[0][0]
+    assert drawn.hands[:12, :12].all() and np.isnan(drawn.difference[:12, :12]).all()
+    axis = plt.figure().add_axes((0, 0, 1, 1))
+    again.error(axis, 0, 0)
+    assert (axis.images[0].get_array()[2, 2] == 200).all()
+
+
+def test_the_observed_row_shows_the_photo_masked_or_whole(video):
+    cut, whole = (painter(video, (0,), style="splats", error="none", ground=ground) for ground in ("white", "image"))
+    pictures = []
+    for paints in (cut, whole):
+        axis = plt.figure().add_axes((0, 0, 1, 1))
+        paints.observed(axis, 0)
+        pictures.append(np.asarray(axis.images[0].get_array()))
+    photo = whole.scene.cut(whole.scene.photo(0))
+    labels = whole.scene.cut(whole.scene.mask(0))
+    assert np.array_equal(pictures[1], photo)
+    assert (pictures[0][labels == 0] == 255).all() and np.array_equal(pictures[0][labels == 1], photo[labels == 1])
+
+
+def test_a_frame_that_a_camera_missed_and_one_behind_a_divergence_say_so(tmp_path):
+    paints = painter(filmed(tmp_path, missing=(4,)), (0, 4), style="splats", error="color")
+    short = replace(paints.takes[1], positions=paints.takes[1].positions[:3])
+    paints = Painter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, Images(), "cpu")
+    panels = grid(strip_figure(paints, 6.0), 5, 2)
+    words = [[text.get_text() for text in axis.texts] for axis in panels[:, 1]]
+    assert words == [["camera 0 missed it"], [], ["no picture"], ["diverged"], []]
+
+
+def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):
+    paints = painter(video, (0, 5), style="splats", error="none")
+    take = paints.takes[0]
+    # The nodes stand still; the splats rise by a tenth of the picture.
+    still = replace(take, positions=np.repeat(take.positions[:1], 8, axis=0))
+    up = 0.1 * np.ptp(take.positions[0], axis=0).max() * np.arange(8)[:, None, None] / 5 * np.array([0, 0, 1.0])
+    own = replace(still, centers=(take.splats.means + up).astype(np.float32))
+    rows = []
+    for shown in (still, own):
+        again = Painter(paints.scene, [shown], (0, 5), paints.manner, Images(), "cpu")
+        rows.append([np.flatnonzero((again._drawn[0][frame].rgba[..., 3] > 128).any(axis=1)).mean() for frame in (0, 5)])
+    assert rows[0][0] == rows[0][1] and rows[1][0] == rows[0][0] and rows[1][1] < rows[1][0] - 3
+
+
+def test_a_far_prediction_does_not_shrink_the_picture(plain):
+    paints = painter(plain, (0, 7))
+    far = replace(paints.takes[1], positions=paints.takes[1].positions + np.float32(50.0))
+    scene = Scene.of(observed(plain), paints.scene.camera, [paints.takes[0], far], (0, 7))
+    assert scene.view.width < 3 * paints.scene.view.width
+
+
+def test_the_caption_names_frames_split_and_errors(plain):
+    told = caption(painter(plain, FRAMES))
+    assert "frames 0, 3, 5, 7; future (from frame 5): 5, 7." in told
+    assert "baseline 0.0 mm" in told and "Distance of nodes to their observed points" in told
+    assert "all of training" in caption(painter(plain, (0, 1)))
