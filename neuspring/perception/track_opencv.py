@@ -180,7 +180,7 @@ def _nearest_label(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:
     """Whether points (x, y) [n, 2] lie within `rim` pixels of their own labels [n]."""
-    on = _labels_at(labels, points) == own
+    on: np.ndarray = _labels_at(labels, points) == own
     if rim > 0:
         for label in np.unique(own[~on]):
             off = np.flatnonzero(~on & (own == label))

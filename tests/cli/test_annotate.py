@@ -37,7 +37,9 @@ def filmed(tmp_path_factory):
 def address(filmed):
     """What the command prints, in a process of its own; it must end well with Ctrl-C."""
     command = [sys.executable, "-m", "neuspring", "annotate", str(filmed[0].folder), "--port", "0", "--no-open"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    options = {"stdout": subprocess.PIPE, "text": True, "env": os.environ | {"OMP_NUM_THREADS": "1"}}
+    # Tests that run in the background of a shell ignore Ctrl-C, and would hand that on.
+    process = subprocess.Popen(command, **options, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     try:
         line = process.stdout.readline()
         found = re.fullmatch(r"Annotate \S+ at (http://127\.0\.0\.1:\d+/#\S+) \(stop with Ctrl-C\)\n", line)

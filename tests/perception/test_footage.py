@@ -16,7 +16,8 @@ MASKS = {
     "single_push_rope_4": (0.86, 0.96),
 }
 """Least mean IoU of object and of hands over the four frames; as measured, less 0.02 to 0.04."""
-TRACKS = ("double_lift_cloth_1", "double_lift_sloth", "double_lift_zebra", "single_lift_rope")
+LOST = {"double_lift_cloth_1": 0.15, "double_lift_sloth": 0.6, "double_lift_zebra": 0.15, "single_lift_rope": 0.15}
+"""Largest share of marked places that a tracker may give up; as measured, plus 0.07 to 0.1."""
 MEDIAN = 4.0
 """Largest median error, pixels, of points that stay visible: what was aimed at."""
 
@@ -55,8 +56,8 @@ def test_masks_and_tracks_of_a_whole_film(case):
     objects, hands = overlaps(labels, truths(FOOTAGE, case)).mean(axis=0)
     assert objects > MASKS[case][0]
     assert hands > MASKS[case][1]
-    if case in TRACKS:
+    if case in LOST:
         own = points(case)
         found = Errors.of(own, *stepwise(colors, labels, own.xy[:, 0]))
         assert found.median < MEDIAN
-        assert found.lost < 0.5
+        assert found.lost < LOST[case]

@@ -281,5 +281,5 @@ def test_the_command_prints_a_report_and_the_next_commands(tmp_path, capsys):
     assert main(["make-capture", "--category", "ball", "--output", str(tmp_path / "capture"), *words]) == 0
     said = capsys.readouterr().out
     assert f"cameras: 0 {SIZE[0]} x {SIZE[1]}" in said
-    assert f"neuspring check-data {tmp_path / 'capture'}" in said and f"neuspring mask {tmp_path / 'capture'}" in said
+    assert f"neuspring check-data {tmp_path / 'capture'}" in said and f"neuspring annotate {tmp_path / 'capture'}" in said
     assert json.loads((tmp_path / "capture" / CAPTURE).read_text())["name"] == "capture"

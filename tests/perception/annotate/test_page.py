@@ -1,6 +1,7 @@
 """The page in a real browser, by mouse and keys, beside a server with a stand-in for the masks' method."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -180,7 +181,7 @@ def test_marks_are_previewed_carried_with_progress_and_saved(page, method):
     method.gate.clear()
     page.browser.click("#carry")
     page.browser.wait("!document.getElementById('progress').hidden")
-    assert page.text("#progress-text").startswith("camera 0: ")
+    page.browser.wait("document.getElementById('progress-text').textContent.startsWith('camera 0: ')")
     method.gate.set()
     page.shown("#overlay-text", "carried")
     page.told("Carried camera 0")
@@ -194,6 +195,20 @@ def test_marks_are_previewed_carried_with_progress_and_saved(page, method):
     page.drag((70, 50), (90, 70))
     page.saved()
     page.browser.wait("!document.getElementById('stale').hidden")
+
+
+def test_what_is_carried_again_at_once_can_be_saved(page, method):
+    page.drag((40, 50), (60, 70))
+    page.saved()
+    masks = "annotate.modes.masks"
+    page.browser.run(f"void {masks}.carry(['0'])")
+    page.browser.wait(f"{masks}.results.job.state === 'done'")
+    # Between two looks of the page at the job.
+    method.gate.clear()
+    page.browser.run(f"void {masks}.carry(['0'])")
+    time.sleep(0.6)
+    method.gate.set()
+    page.browser.wait("!document.getElementById('save-masks').disabled")
 
 
 def test_an_error_is_shown_in_the_page(page):

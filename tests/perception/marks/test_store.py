@@ -84,7 +84,7 @@ def test_the_workflow_segments_from_marks(folder):
     assert not labels[3].any()
     assert overlap(labels[4], truth, OBJECT) > 0.85
     (folder / "marks.json").unlink()
-    with pytest.raises(InputError, match=r"marks needs this file.*neuspring annotate"):
+    with pytest.raises(InputError, match=r"marks of object and hands are required.*neuspring annotate"):
         BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
 
 

@@ -158,7 +158,8 @@ export class MasksMode {
         this.results.job = job;
         this.progress(job);
         await new Promise((done) => setTimeout(done, 250));
-      } while (job.state === "running");
+        // Not the job's own state: another one may have begun while this waited.
+      } while (this.results.job.state === "running");
     } catch (error) {
       say(error.message, "bad", { "Try again": () => this.watch() });
     } finally {
@@ -168,6 +169,7 @@ export class MasksMode {
     this.preview = null;
     await this.reread();
     await this.app.showMasks();
+    if (this.results.job.state === "running") return this.watch();
     if (job?.state === "done") say(job.message, "good");
     else if (job && job.state !== "running") say(job.message);
   }
@@ -250,7 +252,8 @@ export class MasksMode {
     if (job.state !== "running") return;
     const share = job.total ? job.done / job.total : 0;
     find("bar").value = share;
-    find("progress-text").textContent = `${job.what}: ${Math.floor(100 * share)} % in ${Math.floor(job.seconds)} s`;
+    const text = `${job.what}: ${Math.floor(100 * share)} % in ${Math.floor(job.seconds)} s`;
+    find("progress-text").textContent = job.what ? text : "starting";
   }
 
   // Doubt of every frame, of the masks that are shown.

@@ -1,0 +1,104 @@
+"""The demo's scenes, marked with the mouse in a real browser: what a user gets for at most five marks a camera."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.sources import read_scenarios
+from neuspring.data.synthetic.make import make
+from neuspring.perception.annotate.method import FromMarks
+from neuspring.perception.marks import Mark
+from neuspring.perception.marks.compare import overlap
+from tests.benchmarks.masks import MOST_MARKS, outlines
+from tests.support.browser import Browser, chromium
+from tests.support.project import ROOT
+from tests.support.served import TOKEN, Client, served
+
+DEMO = config.read_yaml(ROOT / "config" / "data" / "demo.yaml")
+KEYS = {"object": "1", "hand": "2"}
+LEAST = 0.95
+"""Least mean overlap of a camera's masks with the truth: what was aimed at."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser(served=True) as browser:
+        yield browser
+
+
+def draw(browser: Browser, marks: list[Mark]) -> None:
+    """Click the corners of outlines in the shown frame."""
+    browser.key("p")
+    for mark in marks:
+        browser.key(KEYS[mark.label])
+        for corner in mark.points:
+            browser.drag(tuple(browser.run(f"annotate.view.toWindow({list(corner)})")))
+        browser.key("Enter")
+
+
+def press(browser: Browser, button: str) -> None:
+    """Press a button once it can be pressed: the page learns a moment after the server that a job is done.
+
+    Not by the mouse, because notes above the buttons come and go, and move them.
+    """
+    browser.wait(f"!document.querySelector('{button}').disabled")
+    browser.run(f"document.querySelector('{button}').click()")
+
+
+def carried(browser: Browser, client: Client, camera: str, marks: int) -> list[float]:
+    """Press the button that carries this camera, once its marks are saved; the doubt of each frame."""
+    client.wait(lambda: len(client.get("/api/masks")["marks"]["cameras"][camera]) == marks)
+    press(browser, "#carry")
+
+    def fresh() -> list[float] | None:
+        state = client.get("/api/masks")
+        own = state["carried"].get(camera)
+        assert state["job"]["state"] != "failed", state["job"]
+        return own["doubt"] if own and not own["stale"] and state["job"]["state"] == "done" else None
+
+    return client.wait(fresh, 300.0)
+
+
+def go(browser: Browser, frame: int, of: int) -> None:
+    browser.run(f"annotate.go({frame})")
+    browser.wait(f"document.querySelector('#frame-text').textContent === 'frame {frame} of 0–{of - 1}'")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize("scenario", DEMO["scenarios"])
+def test_five_marks_a_camera_give_the_masks_of_the_demo(browser, tmp_path, scenario):
+    row = read_scenarios(ROOT / "config" / "scenarios.tsv")[scenario]
+    capture, _ = make(row, config.parse(config.Synthetic, DEMO["synthetic"], "synthetic"), tmp_path / "capture")
+    frames = capture.frame_count
+    truths = {camera: np.stack([capture.mask(camera, frame) for frame in range(frames)]) for camera in capture.cameras}
+    # A user's capture has no masks.
+    description = json.loads((capture.folder / "capture.json").read_text())
+    (capture.folder / "capture.json").write_text(json.dumps(description | {"masks": False}))
+    capture = Capture.load(capture.folder)
+    with served(capture, FromMarks()) as client:
+        browser.open("about:blank", 1280, 800)
+        browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", 1280, 800)
+        browser.wait("document.body.dataset.ready === 'yes'")
+        for camera, truth in truths.items():
+            browser.wait(f"annotate.camera === '{camera}'")
+            go(browser, 0, frames)
+            first = outlines(truth[0])
+            draw(browser, first)
+            worst = int(np.argmax(carried(browser, client, camera, len(first))))
+            more = [dataclasses.replace(mark, frame=worst) for mark in outlines(truth[worst])[: MOST_MARKS - len(first)]]
+            go(browser, worst, frames)
+            draw(browser, more)
+            carried(browser, client, camera, len(first) + len(more))
+            browser.key("k")
+        press(browser, "#save-masks")
+        browser.wait("document.getElementById('messages').textContent.includes('Saved masks')")
+    made = Capture.load(capture.folder)
+    for camera, truth in truths.items():
+        labels = np.stack([made.mask(camera, frame) for frame in range(frames)])
+        for label in (OBJECT, HANDS):
+            assert np.mean([overlap(labels[k] == label, truth[k] == label) for k in range(frames)]) > LEAST
