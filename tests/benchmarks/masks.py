@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from argparse import ArgumentParser
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,6 +59,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=160, help="first frame of plush")
     parser.add_argument("--frames", type=int, help="of each film, from its first one; all by default")
     parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument(
+        "--correct", action="store_true", help="captures: outlines in the most doubtful frame too, five marks in all"
+    )
     parser.add_argument("--pictures", type=Path)
     a = parser.parse_args()
     settings = MarksSegmentation(scale=a.scale)
@@ -67,7 +70,7 @@ def main() -> None:
         if a.kind == "plush":
             _plush(folder, settings, a.first, a.frames, a.pictures)
         else:
-            _capture(folder, settings, a.pictures)
+            _capture(folder, settings, a.correct, a.pictures)
 
 
 def _plush(folder: Path, settings: MarksSegmentation, first: int, most: int | None, pictures: Path | None) -> None:
@@ -90,12 +93,16 @@ def _shifted(marks: Iterable[Mark], by: int) -> list[Mark]:
     return [replace(own, frame=own.frame - by) for own in marks if own.frame >= by]
 
 
-def _capture(folder: Path, settings: MarksSegmentation, pictures: Path | None) -> None:
+def _capture(folder: Path, settings: MarksSegmentation, correct: bool, pictures: Path | None) -> None:
     capture = Capture.load(folder)
     for camera in capture.cameras:
         truth = {frame: capture.mask(camera, frame) for frame in range(capture.frame_count) if capture.has(camera, frame)}
         began = time.perf_counter()
-        carried = carry_camera(capture, camera, outlines(truth[0]), settings)
+        marks = outlines(truth[0])
+        carried = carry_camera(capture, camera, marks, settings)
+        if correct:
+            frame = max(truth, key=lambda frame: float(carried.doubt[frame]))
+            carried = carry_camera(capture, camera, [*marks, *corrections(marks, truth[frame], frame)], settings)
         colors = [
             capture.colour(camera, frame) if frame in truth else np.zeros((16, 16, 3)) for frame in range(capture.frame_count)
         ]
@@ -113,6 +120,11 @@ def outlines(truth: np.ndarray) -> list[Mark]:
                 points = tuple((float(x), float(y)) for x, y in coarse)
                 found.append((cv2.contourArea(contour), Mark(frame=0, label=name, kind="polygon", points=points, radius=2.0)))  # type: ignore[arg-type]
     return [own for _, own in sorted(found, key=lambda pair: -pair[0])[:MOST_MARKS]]
+
+
+def corrections(marks: Sequence[Mark], truth: np.ndarray, frame: int) -> list[Mark]:
+    """Outlines of what a later frame shows, as many as `marks` leave of MOST_MARKS."""
+    return [replace(own, frame=frame) for own in outlines(truth)[: MOST_MARKS - len(marks)]]
 
 
 def _tell(
