@@ -9,11 +9,11 @@ from pathlib import Path
 from neuspring.core.errors import InputError
 
 FORMATS = {
-    "npz": ("neuspring.export.plain", "", "{name}"),
+    "npz": ("neuspring.export.plain", "", "{name}_npz"),
     "ply": ("neuspring.export.ply", "0", "{name}"),
     "spz": ("neuspring.export.spz", "0", "{name}"),
-    "newton": ("neuspring.export.newton", "", "{name}"),
-    "mujoco": ("neuspring.export.mujoco", "", "{name}"),
+    "newton": ("neuspring.export.newton", "", "{name}_newton"),
+    "mujoco": ("neuspring.export.mujoco", "", "{name}_mujoco"),
     "usd": ("neuspring.export.usd", "", "{name}.usdc"),
 }
 """Format -> module, frames by default (all where empty), what is written by default."""

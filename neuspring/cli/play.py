@@ -78,7 +78,7 @@ def _serve(a: Namespace, found: Scene, own: Run | None, controls: Controls | Non
         for page in pages:
             page.show(frame)
 
-    server = start(a.host, a.port, go_to)
+    server = start(a.host, a.port, go_to, found.folder.name)
     page = Page(server, found, a.save)
     page.show(a.frame)
     pages.append(page)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import viser
 
 LABEL = "NeuSpring"
-VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9}))?")
-"""The page, and a frame of it."""
+VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9})(?:&scenario=([A-Za-z0-9_.-]{1,200}))?)?")
+"""The page, and a frame of it, perhaps of a scenario that must be the one that is shown."""
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -30,10 +30,13 @@ PAGE_HEADERS = {"Cache-Control": "no-store"}
 INSTALL = "Install it: pip install 'neuspring[play]'."
 
 
-def start(host: str, port: int, asked: Callable[[int], object] = lambda frame: None) -> viser.ViserServer:
+def start(
+    host: str, port: int, asked: Callable[[int], object] = lambda frame: None, scenario: str | None = None
+) -> viser.ViserServer:
     """A running server at host and port (0: any that is free); `asked` gets the frame of an address that ends in /?frame=<number>.
 
-    Raises InputError where it cannot listen there, or without viser.
+    An address that ends in &scenario=NAME is answered only where `scenario` is that name. Raises InputError where it cannot listen
+    there, or without viser.
     """
     try:
         import viser
@@ -42,7 +45,7 @@ def start(host: str, port: int, asked: Callable[[int], object] = lambda frame: N
     _require_free(host, port)
     # viser takes another port from this variable, whatever it is told.
     os.environ.pop("_VISER_PORT_OVERRIDE", None)
-    with _guarded(host, asked) as used, contextlib.redirect_stdout(io.StringIO()):
+    with _guarded(host, asked, scenario) as used, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=LABEL, verbose=False)
     if not used:
         server.stop()
@@ -62,10 +65,15 @@ def address(server: viser.ViserServer) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
 
 
-def asked_frame(path: str) -> int | None:
-    """The frame that an address asks for, if it asks for that and for nothing else."""
+def asked_frame(path: str, scenario: str | None) -> int | None:
+    """The frame that an address asks for, if it asks for that and for nothing else. Raises Refused for another scenario's."""
     found = VISIT.fullmatch(path)
-    return int(found[1]) if found and found[1] else None
+    if found is None or not found[1]:
+        return None
+    if found[2] and scenario and found[2] != scenario:
+        text = f"This player shows {scenario}. Run `neuspring play` on the folder of {found[2]}, then follow the link again."
+        raise Refused(404, text)
+    return int(found[1])
 
 
 def _is_visit(request: Any) -> bool:
@@ -107,7 +115,7 @@ def _taken(host: str, port: int, reason: object) -> InputError:
 
 
 @contextlib.contextmanager
-def _guarded(host: str, asked: Callable[[int], object]) -> Iterator[list[bool]]:
+def _guarded(host: str, asked: Callable[[int], object], scenario: str | None) -> Iterator[list[bool]]:
     """Servers that are started inside check each request's Host and Origin; the list is empty if none was started.
 
     viser has no place for such a check. Without it any page of the web that this browser shows could reach the server, by its
@@ -127,7 +135,10 @@ def _guarded(host: str, asked: Callable[[int], object]) -> Iterator[list[bool]]:
                     check_origin(request.headers)
             except Refused as refused:
                 return connection.respond(refused.status, "Open the address that neuspring play printed.\n")
-            frame = asked_frame(request.path)
+            try:
+                frame = asked_frame(request.path, scenario)
+            except Refused as refused:
+                return connection.respond(refused.status, f"{refused}\n")
             if frame is not None:
                 asked(frame)
             answer = process_request(connection, request)

@@ -132,3 +132,11 @@ def test_missing_splats_are_named(tmp_path):
 def test_a_rate_is_for_usd(folder, capsys):
     assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
     assert "--rate: is for usd" in capsys.readouterr().err
+
+
+def test_without_output_no_format_writes_over_another(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for to, frames in (("npz", "2"), ("newton", "0:3"), ("mujoco", "0:4")):
+        assert main(["export", str(folder), "--to", to, "--frames", frames]) == 0
+    counts = {path.parent.name: len(np.load(path)["frame"]) for path in (tmp_path / "export").rglob("arrays.npz")}
+    assert counts == {"scene_neuspring_0_npz": 1, "scene_neuspring_0_newton": 3, "scene_neuspring_0_mujoco": 4}

@@ -138,10 +138,19 @@ def test_a_saved_recording_is_compared_and_names_its_twin(page, capsys):
 LINK = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
 
 
-@pytest.mark.parametrize(("path", "answer", "frames"), [("/?frame=5", 200, [5]), ("/", 200, []), ("/?frame=-1", 403, [])])
-def test_a_link_of_a_report_opens_a_frame(path, answer, frames):
+@pytest.mark.parametrize(
+    ("path", "answer", "frames"),
+    [
+        ("/?frame=5", 200, [5]),
+        ("/?frame=5&scenario=rope", 200, [5]),
+        ("/?frame=5&scenario=cloth", 404, []),
+        ("/", 200, []),
+        ("/?frame=-1", 403, []),
+    ],
+)
+def test_a_link_of_a_report_opens_a_frame_of_its_own_scenario(path, answer, frames):
     asked: list[int] = []
-    one = start("127.0.0.1", 0, asked.append)
+    one = start("127.0.0.1", 0, asked.append, "rope")
     try:
         assert status(one, path, **LINK) == answer
         assert asked == frames

@@ -121,15 +121,14 @@ def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
     others = [target for target in parser.targets if not target.startswith(("#", "data:", f"{playing.ADDRESS}?frame="))]
     # Links to files beside the page, which are there.
     assert others and all((full / target).exists() for target in others)
-    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/|127\.0\.0\.1:8080/\?frame=\d+\")", page)
+    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/|127\.0\.0\.1:8080/\?frame=\d+&amp;scenario=\w+\")", page)
 
 
 def test_pictures_lead_to_their_frames_in_the_player_and_a_command_opens_it(page, full):
     runs = " ".join(str(full / "rope" / method / "0") for method in ("baseline", "neuspring"))
     assert f'<pre tabindex="0" class="whole">neuspring play {runs}</pre>' in page
-    frames = [
-        int(frame) for frame in re.findall(r'href="http://127\.0\.0\.1:8080/\?frame=(\d+)" target="player">frame \1</a>', page)
-    ]
+    link = r'href="http://127\.0\.0\.1:8080/\?frame=(\d+)&amp;scenario=rope" target="player">frame \1</a>'
+    frames = [int(frame) for frame in re.findall(link, page)]
     facts = Observations.load(full / "rope" / "observations.npz").scenario
     assert set(frames) == set(chosen_frames(facts, facts.frame_count))
 

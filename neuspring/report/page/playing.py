@@ -25,4 +25,7 @@ def links(material: Material, scenario: str) -> tuple[tuple[str, str], ...]:
         facts = Observations.load(path).scenario
     except UNREADABLE:
         return ()
-    return tuple((f"frame {frame}", f"{ADDRESS}?frame={frame}") for frame in sorted(chosen_frames(facts, facts.frame_count)))
+    return tuple(
+        (f"frame {frame}", f"{ADDRESS}?frame={frame}&scenario={scenario}")
+        for frame in sorted(chosen_frames(facts, facts.frame_count))
+    )
