@@ -1,4 +1,4 @@
-"""The playground's live mode: `python -m tests.benchmarks.bench_play [--nodes 100 400 1000 2000 5000] [--seconds 5] [--frames N]`.
+"""The playground's live mode: `python -m tests.benchmarks.bench_play [--nodes N ...] [--seconds S] [--frames N] [--runs RUN ...]`.
 
 For each size a box of random points (`scenes.py`, 100 substeps per frame of 1/30 s) is pulled by a mouse that moves 60 times per
 second. Columns: one frame of the simulation alone, and one with its drawing, in ms of processor time (medians), so that other work
@@ -7,6 +7,9 @@ effect was handed to viser. No browser is open: what it costs depends on its mac
 
 `--frames N` then lets the smallest twin run N frames as fast as it can, and says how memory grows; half an hour at 30 frames/s are
 54,000 frames.
+
+`--runs RESULTS/SCENARIO/METHOD/SEED ...` measures finished runs instead, while a headless Chromium on this machine draws them by
+software and a mouse pulls their highest node.
 """
 
 from __future__ import annotations
@@ -23,13 +26,17 @@ from neuspring.core.records import Recorder
 from neuspring.play.begin import Begin, Script
 from neuspring.play.controls import MOST_FRAMES
 from neuspring.play.live import Live
+from neuspring.play.page import Page
 from neuspring.play.player import Player
 from neuspring.play.results import find
-from neuspring.play.serve import start
+from neuspring.play.serve import address, start
 from neuspring.play.simulator import Simulator, Start
 from tests.benchmarks.memory import resident_mib
 from tests.benchmarks.scenes import box
 from tests.support import scenarios
+from tests.support.browser import Browser
+from tests.support.pointing import WINDOW, pixel, settled, until
+from tests.support.pointing import pull as mouse
 
 NODES = (100, 400, 1000, 2000, 5000)
 SUBSTEPS, NEIGHBORS = 100, 22
@@ -39,6 +46,8 @@ FEWEST = 12
 """Frames that a row is the median of, at least."""
 SAMPLES = 10
 """Of memory."""
+PATIENCE = 300.0
+"""With a browser that draws by software, s."""
 
 
 class Timed(Live):
@@ -65,7 +74,12 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=NODES)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--frames", type=int, default=0)
+    parser.add_argument("--runs", type=Path, nargs="+", default=())
     a = parser.parse_args()
+    for run in a.runs:
+        print(browsed(run, a.seconds), flush=True)
+    if a.runs:
+        return
     print("nodes  springs | processor time of a frame, ms: simulation  with drawing | frames/s of 30  mouse to scene, ms")
     for nodes in a.nodes:
         print(row(nodes, a.seconds), flush=True)
@@ -109,6 +123,43 @@ def grow(nodes: int, frames: int) -> None:
             print(f"{live.simulator.frame:7d}  {resident_mib():12.0f}", flush=True)
         print(f"{time.monotonic() - begun:.0f} s; {live.message}")
         close()
+
+
+def browsed(run: Path, seconds: float) -> str:
+    """Frame rate and latency of a run that a browser shows."""
+    found = find([run])
+    server = start("127.0.0.1", 0)
+    page = Page(server, found)
+    try:
+        with Browser(served=True, webgl=True, patience=PATIENCE) as browser:
+            browser.open(address(server), *WINDOW)
+            until(server.get_clients, PATIENCE)
+            page.panel.start(found.shown[0])
+            live = page.panel.live
+            assert live is not None
+            # The first frames load kernels.
+            until(lambda: live.simulator.frame > 5, PATIENCE)
+            x = live.simulator.positions
+            node = int(np.argmax(x[:, 2] * (1 if found.observations.scenario.up == "+z" else -1)))
+            x_mouse, y_mouse = pixel(settled(server, browser), x[node])
+            with mouse(browser, x_mouse, y_mouse, 20, -20):
+                until(lambda: live.simulator.grabbed >= 0, PATIENCE)
+                frame, begun, rates, delays = live.simulator.frame, time.monotonic(), [], []
+                while time.monotonic() < begun + seconds:
+                    time.sleep(0.1)
+                    right = 20 + 10 * np.sin(6 * time.monotonic())
+                    browser._mouse("mouseMoved", x_mouse + right, y_mouse - 20, 0, buttons=1)
+                    rates.append(live.rate)
+                    delays.append(live.latency)
+                reached = (live.simulator.frame - frame) / (time.monotonic() - begun)
+        graph = live.simulator.twin.topology
+        size = f"{len(graph.nodes)} nodes, {len(graph.springs)} springs, {live.simulator.twin.simulation.substeps} substeps"
+        wanted = found.observations.scenario.frame_rate
+        slow = 1e3 * float(np.median(delays))
+        return f"{run}: {size}; {reached:.1f} frames/s of {wanted:g} (least {min(rates):.1f}); mouse to scene {slow:.0f} ms"
+    finally:
+        page.close()
+        server.stop()
 
 
 def running(kind: type[Live], twin: Twin, folder: Path):
