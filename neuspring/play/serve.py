@@ -35,8 +35,8 @@ def start(
 ) -> viser.ViserServer:
     """A running server at host and port (0: any that is free); `asked` gets the frame of an address that ends in /?frame=<number>.
 
-    An address that ends in &scenario=NAME is answered only where `scenario` is that name. Raises InputError where it cannot listen
-    there, or without viser.
+    `scenario` is the one that is shown: an address that ends in &scenario=<name> of another one is refused; without it none is.
+    Raises InputError where it cannot listen there, or without viser.
     """
     try:
         import viser
@@ -66,7 +66,10 @@ def address(server: viser.ViserServer) -> str:
 
 
 def asked_frame(path: str, scenario: str | None) -> int | None:
-    """The frame that an address asks for, if it asks for that and for nothing else. Raises Refused for another scenario's."""
+    """The frame that an address asks for, if it asks for a frame and for nothing more than its scenario.
+
+    Raises Refused where that is not `scenario`, the one that is shown.
+    """
     found = VISIT.fullmatch(path)
     if found is None or not found[1]:
         return None
