@@ -35,7 +35,7 @@ def start(
 ) -> viser.ViserServer:
     """A running server at host and port (0: any that is free); `asked` gets the frame of an address that ends in /?frame=<number>.
 
-    `scenario` is the one that is shown: an address that ends in &scenario=<name> of another one is refused; without it none is.
+    `scenario` is the one that is shown: an address that ends in &scenario=<name> of another one is refused. None: all are answered.
     Raises InputError where it cannot listen there, or without viser.
     """
     try:
