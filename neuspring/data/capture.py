@@ -1,11 +1,12 @@
-"""The capture folder: RGBD video of one or more cameras, as JSON and images only.
+"""The capture folder: RGBD video of one or more cameras, or color alone of one, as JSON and images only.
 
     capture.json                       everything but images, see `Description`
     color/<camera>/<frame>.png         8-bit RGB
     depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
-                                       0: none
+                                       0: none; not there with `depth: none`
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
     tracks.json                        optional, for scoring alone: [K][T] of [x, y, z] m in the world, or null where not annotated
+    points.json                        optional, for scoring alone: {camera: [K][T] of [x, y] pixels, or null where not marked}
 
 Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
 is right-handed, meters, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +37,7 @@ from neuspring.data.calibration import TEXT_TOLERANCE, intrinsics_departures, po
 from neuspring.data.departure import Departure, broken, refuse
 from neuspring.data.json_file import load_json
 
-CAPTURE, TRACKS = "capture.json", "tracks.json"
+CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
@@ -113,6 +115,8 @@ class Description:
     frame_rate: Positive
     """Frames per second."""
     cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    depth: Literal["measured", "none"] = "measured"
+    """none: color alone, of one camera, with the table at z = 0 (neuspring/perception/color)."""
     depth_unit: Positive = 0.001
     """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
@@ -159,6 +163,11 @@ class Capture:
         """Training frames are [0, train_end)."""
         return self.description.train_end or int(0.7 * self.frame_count)
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth was measured."""
+        return self.description.depth == "measured"
+
     def require_camera(self, name: str) -> None:
         """Raise InputError if there is no such camera."""
         if name not in self.cameras:
@@ -182,7 +191,9 @@ class Capture:
         return self._image("color", camera, frame, cv2.IMREAD_COLOR)[..., ::-1]
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
-        """Depth [H, W], m, 0 where nothing was measured. Raises InputError."""
+        """Depth [H, W], m, 0 where nothing was measured: everywhere with `depth: none`. Raises InputError."""
+        if not self.has_depth:
+            return np.zeros((self.cameras[camera].height, self.cameras[camera].width))
         path = self.path("depth", camera, frame)
         if path.suffix == ".png":
             values = self._image("depth", camera, frame, cv2.IMREAD_UNCHANGED)
@@ -211,21 +222,32 @@ class Capture:
     def tracks(self) -> np.ndarray:
         """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
         path = self.folder / TRACKS
-        if not path.exists():
-            return np.zeros((self.frame_count, 0, 3))
-        listed = load_json(path)
-        if listed == []:
-            return np.zeros((self.frame_count, 0, 3))
-        if not isinstance(listed, list):
-            raise InputError(path, "a list of tracks is required", type(listed).__name__)
-        try:
-            rows = [[[np.nan] * 3 if point is None else point for point in track] for track in listed]
-            tracks = np.array(rows, dtype=float).reshape(len(rows), -1, 3)
-        except (TypeError, ValueError) as error:
-            raise InputError(path, "a list of tracks of [x, y, z] or null is required", str(error)) from error
-        if tracks.shape[1] != self.frame_count:
-            raise InputError(path, f"every track needs {self.frame_count} entries", tracks.shape[1])
-        return np.swapaxes(tracks, 0, 1)
+        return _read_tracks(path, load_json(path) if path.exists() else [], self.frame_count, 3)
+
+    def points(self, camera: str) -> np.ndarray:
+        """Points marked in the images of a camera [T, K, 2], pixels, NaN where not marked; K = 0 without any. Raises InputError."""
+        path = self.folder / POINTS
+        listed = load_json(path) if path.exists() else {}
+        if not isinstance(listed, dict):
+            raise InputError(path, "an object of tracks by camera is required", type(listed).__name__)
+        return _read_tracks(path, listed.get(camera, []), self.frame_count, 2)
+
+
+def _read_tracks(path: Path, listed: object, frames: int, size: int) -> np.ndarray:
+    """Tracks [T, K, size] of [K][T] lists, null as NaN. Raises InputError."""
+    if listed == []:
+        return np.zeros((frames, 0, size))
+    if not isinstance(listed, list):
+        raise InputError(path, "a list of tracks is required", type(listed).__name__)
+    try:
+        rows = [[[np.nan] * size if point is None else point for point in track] for track in listed]
+        tracks = np.array(rows, dtype=float).reshape(len(rows), -1, size)
+    except (TypeError, ValueError) as error:
+        form = "[x, y, z]" if size == 3 else "[x, y]"
+        raise InputError(path, f"a list of tracks of {form} or null is required", str(error)) from error
+    if tracks.shape[1] != frames:
+        raise InputError(path, f"every track needs {frames} entries", tracks.shape[1])
+    return np.swapaxes(tracks, 0, 1)
 
 
 class Writer:
@@ -233,14 +255,18 @@ class Writer:
 
     def __init__(self, folder: Path, description: Description) -> None:
         self.capture = Capture(Path(folder), description)
-        for name in (CAPTURE, TRACKS):
+        for name in (CAPTURE, TRACKS, POINTS):
             (self.capture.folder / name).unlink(missing_ok=True)
 
-    def frame(self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """RGB uint8 [H, W, 3], depth as stored [H, W], labels uint8 [H, W]."""
+    def frame(
+        self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None
+    ) -> None:
+        """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
         _write_png(self.capture.path("color", camera, frame), colour[..., ::-1])
         path = self.capture.path("depth", camera, frame)
-        if path.suffix == ".png":
+        if depth is None:
+            assert not self.capture.has_depth, "depth was measured"
+        elif path.suffix == ".png":
             _write_png(path, depth)
         else:
             make_way(path)
@@ -252,26 +278,37 @@ class Writer:
         """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""
         _write_png(self.capture.path("mask", camera, frame), labels)
 
-    def finish(self, tracks: np.ndarray | None = None, **provenance: str) -> Capture:
-        """Write tracks [T, K, 3], m, NaN where not annotated, and capture.json, with a digest of all images in its provenance."""
+    def finish(
+        self, tracks: np.ndarray | None = None, points: Mapping[str, np.ndarray] | None = None, **provenance: str
+    ) -> Capture:
+        """Write tracks [T, K, 3], m, and points [T, K, 2], pixels, by camera, both NaN where not annotated, and capture.json, with a
+        digest of all images in its provenance."""
         folder, before = self.capture.folder, self.capture.description
         description = replace(before, provenance={**before.provenance, "images": images_digest(folder), **provenance})
         if tracks is not None:
             write_tracks(folder, tracks)
+        if points is not None:
+            write_text(folder / POINTS, json.dumps({name: _listed(one) for name, one in points.items()}) + "\n")
         plain = TypeAdapter(Description).dump_python(description, mode="json")
         if not description.obstacles:
             del plain["obstacles"]
+        if self.capture.has_depth:
+            del plain["depth"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
 
 
 def write_tracks(folder: Path, tracks: np.ndarray) -> None:
     """Write tracks.json of a capture's folder from tracks [T, K, 3], m, NaN where not annotated."""
-    listed = [
+    write_text(folder / TRACKS, json.dumps(_listed(tracks)) + "\n")
+
+
+def _listed(tracks: np.ndarray) -> list[list[list[float] | None]]:
+    """Tracks [T, K, n] as JSON holds them, [K][T], null where not annotated."""
+    return [
         [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
         for track in np.swapaxes(tracks, 0, 1)
     ]
-    write_text(folder / TRACKS, json.dumps(listed) + "\n")
 
 
 def images_digest(folder: Path) -> str:
@@ -299,6 +336,8 @@ def description_departures(path: Path, description: Description) -> list[Departu
     if description.train_end is not None and description.train_end > description.frame_count:
         rule = f"must be at most frame_count = {description.frame_count}"
         departures.append(broken(path, "train_end", rule, description.train_end))
+    if description.depth == "none" and len(names) > 1:
+        departures.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
     for number, obstacle in enumerate(description.obstacles):
         if wrong := obstacle.wrong():
             departures.append(broken(path, f"obstacles[{number}].{wrong[0]}", wrong[1], wrong[2]))
