@@ -15,6 +15,8 @@ LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
 EXTRA = ("drag_quadratic", "bending")
 """Variables beyond the released ones."""
+HANDS = ("hand_tilt", "hand_size", "hand_depth")
+"""Variables of how far hands are from a camera without depth; of captures with depth there are none."""
 TOPOLOGY = ("object_radius", "object_neighbours", "controller_radius", "controller_neighbours")
 """Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
@@ -52,11 +54,17 @@ class SearchRanges(Section):
     """Velocity decay per speed, 1/m; searched where `extra` names it."""
     bending: Range = (0.001, 100.0)
     """Stiffness and dashpot of bending springs over those of the others; searched where `extra` names it."""
+    hand_tilt: Range = (-45.0, 90.0)
+    """Color alone: tilt of the plane through its grip in which a hand moves, degrees. 0: upright, facing the camera. 90: level."""
+    hand_size: Range = (0.0, 1.0)
+    """Color alone: how much of a hand's distance follows from its apparent size, the rest from that plane."""
+    hand_depth: Range = (0.85, 1.18)
+    """Color alone: factors on a hand's distance from the camera at its knots (`hand_knots`)."""
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
             low, high = getattr(self, spec.name)
-            if not 0 <= low < high:
+            if not (0 <= low < high or (spec.name == "hand_tilt" and -90 < low < high)):
                 raise ValueError(f"{spec.name}: 0 <= low < high is required, received [{low}, {high}]")
         # An object node counts itself among its neighbors.
         for name, least in (("object_neighbours", 2), ("controller_neighbours", 1)):
@@ -98,6 +106,12 @@ class SearchScales(Section):
     """Velocity decay per speed."""
     bending: Scale = "log"
     """Stiffness and dashpot of bending springs over those of the others."""
+    hand_tilt: Scale = "linear"
+    """Tilt of the plane in which a hand moves."""
+    hand_size: Scale = "linear"
+    """How much apparent size says of a hand's distance."""
+    hand_depth: Scale = "log"
+    """Factors on a hand's distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +146,12 @@ class SearchStart(Section):
     """Velocity decay per speed, 1/m."""
     bending: float = 0.1
     """Stiffness and dashpot of bending springs over those of the others."""
+    hand_tilt: float = 0.0
+    """Tilt of the plane in which a hand moves, degrees."""
+    hand_size: float = 0.0
+    """How much apparent size says of a hand's distance."""
+    hand_depth: float = 1.0
+    """Factors on a hand's distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +210,9 @@ class Search(Section):
     """Variables beyond the released ones that are searched too; without them what they describe is absent."""
     bending_reach: Range = (1.6, 2.6)
     """Lengths of bending springs, from and to, in node spacings of the rest shape; two spacings lie across one node between."""
+    hand_knots: Annotated[int, Field(ge=0)] = 3
+    """Color alone: knots of each hand's distance, spread evenly over the training frames after frame 0; between them the factor is
+    a smooth curve, and it stays as it is after the last one."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
@@ -231,25 +254,34 @@ class Search(Section):
 
     @property
     def polished(self) -> tuple[str, ...]:
-        """Variables of the polish."""
-        return tuple(name for name in self.polish.variables if name not in self.fixed and name not in self.absent)
+        """Variables of the polish; those of hands count only where there are any."""
+        left_out = (*self.fixed, *self.absent, *HANDS)
+        return tuple(name for name in self.polish.variables if name not in left_out)
 
     @property
     def polish_rounds(self) -> int:
         """Most rounds of the polish that its share of the budget holds."""
-        if not self.polished:
-            return 0
-        return min(self.polish.rounds, int(self.polish.share * self.rollouts) // self.round_rollouts)
+        return self.rounds_of(len(self.polished))
 
-    @property
-    def round_rollouts(self) -> int:
-        """Rollouts of a round of the polish."""
-        return 1 + len(self.polished) + TRIALS
+    def rounds_of(self, polished: int) -> int:
+        """As `polish_rounds`, for a number of polished variables."""
+        if not polished:
+            return 0
+        return min(self.polish.rounds, int(self.polish.share * self.rollouts) // round_rollouts(polished))
 
     @property
     def cma_rollouts(self) -> int:
         """Rollouts of CMA-ES: the budget without what the polish may take."""
-        return self.rollouts - self.polish_rounds * self.round_rollouts
+        return self.cma_rollouts_of(len(self.polished))
+
+    def cma_rollouts_of(self, polished: int) -> int:
+        """As `cma_rollouts`, for a number of polished variables."""
+        return self.rollouts - self.rounds_of(polished) * round_rollouts(polished)
+
+
+def round_rollouts(polished: int) -> int:
+    """Rollouts of a round of the polish of so many variables."""
+    return 1 + polished + TRIALS
 
 
 TRIALS = 4

@@ -24,6 +24,13 @@ class Losses(Section):
     """Weight of the smooth-L1 error of tracked points."""
     acceleration: NonNegative = 0.01
     """Weight of the acceleration loss, which the search alone uses, as in the released method."""
+    image_track: NonNegative = 1.0
+    """Color alone: weight of the error of tracked points in the image, as a distance at the object."""
+    silhouette: NonNegative = 1.0
+    """Color alone: weight of the squared distance, in the image, between mask and nodes: of the mask's points from the nearest node,
+    and of nodes that leave object and hands from these."""
+    alpha: NonNegative = 0.0
+    """Color alone: weight of the error of the coverage by splats on the nodes, in squared node spacings."""
 
 
 @dataclass(frozen=True, kw_only=True)

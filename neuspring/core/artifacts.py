@@ -13,7 +13,8 @@ import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_type_hints
+from types import UnionType
+from typing import Any, ClassVar, Literal, Self, get_args, get_type_hints
 
 import numpy as np
 
@@ -104,6 +105,7 @@ class Artifact:
                 if value.size or not spec.metadata["omitted"]:
                     arrays[prefix + spec.name] = value
             elif isinstance(value, Artifact):
+                # Its arrays stand beside those of this one.
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
                 parts = dataclasses.asdict(value)
@@ -147,9 +149,13 @@ class Artifact:
                 if not optional or prefix + spec.name in arrays:
                     values[spec.name] = arrays[prefix + spec.name]
                 continue
-            if spec.name not in plain and spec.default is not dataclasses.MISSING:
+            has_default = spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
+            if spec.name not in plain and has_default:
                 continue  # a file of an older version, which did not know this field
             kind, value = hints[spec.name], plain[spec.name]
+            if isinstance(kind, UnionType):
+                # An artifact or none; a file that has it has an artifact.
+                kind = get_args(kind)[0]
             if isinstance(kind, type) and issubclass(kind, Artifact):
                 value = kind._build(arrays, value, f"{prefix}{spec.name}.")
             elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
@@ -221,6 +227,39 @@ class Scenario(Artifact):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ImageObservations(Artifact):
+    """What one calibrated camera without depth saw: the object in training frames, the hands in all frames.
+
+    Pixel centers lie at whole coordinates, x right, y down (data/capture.py).
+    """
+
+    kind: ClassVar[str] = "image_observations"
+    width: int
+    height: int
+    intrinsics: np.ndarray = array("3,3", np.float64, "px", "K")
+    camera_to_world: np.ndarray = array("4,4", np.float64, "m", "pose")
+    pixel_size: float
+    """Width of a pixel at the object in frame 0, m."""
+    pixels: np.ndarray = array("T,No,2", np.float32, "px", "where tracked points of the object are seen; zeros elsewhere")
+    visible: np.ndarray = array("T,No", np.bool_, "1", "whether they are seen; never in future frames")
+    inside: np.ndarray = array("E,P,2", np.float32, "px", "points of the object's silhouette in training frames; NaN: fewer", nan=True)
+    beside: np.ndarray = array("E,Q,2", np.float32, "px", "points beside object and hands; NaN: fewer", nan=True)
+    outside: np.ndarray = array("E,h,w", np.float32, "px", "distance from object and hands of cells of the image; 0 within")
+    cell: int
+    """Side of a cell, px; the center of cell (row i, column j) is ((j + 1/2) cell - 1/2, (i + 1/2) cell - 1/2)."""
+    hand_of: np.ndarray = array("C", np.int32, "1", "the hand of each controller")
+    hand_centers: np.ndarray = array("T,H,2", np.float32, "px", "where the grip of each hand is in the image")
+    hand_angles: np.ndarray = array("T,H", np.float32, "rad", "turn of each hand in the image since frame 0, from x to y")
+    hand_sizes: np.ndarray = array("T,H", np.float32, "1", "apparent size of each hand over that of frame 0")
+    marked: np.ndarray = array("T,K,2", np.float32, "px", "points marked by hand, for scoring only; NaN: not marked", nan=True)
+
+    @property
+    def hands(self) -> int:
+        """How many hands there are."""
+        return self.hand_centers.shape[1]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Observations(Artifact):
     """What was seen: tracked object points, the hands, and the structure of the object at frame 0.
 
@@ -243,6 +282,9 @@ class Observations(Artifact):
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
+    image: ImageObservations | None = field(default=None, metadata=OMITTED)
+    """What a camera without depth saw. Then object points are known in frame 0 alone, and controllers move as a guess says, which
+    a twin's `hands` replace (twin/hand_paths.py)."""
 
     def check(self) -> None:
         name = f"observations of {self.scenario.name}"
@@ -259,6 +301,11 @@ class Observations(Artifact):
                 name, "every tracked point must be visible in frame 0, where every rollout starts", f"{count} of {points} are not"
             )
         _require_rest_shape(name, self.rest_shape, len(self.nodes) + self.controller_points.shape[1])
+        if self.image is not None:
+            sizes = (*self.image.visible.shape, len(self.image.hand_of))
+            wanted = (frames, points, self.controller_points.shape[1])
+            if sizes != wanted:
+                raise InputError(f"{name}.image", f"frames, tracked points and controllers must be {wanted}", sizes)
 
     @property
     def nodes(self) -> np.ndarray:
@@ -442,6 +489,8 @@ class Twin(Artifact):
     topology: Topology
     material: Material
     simulation: Simulation
+    hands: dict[str, float] = field(default_factory=dict, metadata=OMITTED)
+    """How far the hands are from a camera without depth: searched variables of twin/hand_paths.py. Empty: hands were measured."""
 
     def check(self) -> None:
         springs, values = len(self.topology.springs), len(self.material.stiffness)

@@ -19,6 +19,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
 from neuspring.twin.fit import FitProblem, fit
+from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.pooled import PooledFit
 
@@ -90,9 +91,10 @@ def recorder(
 def prepared(record: Recorder, observations_path: Path, search_record: Path, settings: Config) -> Prepared:
     """What a fit starts from; the search must not have failed."""
     before = StageRecord.load(search_record)
+    twin = Twin.load(before.file("twin", search_record))
     problem = FitProblem(
-        Observations.load(observations_path),
-        Twin.load(before.file("twin", search_record)),
+        with_hands(Observations.load(observations_path), twin),
+        twin,
         settings.fit,
         settings.simulation,
         settings.losses,

@@ -17,6 +17,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import STAGES
 from neuspring.stages import options as shared
 from neuspring.twin.carry import carry_over
+from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.rollout import mean_trajectory, roll_out
 
@@ -72,10 +73,11 @@ def run(
     if failed:
         record.save(failure=f"{failed.stage}: {failed.reason}")
         return
-    observations = Observations.load(observations_path)
+    seen = Observations.load(observations_path)
     trajectories, corrections, updates = [], [], 0
     for path, stage in before.items():
         twin = Twin.load(stage.file("twin", path))
+        observations = with_hands(seen, twin)
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
         trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
         updates += (len(trajectory.positions) - 1) * twin.counts["springs"] * twin.counts["substeps"]

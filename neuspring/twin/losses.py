@@ -16,6 +16,7 @@ from torch.nn.functional import smooth_l1_loss
 
 from neuspring.config import Losses
 from neuspring.core.artifacts import Observations
+from neuspring.twin.image_losses import ImageLoss
 
 CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
@@ -81,6 +82,8 @@ class FrameLoss:
     surface: int
     weights: Losses
     frozen_counts: bool = False
+    image: ImageLoss | None = None
+    """Of captures without depth."""
 
     @classmethod
     def of(
@@ -101,7 +104,8 @@ class FrameLoss:
         points = torch.tensor(observations.object_points[:end], dtype=dtype, device=device)
         visible = torch.tensor(observations.object_visibility[:end], device=device)
         valid = torch.tensor(observations.object_motion_valid[:end], device=device)
-        return cls(points, visible, valid, observations.surface_count, weights, frozen_counts)
+        image = ImageLoss.of(observations, weights, device, dtype)
+        return cls(points, visible, valid, observations.surface_count, weights, frozen_counts, image)
 
     def counts(self) -> list[tuple[int, int]]:
         """(visible points, points whose motion is valid) that each frame's terms are divided by; none in frame 0."""
@@ -120,7 +124,8 @@ class FrameLoss:
             "chamfer": chamfer(nodes, target, visible, self.surface, visible_count),
             "track": track(nodes, target, valid, valid_count),
         }
-        return {name: getattr(self.weights, name) * value for name, value in values.items()}
+        weighted = {name: getattr(self.weights, name) * value for name, value in values.items()}
+        return weighted | (self.image.terms(frame, nodes) if self.image else {})
 
     def __call__(self, frame: int, nodes: torch.Tensor) -> torch.Tensor:
         """The sum of a frame's terms."""

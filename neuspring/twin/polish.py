@@ -55,7 +55,7 @@ class Polish:
     @property
     def done(self) -> bool:
         """Whether nothing more is asked for."""
-        return self.finished or self.rounds >= self.search.polish_rounds
+        return self.finished or self.rounds >= self.search.rounds_of(len(self.columns))
 
     def steps(self) -> np.ndarray:
         """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""

@@ -28,7 +28,9 @@ class Proposals:
         searched = problem
         if self._tied:
             searched = replace(problem, clusters=1)
-            self._columns = np.array([searched.variables.index(name.partition(".")[0]) for name in problem.variables])
+            # Those of regions share a value; those of hands are of no region.
+            shared = [name if name in searched.variables else name.partition(".")[0] for name in problem.variables]
+            self._columns = np.array([searched.variables.index(name) for name in shared])
         self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
         self._population: list[np.ndarray] = []
         self._best = (np.inf, problem.encode())

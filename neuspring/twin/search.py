@@ -22,13 +22,14 @@ import pandas as pd
 import torch
 
 from neuspring import config
-from neuspring.config.search import LENGTHS
+from neuspring.config.search import HANDS, LENGTHS
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.physics.path import waypoints
+from neuspring.twin import hand_paths
 from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.masses import volume_masses
@@ -91,6 +92,9 @@ class SearchProblem:
 
     def __post_init__(self) -> None:
         require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
+        if self.pool and self.observations.image is not None:
+            where = f"pool of {self.observations.scenario.name}"
+            raise InputError(where, "recordings of color alone are searched one by one", f"a pool of {len(self.pool) + 1}")
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
@@ -110,16 +114,22 @@ class SearchProblem:
         """All that makes a candidate: the fields of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
         for f in fields(config.SearchRanges):
-            if f.name in self.search.absent:
+            if f.name in (*self.search.absent, *HANDS):
                 continue
             regional = f.name in REGIONAL and self.clusters > 1
             names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
-        return tuple(names)
+        image = self.observations.image
+        return (*names, *(hand_paths.names(image, self.search.hand_knots) if image else ()))
 
     @property
     def variables(self) -> tuple[str, ...]:
         """Names of what is searched: `names` without `search.fixed`."""
         return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
+
+    @property
+    def polished(self) -> tuple[str, ...]:
+        """Names of what is polished."""
+        return tuple(name for name in self.variables if name.partition(".")[0] in self.search.polish.variables)
 
     @property
     def bending_reach(self) -> tuple[float, float]:
@@ -227,7 +237,8 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     if "bending" in values:
         factor = np.where(topology.is_bending, values["bending"], 1.0)
         material = replace(material, stiffness=material.stiffness * factor, dashpot=material.dashpot * factor)
-    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1)))
+    hands = {name: value for name, value in values.items() if name.partition(".")[0] in HANDS}
+    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1), hands=hands))
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
@@ -240,19 +251,30 @@ def homogeneous(values: dict[str, float], springs: int) -> Material:
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of candidates that are rolled out together over the training frames."""
-    return outcomes(twins, *_motion(problem), loss, problem.device)
+    return outcomes(twins, *_motion(problem, twins), loss, problem.device)
 
 
-def _motion(problem: SearchProblem) -> tuple[torch.Tensor, torch.Tensor]:
-    """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s."""
-    hands = torch.tensor(problem.observations.controller_points, device=problem.device)[: problem.observations.scenario.train_end]
-    hands = waypoints(hands, simulation_of(problem, 1), problem.observations.controller_valid)
+def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s.
+
+    Waypoints have an axis [B] of twins where each has hands of its own.
+    """
+    observations, end = problem.observations, problem.observations.scenario.train_end
+
+    def path(points: np.ndarray) -> torch.Tensor:
+        hands = torch.tensor(points, dtype=torch.float32, device=problem.device)[:end]
+        return waypoints(hands, simulation_of(problem, 1), observations.controller_valid)
+
+    if observations.image is None:
+        hands = path(observations.controller_points)
+    else:
+        hands = torch.stack([path(hand_paths.hand_points(observations, twin.hands)) for twin in twins], dim=1)
     return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
 
 
-def _recordings(problem: SearchProblem, loss: FrameLoss) -> dict[int, Recording]:
-    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own."""
-    own = {} if problem.leave_out else {0: Recording(problem.observations, *_motion(problem), loss)}
+def _recordings(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> dict[int, Recording]:
+    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own, with its `twins`."""
+    own = {} if problem.leave_out else {0: Recording(problem.observations, *_motion(problem, twins), loss)}
     return own | dict(enumerate(problem.pool, start=1))
 
 
@@ -319,7 +341,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     saved = len(trace)
     proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    budget = problem.search.cma_rollouts
+    budget = problem.search.cma_rollouts_of(len(problem.polished))
     progress = Progress(
         f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", problem.search.rollouts
     )
@@ -377,10 +399,10 @@ def _polished(
 ) -> Iterator[list[dict[str, Any]]]:
     """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
     best = min(trace, key=lambda row: row["cost"])
-    if not problem.search.polish_rounds or best["cost"] >= PENALTY:
+    if not problem.search.rounds_of(len(problem.polished)) or best["cost"] >= PENALTY:
         return
     start = np.array([best[f"normalised.{name}"] for name in problem.variables])
-    columns = [problem.variables.index(name) for name in problem.search.polished]
+    columns = [problem.variables.index(name) for name in problem.polished]
     polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
     while not polish.done:
         generation += 1
@@ -421,7 +443,7 @@ def _slopes(
     families = [family or base for _, family in made]
     most = [max(twin.simulation.substeps for twin in twins) for twins in zip(*families, strict=True)]
     fine, seen = [bool(family) for _, family in made], []
-    for place, recording in _recordings(problem, loss).items():
+    for place, recording in _recordings(problem, [family[0] for family in families], loss).items():
         twins = [family[place] for family in families]
         twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
         positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
@@ -437,7 +459,7 @@ def _slopes(
         row["cost"] = min(float(costs[k]), PENALTY)
         own = (0.0, np.zeros(len(steps))) if k == 0 else (gradient[k - 1], products[k - 1])
         row |= {RESIDUAL: float(own[0])}
-        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.search.polished, own[1], strict=True)}
+        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.polished, own[1], strict=True)}
         rows.append(row)
     return rows
 

@@ -39,14 +39,14 @@ class Outcome:
 def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
     """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
 
-    hands are the controllers' positions [T, C, 3], or what `path.waypoints` makes of them.
+    hands are the controllers' positions [T, C, 3], or what `path.waypoints` makes of them; or those of each twin, [T, B, C, 3].
     """
     solver = solver_of(twins, device, differentiable=False)
     count = len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
     sums = LossSums(solver, loss, velocity)
-    every = hands[:, None].expand(-1, count, -1, -1)
+    every = _of_each(hands, count)
     for frame in range(1, len(hands)):
         solver.advance(every[frame - 1], every[frame])
         sums.add(frame)
@@ -60,11 +60,12 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 
 
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], on the CPU."""
+    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3] (or of each twin,
+    [T, B, C, 3]), on the CPU."""
     solver, count = solver_of(twins, device, differentiable=False), len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
-    every = hands[:, None].expand(-1, count, -1, -1)
+    every = _of_each(hands, count)
     kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
     for frame in range(1, len(hands)):
         solver.advance(every[frame - 1], every[frame])
@@ -72,6 +73,11 @@ def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, 
             states.append(solver.buffers.get_vectors(name, solver.last, solver.nodes).cpu())
         solver.go_on()
     return torch.stack(kept["x"]), torch.stack(kept["v"])
+
+
+def _of_each(hands: torch.Tensor, twins: int) -> torch.Tensor:
+    """Hands [T, B, C, k] of each twin, if all share [T, C, k]."""
+    return hands if hands.dim() == 4 else hands[:, None].expand(-1, twins, -1, -1)
 
 
 class LossSums:
@@ -92,6 +98,7 @@ class LossSums:
             wp.from_torch(flags.to(torch.int32).contiguous()) for flags in (loss.visible, loss.motion_valid)
         )
         self._counts = loss.counts()
+        self._images = torch.zeros(b.twins, dtype=torch.float64, device=b.device)
 
     def add(self, frame: int) -> None:
         """Add the loss of a frame, whose end the solver holds."""
@@ -108,11 +115,17 @@ class LossSums:
             ("acceleration", b.nodes, weights.acceleration / (3 * b.nodes)),
         ):
             b.launch(k.total, b.groups, views[name], size, weight, self._view)
+        if self._loss.image:
+            # One twin at a time, so that its sum does not depend on its company.
+            for twin, nodes in enumerate(b.get_vectors("x", slot, b.nodes)):
+                terms = self._loss.image.terms(frame, nodes).values()
+                self._images[twin] += sum(term.double() for term in terms)
         b.launch(k.look, b.groups, x, slot, b.nodes, float(frame), views["gone"])
 
     def costs(self, frames: int) -> list[float]:
         """Mean loss of `frames` frames, of each twin."""
-        return [float(total) / frames for total in self._total.reshape(-1)[: self._buffers.twins].cpu()]
+        totals = self._total.reshape(-1)[: self._buffers.twins] + self._images
+        return [float(total) / frames for total in totals.cpu()]
 
     @property
     def left(self) -> list[int]:

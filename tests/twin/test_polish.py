@@ -36,7 +36,7 @@ def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, 
 
 def rollouts_of(problem: SearchProblem, twins: list) -> tuple[torch.Tensor, torch.Tensor, FrameLoss, torch.Tensor]:
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu", frozen_counts=problem.quirks.frozen_loss_denominators)
-    hands, start = module._motion(problem)
+    hands, start = module._motion(problem, twins)
     return *motions(twins, hands, start, "cpu"), loss, start
 
 
@@ -71,7 +71,7 @@ def test_slopes_are_those_of_the_cost():
     """2 J'r against central differences of the cost, without the acceleration term, which bends most."""
     problem = polished(losses=config.Losses(acceleration=0.0))
     base = problem.encode()
-    columns = [problem.variables.index(name) for name in problem.search.polished]
+    columns = [problem.variables.index(name) for name in problem.polished]
 
     def twins(step: float) -> list:
         moved = [base + step * np.eye(len(base))[column] for column in columns]
