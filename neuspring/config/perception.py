@@ -198,6 +198,36 @@ class Sampling(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ColorSettings(Section):
+    """Captures without depth (`depth: none`): the object of frame 0 on the table, hands and silhouettes in the image."""
+
+    flat: tuple[str, ...] = ("cloth",)
+    """Categories of sheets: every pixel lies on the table."""
+    round: tuple[str, ...] = ("rope",)
+    """Categories of ropes: as thick as they are wide."""
+    sheet_thickness: Positive = 0.004
+    """Thickness of a sheet, m."""
+    body_thickness: Positive = 0.8
+    """Height of a body above the table in local widths of its silhouette, of all categories that are neither flat nor round."""
+    beneath: NonNegative = 0.03
+    """What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
+    grip_reach: Positive = 0.02
+    """Distance from the object, m at the object, up to which pixels of a hand hold it in frame 0."""
+    hands_apart: Positive = 0.04
+    """Distance between the grips of different hands, m at the object."""
+    hand_radius: Positive = 0.08
+    """Corners of a hand are followed this far around its grip, m at the object."""
+    hand_tilt: Finite = 0.0
+    """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.ranges.hand_tilt)."""
+    samples: Count = 300
+    """Points of the object's silhouette per frame, and as many beside it."""
+    band: Positive = 30.0
+    """How far from the object points beside it may be, pixels."""
+    cell: Count = 4
+    """Side of the cells of the distance from object and hands, pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
@@ -224,12 +254,13 @@ class PointTracking(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Perception(Section):
-    """Raw RGBD video to observations."""
+    """Raw video to observations."""
 
     segment: Segmentation = field(default_factory=Segmentation)
     track: PointTracking = field(default_factory=PointTracking)
     lift: Lift = field(default_factory=Lift)
     shape: ShapePriorSettings = field(default_factory=ShapePriorSettings)
     sample: Sampling = field(default_factory=Sampling)
+    color: ColorSettings = field(default_factory=ColorSettings)
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the pixels that are followed and of the points that are sampled."""

@@ -27,8 +27,8 @@ class Losses(Section):
     image_track: NonNegative = 1.0
     """Color alone: weight of the error of tracked points in the image, as a distance at the object."""
     silhouette: NonNegative = 1.0
-    """Color alone: weight of the squared distance, in the image, between mask and nodes: of the mask's points from the nearest node,
-    and of nodes that leave object and hands from these."""
+    """Color alone: weight of the squared distance, in the image, between mask and nodes: of points of the mask from the
+    nearest node, and of nodes that leave object and hands from these."""
     alpha: NonNegative = 0.0
     """Color alone: weight of the error of the coverage by splats on the nodes, in squared node spacings."""
 

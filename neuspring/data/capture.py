@@ -281,8 +281,8 @@ class Writer:
     def finish(
         self, tracks: np.ndarray | None = None, points: Mapping[str, np.ndarray] | None = None, **provenance: str
     ) -> Capture:
-        """Write tracks [T, K, 3], m, and points [T, K, 2], pixels, by camera, both NaN where not annotated, and capture.json, with a
-        digest of all images in its provenance."""
+        """Write capture.json, with a digest of all images in its provenance; before it tracks [T, K, 3], m, and points [T, K, 2],
+        pixels, by camera, both NaN where not annotated."""
         folder, before = self.capture.folder, self.capture.description
         description = replace(before, provenance={**before.provenance, "images": images_digest(folder), **provenance})
         if tracks is not None:

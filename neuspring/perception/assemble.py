@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception
-from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.artifacts import ImageObservations, Observations, Scenario
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import LiftedTracks, ShapePrior
 from neuspring.perception.sample import on_table, structure
 
 
-def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: ShapePrior, settings: Perception) -> Observations:
-    """What every method reads. Points that are invisible are zero."""
+def assemble(
+    row: ScenarioRow,
+    capture: Capture,
+    lifted: LiftedTracks,
+    prior: ShapePrior,
+    settings: Perception,
+    image: ImageObservations | None = None,
+) -> Observations:
+    """What every method reads. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks."""
     up = 1.0 if capture.description.up == "+z" else -1.0
-    indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed)
+    # In the image every node should have a track that is followed for long.
+    followed = None if image is None else image.visible.sum(axis=0)
+    indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed, followed)
+    if image is not None:
+        image = replace(image, pixels=image.pixels[:, indices], visible=image.visible[:, indices])
     visible = lifted.object_visibility[:, indices]
     points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
     origin = {
@@ -48,4 +61,5 @@ def assemble(row: ScenarioRow, capture: Capture, lifted: LiftedTracks, prior: Sh
         surface_points=surface,
         interior_points=interior,
         tracks=capture.tracks(),
+        image=image,
     )

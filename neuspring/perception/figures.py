@@ -8,6 +8,7 @@ import cv2
 import matplotlib
 import numpy as np
 
+from neuspring.core.artifacts import ImageObservations
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
@@ -18,6 +19,8 @@ TINTS = {OBJECT: np.array([40, 200, 60]), HANDS: np.array([70, 110, 255])}
 TRAIL = 8
 """How many frames back the tail of a track reaches."""
 MOST_TRACKS = 400
+HAND_ARROW = 40.0
+"""Pixels of the arrow of a hand that appears as large as in frame 0."""
 
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
@@ -49,6 +52,21 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
                 cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, color, 1, cv2.LINE_AA)
                 cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, color, -1, cv2.LINE_AA)
         tiles.append(image)
+    return _save(tiles, path)
+
+
+def hands_strip(capture: Capture, image: ImageObservations, path: Path) -> Path:
+    """Frames of the video with the grip of each hand: its place, turn and size, and where it was."""
+    tiles, camera = [], next(iter(capture.cameras))
+    for frame in _frames(capture, camera):
+        tile = np.ascontiguousarray(capture.colour(camera, frame))
+        for hand in range(image.hands):
+            way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
+            cv2.polylines(tile, [way[:, None]], False, (255, 210, 0), 1, cv2.LINE_AA)
+            angle, size = float(image.hand_angles[frame, hand]), HAND_ARROW * float(image.hand_sizes[frame, hand])
+            tip = way[-1] + np.round(size * np.array([np.cos(angle), np.sin(angle)])).astype(int)
+            cv2.arrowedLine(tile, tuple(way[-1].tolist()), tuple(tip.tolist()), (255, 60, 60), 2, cv2.LINE_AA)
+        tiles.append(tile)
     return _save(tiles, path)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.core.artifacts import Observations
+from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.findings import Finding, finding
 from neuspring.data.plausible.things import place_findings
 from neuspring.perception.results import LiftedTracks, ShapePrior
@@ -27,15 +27,18 @@ APART = 0.15
 """m between hand and object, at their nearest, from which there is no interaction to learn from."""
 STILL = 0.005
 """m: motions smaller than this are noise."""
+RESIZED = 1.8
+"""Change of a hand's apparent size."""
 FASTEST = 5.0
 """m/s: no hand that manipulates is faster."""
 NODES = (30, 5000)
 """Structure points that can deform, and that a search can pay for."""
 
 
-def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
-    """Findings about points in the world and the shape; `up` is +1 or -1."""
-    return [*place_findings("object in frame 0", [lifted.cloud], up), *_shape(prior), *_motion(lifted)]
+def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
+    """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
+    moving = _motion(lifted) if image is None else _in_image(image)
+    return [*place_findings("object in frame 0", [lifted.cloud], up), *_shape(prior), *moving]
 
 
 def look_at_observations(observations: Observations) -> list[Finding]:
@@ -49,8 +52,13 @@ def look_at_observations(observations: Observations) -> list[Finding]:
     if len(nodes) > NODES[1]:
         value, rule = f"{len(nodes):,} structure points", f"more than {NODES[1]:,} make searches take hours"
         found.append(finding("many nodes", "note", where, value, rule, "perception.sample.nodes limits them."))
-    seen = observations.object_visibility[: scenario.train_end]
-    moved = np.linalg.norm(observations.object_points[: scenario.train_end] - observations.object_points[0], axis=2)
+    image = observations.image
+    if image is None:
+        seen = observations.object_visibility[: scenario.train_end]
+        moved = np.linalg.norm(observations.object_points[: scenario.train_end] - observations.object_points[0], axis=2)
+    else:
+        seen = image.visible[: scenario.train_end]
+        moved = image.pixel_size * np.linalg.norm(image.pixels[: scenario.train_end] - image.pixels[0], axis=2)
     # Of the points that are seen in a frame, a tenth moves farther than this; the farthest frame counts.
     farthest = max(
         (float(np.quantile(row[shown], 0.9)) for row, shown in zip(moved, seen, strict=True) if shown.any()), default=0.0
@@ -94,6 +102,21 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
         value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
         rule = f"at least {ALIVE:.0%} are expected in every frame"
         found.append(finding("points lost", "warning", where, value, rule, f"End the capture before frame {low[0]}. {remedy}"))
+    return found
+
+
+def _in_image(image: ImageObservations) -> list[Finding]:
+    """Points of the object that are lost in the image, and hands that were not followed."""
+    found = []
+    alive = image.visible[: len(image.inside)].mean(axis=1)
+    if (low := np.flatnonzero(alive < ALIVE)).size:
+        value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
+        rule = f"at least {ALIVE:.0%} are expected in every training frame; silhouettes alone say where the object is in the others"
+        found.append(finding("points lost", "warning", "tracks", value, rule, "Look at tracks.png."))
+    if image.hand_sizes.max() > RESIZED or image.hand_sizes.min() < 1 / RESIZED:
+        value = f"a hand appears {image.hand_sizes.min():.2f} to {image.hand_sizes.max():.2f} times as large as in frame 0"
+        rule = f"a hand at arm's length changes by less than {RESIZED:g} times; it was not followed well"
+        found.append(finding("size of hands", "warning", "hands", value, rule, "Look at hands.png, and mark the hands anew."))
     return found
 
 

@@ -20,16 +20,19 @@ GROWTH = 1.01
 
 
 def structure(
-    lifted: LiftedTracks, prior: ShapePrior, settings: Sampling, up: float, seed: int
+    lifted: LiftedTracks, prior: ShapePrior, settings: Sampling, up: float, seed: int, rank: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Indices of the object tracks to keep [No], surface points [Ns, 3] and interior points [Ni, 3], m, and the voxel's side, m.
 
-    Tracks with the same place in frame 0 count once, in lexicographic order of their places. Every voxel holds one point; object
+    Tracks with the same place in frame 0 count once, in lexicographic order of their places, those of the highest `rank` [Q] first
+    where one is given. Every voxel holds one point; object
     before surface before interior. Its side is `settings.voxel`, or what `settings.nodes` needs. Points below the table are lifted
     to it.
     """
     start = on_table(lifted.object_points[0], up)
     _, unique = np.unique(start, axis=0, return_index=True)
+    if rank is not None:
+        unique = unique[np.argsort(-rank[unique], kind="stable")]
     surface, interior = (on_table(points, up) for points in _samples(prior, settings, seed))
     everything = np.concatenate([start[unique], surface, interior])
     voxel = settings.voxel if settings.nodes is None else voxel_for(everything, settings.nodes, settings.voxel)

@@ -42,7 +42,7 @@ STAGES = {
     ),
     "lift": Stage(
         about="masks and tracks of all cameras -> points in the world, shape prior",
-        reads=("perception.lift", "perception.shape"),
+        reads=("perception.lift", "perception.shape", "perception.color"),
         memory_mb=8000,
         minutes=60,
     ),

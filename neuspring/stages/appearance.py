@@ -106,7 +106,8 @@ def run(
     capture = Capture.load(folder)
     masks = masks_of_cameras(capture, masks_records)
     backend = choose_backend(images.backend, device)
-    shots = _shots(capture, masks, images, device)
+    depths = {} if capture.has_depth or lifted_record is None else _guessed_depth(capture, lifted_record)
+    shots = _shots(capture, masks, images, device, depths)
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
     surface = _surface(capture, masks, settings, seed, width, lifted_record, observations_path)
     _require_outside(capture, np.concatenate([surface.cloud, surface.prior]))
@@ -143,13 +144,31 @@ def run(
     record.save(files, facts)
 
 
-def _shots(capture: Capture, masks: Mapping[str, Masks], images: Images, device: str) -> list[Shot]:
-    """Views of frame 0 to train on; a camera that does not show the object is left out, and said."""
+def _guessed_depth(capture: Capture, lifted_record: Path) -> dict[str, np.ndarray]:
+    """Depth of frame 0 [H, W], m, of a camera without depth: where perception put what each pixel shows."""
+    lifted = LiftedTracks.load(StageRecord.load(lifted_record).file("lifted", lifted_record))
+    depths = {}
+    for name, camera in capture.cameras.items():
+        pixels, distance = camera.project(lifted.cloud.astype(float))
+        seen = camera.sees(pixels)
+        x, y = np.round(pixels[seen]).astype(int).T
+        depths[name] = np.zeros((camera.height, camera.width))
+        depths[name][y, x] = distance[seen]
+    return depths
+
+
+def _shots(
+    capture: Capture, masks: Mapping[str, Masks], images: Images, device: str, depths: Mapping[str, np.ndarray]
+) -> list[Shot]:
+    """Views of frame 0 to train on; a camera that does not show the object is left out, and said.
+
+    `depths` are guesses for cameras without depth.
+    """
     shots = []
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
         margin = images.appearance.hand_margin * camera.width / REFERENCE_WIDTH
-        seen = (capture.colour(name, 0), labels == OBJECT, labels == HANDS, capture.depth(name, 0))
+        seen = (capture.colour(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
         shot = Shot.of(name, view_of(camera, images, device), *seen, margin)
         if shot is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)

@@ -41,6 +41,7 @@ def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None =
         rule = f"scenarios of source {row.source} need --capture and --lifted"
         raise InputError(f"scenario {row.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     # Imported here: processed data need nothing of perception, whose code must not start their jobs again.
+    from neuspring.core.artifacts import ImageObservations
     from neuspring.data.capture import Capture
     from neuspring.perception.assemble import assemble
     from neuspring.perception.look_world import look_at_observations
@@ -50,7 +51,8 @@ def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None =
     lifted = LiftedTracks.load(record.file("lifted", lifted_record))
     prior = ShapePrior.load(record.file("shape", lifted_record))
     recorder = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted_record})
-    observations = assemble(row, Capture.load(capture), lifted, prior, settings.perception)
+    image = ImageObservations.load(record.file("image", lifted_record)) if "image" in record.files else None
+    observations = assemble(row, Capture.load(capture), lifted, prior, settings.perception, image)
     findings = look_at_observations(observations)
     facts = told(findings)
     # Before the observations are there: what no method can work with starts no search.

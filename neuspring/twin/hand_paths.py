@@ -60,11 +60,15 @@ def hand_depths(observations: Observations, values: Mapping[str, float]) -> np.n
     """z(t) / z(0) of each hand [T, H]."""
     image, scenario = observations.image, observations.scenario
     assert image is not None
-    up = 1.0 if scenario.up == "+z" else -1.0
+    return depths_of(image, values, scenario.train_end, 1.0 if scenario.up == "+z" else -1.0)
+
+
+def depths_of(image: ImageObservations, values: Mapping[str, float], train_end: int, up: float) -> np.ndarray:
+    """As `hand_depths`; up is +1 or -1."""
     factors = np.array([value for name, value in values.items() if name.startswith("hand_depth.")]).reshape(image.hands, -1)
     share = values["hand_size"]
     plane = plane_depths(image, values["hand_tilt"], up)
-    curve = knot_curve(factors, scenario.train_end, scenario.frame_count)
+    curve = knot_curve(factors, train_end, len(image.hand_centers))
     return np.asarray(plane ** (1 - share) * image.hand_sizes.astype(np.float64) ** -share * curve)
 
 
@@ -106,8 +110,8 @@ def rays(image: ImageObservations, pixels: np.ndarray) -> np.ndarray:
 def place(image: ImageObservations, first: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Controllers [T, C, 3], m, from those of frame 0 [C, 3] and z(t) / z(0) [T, H].
 
-    In camera axes, with the grip's point g(t) at depth z(t) on the ray through u(t): x(t) = g(t) + R(a(t)) (x(0) - g(0)), R a turn about
-    the ray of u(t).
+    In camera axes, with the grip's point g(t) at depth z(t) on the ray through u(t): x(t) = g(t) + R(a(t)) (x(0) - g(0)), R a turn
+    about that ray.
     """
     pose = image.camera_to_world
     local = (first - pose[:3, 3]) @ pose[:3, :3]

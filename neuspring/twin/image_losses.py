@@ -5,10 +5,10 @@ With the projection u(x) = K R^T (x - c) / depth, pixel size s (m per pixel at t
     image_track   smooth-L1 of s (u(x_i) - q_i), mean over tracked points that are seen and over x and y; linear beyond BETA, since
                   trackers slide
     silhouette    s^2 (mean over points p of the mask of min_i |p - u(x_i)|^2  +  mean over nodes i of D(u(x_i))^2), the first over
-                  surface nodes, assignment fixed; D is the distance from object and hands, bilinear between cells. A node before
-                  or behind a hand is not wrong.
-    alpha         d^2 (mean over points p of the mask of (1 - A(p))^2  +  mean over points p beside it of A(p)^2), where splats on the
-                  surface nodes cover A(p) = 1 - prod_i (1 - OPACITY exp(-|p - u(x_i)|^2 / (2 w^2))), w = d / (2 s) pixels
+                  surface nodes, assignment fixed; D is the distance from object and hands, bilinear between cells. A node that a
+                  hand hides is not wrong.
+    alpha         d^2 (mean over points p of the mask of (1 - A(p))^2  +  mean over points p beside it of A(p)^2), where splats
+                  on the surface nodes cover A(p) = 1 - prod_i (1 - OPACITY exp(-|p - u(x_i)|^2 / (2 w^2))), w = d / (2 s) pixels
 
 A term is weighted by the field of `config.Losses` that has its name. All are in m^2, as the other losses are.
 """
@@ -56,9 +56,7 @@ class ImageLoss:
     weights: Losses
 
     @classmethod
-    def of(
-        cls, observations: Observations, weights: Losses, device: str, dtype: torch.dtype = torch.float32
-    ) -> ImageLoss | None:
+    def of(cls, observations: Observations, weights: Losses, device: str, dtype: torch.dtype = torch.float32) -> ImageLoss | None:
         """None for captures with depth."""
         image = observations.image
         if image is None:

@@ -60,8 +60,8 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 
 
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3] (or of each twin,
-    [T, B, C, 3]), on the CPU."""
+    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], or
+    [T, B, C, 3] of each twin, on the CPU."""
     solver, count = solver_of(twins, device, differentiable=False), len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))

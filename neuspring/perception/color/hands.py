@@ -1,0 +1,162 @@
+"""Hands in the image: where the grip of each is, how it is turned and how large it appears, in all frames.
+
+Corners of the hand near its grip are followed from frame to frame (pyramidal Lucas-Kanade, forward and backward) in images in
+which all but the hand's mask is gray: nothing else is read. Between a key frame and the present frame, a similarity is fitted to
+the corners that are left (RANSAC). Where too few are left, the present frame becomes the key frame. Sizes and turns are smoothed
+over time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.signal import savgol_filter
+
+from neuspring.data.capture import HANDS, OBJECT, Capture
+
+CORNERS, LEAST, KEPT = 120, 6, 0.5
+"""Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""
+EDGE = 2
+"""px: corners are this far within the mask, so that its own outline is not followed."""
+FORWARD_BACKWARD = 0.7
+"""px by which a corner may miss its start."""
+WINDOW = 15
+GRAY = 128
+SMOOTH = 9
+"""Frames over which size and turn are smoothed (Savitzky-Golay, second order)."""
+LARGEST_STEP = 1.15
+"""Change of size from frame to frame beyond which a fit is not believed."""
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """Motion of H hands in the image."""
+
+    centers: np.ndarray
+    """[T, H, 2] px: the grip."""
+    angles: np.ndarray
+    """[T, H] rad, from x to y, since frame 0."""
+    sizes: np.ndarray
+    """[T, H], over those of frame 0."""
+    lost: int
+    """Frames in which some hand was not followed: it moves as before."""
+
+
+def grips(labels: np.ndarray, filled: np.ndarray, reach: float, apart: float) -> list[np.ndarray]:
+    """Pixels (x, y) [n, 2] of each hand that hold the object in frame 0.
+
+    They are those of the hands' mask within `reach` of the object, or, if there are none, the nearest ones. Pieces of them that
+    lie `apart` or more from each other (pixels) are different hands.
+    """
+    away = cv2.distanceTransform((labels != OBJECT).astype(np.uint8) * (~filled).astype(np.uint8), cv2.DIST_L2, 5)
+    hands = labels == HANDS
+    if not hands.any():
+        return []
+    near = hands & (away <= max(reach, float(away[hands].min()) + 2.0))
+    radius = max(round(apart / 2), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+    count, pieces = cv2.connectedComponents(cv2.dilate(near.astype(np.uint8), disc))
+    found = []
+    for piece in range(1, count):
+        y, x = np.nonzero(near & (pieces == piece))
+        found.append(np.stack([x, y], axis=1))
+    largest = max(len(one) for one in found)
+    # Specks of a mask are no hands.
+    return [one for one in found if len(one) >= 0.1 * largest]
+
+
+def follow_hands(capture: Capture, camera: str, labels: np.ndarray, held: list[np.ndarray], radius: float) -> HandMotion:
+    """Follow the grips `held` of frame 0 through all frames; labels [T, H, W]. Corners lie within `radius` px of the grip."""
+    hands = [_follow(capture, camera, labels, grip.mean(axis=0), radius) for grip in held]
+    poses = np.stack([pose for pose, _ in hands], axis=1)
+    angles, sizes = np.unwrap(poses[..., 2], axis=0), poses[..., 3]
+    if len(poses) > SMOOTH:
+        angles = savgol_filter(angles, SMOOTH, 2, axis=0)
+        sizes = np.exp(savgol_filter(np.log(sizes), SMOOTH, 2, axis=0))
+    angles, sizes = angles - angles[:1], sizes / sizes[:1]
+    return HandMotion(poses[..., :2], angles, sizes, sum(lost for _, lost in hands))
+
+
+def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarray, radius: float) -> tuple[np.ndarray, int]:
+    """(x, y, angle, size) of one hand in every frame [T, 4], and how often it was lost."""
+    frames, lost = capture.frame_count, 0
+    poses = np.zeros((frames, 4))
+    poses[0] = [*center, 0.0, 1.0]
+    before = _hand_image(capture, camera, labels, 0)
+    key, start = poses[0], _corners(before, labels[0], center, radius)
+    points = start
+    for frame in range(1, frames):
+        poses[frame] = _as_before(poses, frame)
+        if not capture.has(camera, frame):
+            continue
+        now = _hand_image(capture, camera, labels, frame)
+        if len(points):
+            points, ok = _flow(before, now, points)
+            start, points = start[ok], points[ok]
+        fit = _similarity(start, points)
+        pose = None if fit is None else _moved(key, *fit)
+        if pose is not None and 1 / LARGEST_STEP < pose[3] / poses[frame - 1, 3] < LARGEST_STEP:
+            poses[frame] = pose
+        else:
+            lost += 1
+            start = points = np.zeros((0, 2), np.float32)
+        if len(points) < max(LEAST, KEPT * CORNERS / 2):
+            key, start = poses[frame], _corners(now, labels[frame], poses[frame, :2], radius)
+            points = start
+        before = now
+    return poses, lost
+
+
+def _as_before(poses: np.ndarray, frame: int) -> np.ndarray:
+    """Where a hand is that was not followed: it goes on as it went, half as fast."""
+    step = poses[frame - 1] - poses[frame - 2] if frame > 1 else np.zeros(4)
+    guess = poses[frame - 1] + 0.5 * step
+    guess[2:] = poses[frame - 1, 2:]
+    return np.asarray(guess)
+
+
+def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -> np.ndarray:
+    """Gray image [H, W] uint8 of the hands alone."""
+    if not capture.has(camera, frame):
+        return np.full(labels.shape[1:], GRAY, np.uint8)
+    gray = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+    return np.where(labels[frame] == HANDS, gray, GRAY).astype(np.uint8)
+
+
+def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
+    """Corners (x, y) [n, 2] of hands around a place, within their mask; of a wider place if there are few."""
+    inside = cv2.erode((labels == HANDS).astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8))
+    for factor in (1.0, 1.6, 2.5):
+        disc = np.zeros_like(inside)
+        cv2.circle(disc, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
+        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & disc, blockSize=3)
+        if found is not None and len(found) >= 3 * LEAST:
+            return np.asarray(found.reshape(-1, 2))
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))
+
+
+def _flow(before: np.ndarray, now: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    options = {"winSize": (WINDOW, WINDOW), "maxLevel": 3}
+    start = np.ascontiguousarray(points, np.float32)
+    moved, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, **options)  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, **options)
+    ok = (there.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < FORWARD_BACKWARD)
+    return np.asarray(moved), ok
+
+
+def _similarity(start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+    """(matrix [2, 3], angle, size) of the similarity from corners of the key frame to their present places; None: too few agree."""
+    if len(start) < LEAST:
+        return None
+    # OpenCV's RANSAC begins with the same seed in every call.
+    matrix, agree = cv2.estimateAffinePartial2D(start, points, method=cv2.RANSAC, ransacReprojThreshold=1.5)
+    if matrix is None or agree.sum() < LEAST:
+        return None
+    return matrix, float(np.arctan2(matrix[1, 0], matrix[0, 0])), float(np.hypot(matrix[0, 0], matrix[1, 0]))
+
+
+def _moved(key: np.ndarray, matrix: np.ndarray, angle: float, size: float) -> np.ndarray:
+    """The pose that a similarity makes of that of the key frame."""
+    return np.array([*(matrix[:, :2] @ key[:2] + matrix[:, 2]), key[2] + angle, key[3] * size])
