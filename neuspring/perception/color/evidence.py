@@ -15,6 +15,9 @@ from neuspring.perception.color.hands import follow_hands, grips
 from neuspring.perception.results import LiftedTracks, PixelTracks
 from neuspring.twin.hand_paths import depths_of, place
 
+HIDDEN_STRIDE = 3
+"""Of the object's pixels beneath hands each third gets a point."""
+
 
 def lift_color(
     capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, settings: ColorSettings, controllers: int
@@ -31,7 +34,7 @@ def lift_color(
     if not own.any():
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
     y, x = np.nonzero(first.filled & (labels[0] != OBJECT))
-    hidden = np.stack([x, y], axis=1)[:: settings.hidden_stride].astype(np.float32)
+    hidden = np.stack([x, y], axis=1)[:: HIDDEN_STRIDE].astype(np.float32)
     pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
     visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
     # Nothing of the object is handed on from future frames.

@@ -22,6 +22,9 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, Capture
 from neuspring.perception.shape_back import round_chord
 
+ROPE_WIDEST = 1.5
+"""Largest thickness of a rope over its median."""
+
 
 @dataclass(frozen=True)
 class FirstFrame:
@@ -58,6 +61,9 @@ class FirstFrame:
         chord = round_chord(filled) * size
         factor = settings.body_thickness if kind == "body" else 1.0
         heights = np.where(filled, settings.sheet_thickness, 0.0) if kind == "flat" else factor * chord
+        if kind == "round":
+            # Where the silhouette is wider than a rope it shows two turns, or a shadow.
+            heights = np.minimum(heights, ROPE_WIDEST * np.median(heights[filled]))
         return cls(camera, up, kind, filled, heights, size)
 
     @property
