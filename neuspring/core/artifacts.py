@@ -242,9 +242,7 @@ class ImageObservations(Artifact):
     """Width of a pixel at the object in frame 0, m."""
     pixels: np.ndarray = array("T,No,2", np.float32, "px", "where tracked points of the object are seen; zeros elsewhere")
     visible: np.ndarray = array("T,No", np.bool_, "1", "whether they are seen; never in future frames")
-    inside: np.ndarray = array(
-        "E,P,2", np.float32, "px", "on the object, in training frames; NaN: fewer", nan=True
-    )
+    inside: np.ndarray = array("E,P,2", np.float32, "px", "on the object, in training frames; NaN: fewer", nan=True)
     beside: np.ndarray = array("E,Q,2", np.float32, "px", "points beside object and hands; NaN: fewer", nan=True)
     outside: np.ndarray = array("E,h,w", np.float32, "px", "distance from object and hands of cells of the image; 0 within")
     cell: int

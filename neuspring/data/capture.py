@@ -258,9 +258,7 @@ class Writer:
         for name in (CAPTURE, TRACKS, POINTS):
             (self.capture.folder / name).unlink(missing_ok=True)
 
-    def frame(
-        self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None
-    ) -> None:
+    def frame(self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
         """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
         _write_png(self.capture.path("color", camera, frame), colour[..., ::-1])
         path = self.capture.path("depth", camera, frame)

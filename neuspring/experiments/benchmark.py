@@ -18,6 +18,7 @@ from neuspring.baselines import BASELINES, REFERENCES
 from neuspring.config import (
     Config,
     Fit,
+    Losses,
     Method,
     ReleasedQuirks,
     ScenarioRow,
@@ -106,6 +107,11 @@ def search_of(config: Config, row: SearchRow, name: str) -> Search:
 def quirks_of(config: Config, row: SearchRow, name: str) -> ReleasedQuirks:
     """The quirks of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
     return parse(ReleasedQuirks, _overlaid(config.released_quirks, row.released_quirks), f"search {name}, released_quirks")
+
+
+def losses_of(config: Config, row: SearchRow, name: str) -> Losses:
+    """The losses of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
+    return parse(Losses, _overlaid(config.losses, row.losses), f"search {name}, losses")
 
 
 def section_of(config: Config, method: Method, name: str) -> Any:
@@ -257,6 +263,7 @@ class Benchmark:
             appearance_of(self.config, method, name)
         if method.search:
             quirks_of(self.config, self.searches[method.searched], method.search)
+            losses_of(self.config, self.searches[method.searched], method.search)
         if not (method.search and method.fit):
             return
         wanted_low, wanted_high = search_of(self.config, self.searches[method.searched], method.search).ranges.stiffness

@@ -320,6 +320,7 @@ class Inputs:
             row = self.benchmark.searches[name]
             values["search"] = plain(benchmarks.search_of(config, row, name))
             values["released_quirks"] = plain(benchmarks.quirks_of(config, row, name))
+            values["losses"] = plain(benchmarks.losses_of(config, row, name))
             if row.clusters == 1:
                 # What concerns regions alone changes nothing here, so it must not start the search again.
                 values["search"] = {key: value for key, value in values["search"].items() if key not in REGIONS_ONLY}
@@ -327,7 +328,9 @@ class Inputs:
             method = self.benchmark.fits[name]
             values["fit"] = plain(benchmarks.fit_of(config, method, name))
             search = method.searched
-            values["released_quirks"] = plain(benchmarks.quirks_of(config, self.benchmark.searches[search], search))
+            row = self.benchmark.searches[search]
+            values["released_quirks"] = plain(benchmarks.quirks_of(config, row, search))
+            values["losses"] = plain(benchmarks.losses_of(config, row, search))
             if method.fit == "springs":
                 del values["fit"]["field"]
         if stage == "appearance":

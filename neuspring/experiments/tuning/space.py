@@ -24,7 +24,7 @@ from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
 from neuspring.core.run_record import flat
-from neuspring.experiments.benchmark import fit_of, quirks_of, read_methods, read_searches, search_of
+from neuspring.experiments.benchmark import fit_of, losses_of, quirks_of, read_methods, read_searches, search_of
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 """What a trial reads; observations are made before."""
@@ -60,6 +60,7 @@ class Plan:
         base["fit"] = config.plain(fit_of(settings, method, tune.method))
         base["search"] = config.plain(search_of(settings, row, method.search))
         base["released_quirks"] = config.plain(quirks_of(settings, row, method.search))
+        base["losses"] = config.plain(losses_of(settings, row, method.search))
         plan = cls(tune, method, row, base)
         for name, dimension in tune.space.items():
             plan._require_setting(name)

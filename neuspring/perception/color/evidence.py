@@ -34,7 +34,7 @@ def lift_color(
     if not own.any():
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
     y, x = np.nonzero(first.filled & (labels[0] != OBJECT))
-    hidden = np.stack([x, y], axis=1)[:: HIDDEN_STRIDE].astype(np.float32)
+    hidden = np.stack([x, y], axis=1)[::HIDDEN_STRIDE].astype(np.float32)
     pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
     visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
     # Nothing of the object is handed on from future frames.
