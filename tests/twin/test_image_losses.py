@@ -1,0 +1,195 @@
+"""Losses in the image: closed forms, gradients through projection and simulator, residuals, searches."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from neuspring import config
+from neuspring.config import Losses
+from neuspring.core.errors import InputError
+from neuspring.twin import hand_paths
+from neuspring.twin.fit import FitProblem, TwinFit
+from neuspring.twin.image_losses import BETA, OPACITY, ImageLoss
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.recordings import Recording
+from neuspring.twin.residuals import Residuals
+from neuspring.twin.search import SearchProblem, _motion, candidate, judge, search
+from neuspring.twin.trials import motions
+from tests.support import colored, small
+
+ALL = Losses(image_track=1.0, silhouette=1.0, alpha=1.0)
+
+
+def loss_of(weights: Losses = ALL) -> ImageLoss:
+    made = ImageLoss.of(colored.observed(), weights, "cpu", torch.float64)
+    assert made is not None
+    return made
+
+
+def truth(frame: int) -> torch.Tensor:
+    return torch.tensor(np.asarray(small.scene().observations.object_points[frame]), dtype=torch.float64)
+
+
+def nodes_of(frame: int) -> torch.Tensor:
+    """Nodes of frame 0, tracked ones where they are in a frame."""
+    nodes = torch.tensor(colored.observed().nodes, dtype=torch.float64)
+    nodes[: len(truth(frame))] = truth(frame)
+    return nodes
+
+
+def problem_of(**changes: object) -> SearchProblem:
+    return small.search_problem(colored.observed(), **changes)
+
+
+def test_tracks_of_the_truth_cost_nothing_and_a_shift_in_the_image_its_square():
+    loss = loss_of(Losses(silhouette=0.0))
+    assert float(loss.terms(2, nodes_of(2))["image_track"]) == pytest.approx(0.0, abs=1e-12)
+    shifted = replace(loss, pixels=loss.pixels + torch.tensor([3.0, 0.0]))
+    error = 3.0 * loss.size
+    assert error < BETA
+    # Half a square in one of two axes.
+    assert float(shifted.terms(2, nodes_of(2))["image_track"]) == pytest.approx(error**2 / 4, rel=1e-4)
+    far = replace(loss, pixels=loss.pixels + torch.tensor([100.0, 0.0]))
+    assert float(far.terms(2, nodes_of(2))["image_track"]) == pytest.approx(BETA * (100 * loss.size - BETA / 2) / 2, rel=1e-4)
+
+
+def test_silhouettes_measure_distances_in_the_image():
+    loss = replace(loss_of(Losses(image_track=0.0)), outside=torch.zeros_like(loss_of().outside))
+    u = loss.project(nodes_of(1))
+    at_nodes = replace(loss, inside=u[None, : loss.surface].expand(len(loss.inside), -1, -1))
+    assert float(at_nodes.terms(1, nodes_of(1))["silhouette"]) == pytest.approx(0.0, abs=1e-12)
+    # One point 50 px beyond the node that is farthest to the left.
+    left = u[u[: loss.surface, 0].argmin()] - torch.tensor([50.0, 0.0])
+    apart = replace(loss, inside=left.expand(len(loss.inside), 1, 2))
+    assert float(apart.terms(1, nodes_of(1))["silhouette"]) == pytest.approx((50 * loss.size) ** 2, rel=1e-6)
+
+
+def test_nodes_that_leave_object_and_hands_cost_their_distance():
+    loss = loss_of(Losses(image_track=0.0))
+    columns = torch.arange(loss.outside.shape[2], dtype=torch.float64)
+    ramp = (columns * loss.cell).expand(loss.outside.shape)
+    moved = replace(loss, outside=ramp)
+    u = torch.tensor([[20.0, 30.0], [41.5, 77.0]], dtype=torch.float64)
+    # The center of column j is at 4 j + 1.5.
+    torch.testing.assert_close(moved.distance(1, u), u[:, 0] - 1.5)
+    beyond = torch.tensor([[-50.0, 30.0]], dtype=torch.float64)
+    assert float(moved.distance(1, beyond)) == 0.0
+
+
+def test_coverage_is_that_of_splats_on_the_nodes():
+    loss = loss_of()
+    u = torch.tensor([[10.0, 10.0], [90.0, 90.0]], dtype=torch.float64)
+    lonely = replace(loss, surface=2)
+    far = torch.tensor([[50.0, 10.0]], dtype=torch.float64)
+    assert float(lonely.coverage(u[:1], u)) == pytest.approx(OPACITY, rel=1e-6)
+    assert float(lonely.coverage(far, u)) < 1e-6
+    width = loss.spacing / (2 * loss.size)
+    beside = u[:1] + torch.tensor([width, 0.0])
+    assert float(lonely.coverage(beside, u)) == pytest.approx(OPACITY * math.exp(-0.5), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["image_track", "silhouette", "alpha"])
+def test_gradients_through_the_projection(name):
+    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0, "alpha": 0.0} | {name: 1.0})
+    loss = loss_of(weights)
+    rng = np.random.default_rng(0)
+    x = (nodes_of(3) + 0.004 * torch.tensor(rng.normal(size=nodes_of(3).shape))).requires_grad_()
+    # Large numbers, so that gradcheck's absolute tolerance says something.
+    assert torch.autograd.gradcheck(lambda nodes: 1e4 * loss.terms(3, nodes)[name], (x,), eps=1e-7, atol=1e-4, rtol=1e-3)
+
+
+def test_residuals_are_roots_of_the_terms():
+    loss = loss_of()
+    near = loss.assigned(2, nodes_of(1))
+    parts = loss.residuals(2, nodes_of(1), near)
+    for name, value in loss.terms(2, nodes_of(1)).items():
+        assert sum(float(r.square().sum()) for r in parts[name]) == pytest.approx(float(value), rel=1e-12)
+
+
+def test_captures_with_depth_have_no_image_losses():
+    assert FrameLoss.of(small.observations(), ALL, "cpu").image is None
+
+
+def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
+    problem = problem_of(losses=replace(ALL, acceleration=0.01))
+    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
+    values = problem.decode(problem.encode())
+    others = values | {"hand_tilt": 20.0, "stiffness": 2e4}
+    twins = [candidate(problem, one) for one in (values, others)]
+    together, alone = judge(problem, twins, loss), [judge(problem, [twin], loss)[0] for twin in twins]
+    assert together == alone
+    assert together[0].cost != together[1].cost
+    hands, start = _motion(problem, twins)
+    x, v = motions(twins, hands, start, "cpu")
+    for k, outcome in enumerate(together):
+        states = [(frame, x[frame - 1, k], v[frame - 1, k]) for frame in range(1, len(x) + 1)]
+        assert loss.of_rollout(states, start) == pytest.approx(outcome.cost, rel=1e-5)
+        residuals = Residuals.of(loss, start)
+        r = residuals(x[:, k], v[:, k], residuals.assigned(x[:, k]))
+        assert r @ r == pytest.approx(outcome.cost, rel=1e-5)
+
+
+def test_gradients_of_stiffness_through_projection_and_simulator():
+    """An epoch's gradient against central differences of its loss."""
+    problem = problem_of()
+    twin = candidate(problem, problem.decode(problem.encode()))
+    twin = replace(twin, simulation=replace(twin.simulation, substeps=100))
+    seen = hand_paths.with_hands(problem.observations, twin)
+    settings = config.Fit(horizon=0, learning_rate=1e-12, epochs=1, global_stiffness=True)
+
+    def loss_at(shift: float) -> tuple[float, float]:
+        run = TwinFit(FitProblem(seen, twin, settings, config.Simulation(substeps=100), ALL, config.ReleasedQuirks()))
+        with torch.no_grad():
+            run.parameters.factors["stiffness"] += shift
+        packed = run.settled()
+        mean = run._simulate((run.rest, run.velocity, None), range(1, run.head_end), packed)[1]
+        mean.backward()
+        return float(mean), float(run.parameters.factors["stiffness"].grad)
+
+    step = 0.02
+    central = (loss_at(step)[0] - loss_at(-step)[0]) / (2 * step)
+    assert loss_at(0.0)[1] == pytest.approx(central, rel=0.05)
+
+
+def test_a_search_moves_the_hands_and_reads_training_frames_alone():
+    polish = {"variables": ["stiffness", "hand_tilt", "hand_size", "hand_depth"]}
+    # The hand rises upright.
+    settings = config.parse(config.Search, {"rollouts": 60, "start": {"hand_tilt": 50.0}, "polish": polish}, "test")
+    problem = problem_of(search=settings)
+    found = search(problem, 0)
+    true = small.observations().controller_points
+    end = problem.observations.scenario.train_end
+
+    def error(values: dict[str, float]) -> float:
+        moved = hand_paths.hand_points(problem.observations, values)
+        return float(np.linalg.norm(moved - true, axis=2)[end - 1].mean())
+
+    assert found.cost < 0.5 * found.trace["cost"].iloc[0]
+    assert error(found.twin.hands) < error(hand_paths.start(problem.observations.image, settings))
+    image = problem.observations.image
+    later = slice(end, None)
+    pixels, visible = image.pixels.copy(), image.visible.copy()
+    pixels[later], visible[later] = 7.0, True
+    spoiled = replace(problem.observations, image=replace(image, pixels=pixels, visible=visible))
+    again = search(replace(problem, observations=spoiled), 0)
+    assert again.cost == found.cost
+    assert again.twin.hands == found.twin.hands
+
+
+def test_regions_and_hands_are_searched_together():
+    settings = config.parse(config.Search, {"rollouts": 40, "tied_rollouts": 20, "polish": {"rounds": 0}}, "test")
+    found = search(problem_of(search=settings, clusters=2), 0)
+    assert {"object_radius.0", "object_radius.1", "hand_tilt", "hand_depth.2"} <= set(found.values)
+    fixed = config.parse(config.Search, {"fixed": ["hand_tilt", "hand_size", "hand_depth"]}, "test")
+    assert not [name for name in problem_of(search=fixed).variables if name.startswith("hand")]
+    assert problem_of(search=fixed).decode(problem_of(search=fixed).encode())["hand_depth.0"] == 1.0
+
+
+def test_a_pool_of_color_alone_is_refused():
+    seen = colored.observed()
+    pool = (Recording.of(seen, config.Simulation(), ALL, config.ReleasedQuirks()),)
+    with pytest.raises(InputError, match="one by one"):
+        problem_of(pool=pool)
