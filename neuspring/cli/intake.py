@@ -18,11 +18,10 @@ def make_capture_options(parser: ArgumentParser) -> None:
     parser.add_argument("--category", required=True, help="kind of object: cloth, rope, package, or any other word")
     source = parser.add_argument_group("what the cameras gave (one of the three)")
     source.add_argument(
-        "--color", type=Path, nargs="+", default=[], metavar="PATH", help="per camera: a folder of images, or a video"
+        "--color", type=Path, nargs="+", default=[], metavar="PATH", help="per camera: a folder of images, or a video; see --depth"
     )
-    source.add_argument(
-        "--depth", type=Path, nargs="+", default=[], metavar="PATH", help="per camera: a folder, or a 16-bit gray video"
-    )
+    depth_help = "per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"
+    source.add_argument("--depth", type=Path, nargs="+", default=[], metavar="PATH", help=depth_help)
     source.add_argument("--bag", type=Path, nargs="+", default=[], metavar="FILE", help="per camera: a RealSense .bag file")
     source.add_argument("--phystwin-raw", type=Path, metavar="FOLDER", help="a case in PhysTwin's raw layout")
     parser.add_argument("--cameras", nargs="+", default=[], metavar="NAME", help="names of the cameras (default: 0 1 2 ...)")
@@ -31,7 +30,7 @@ def make_capture_options(parser: ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second at which it was filmed (default: of the video)")
     parser.add_argument("--frames", default="", metavar="RANGES", help="what is kept, by number: 250-335, 0-300/2, 1,5,9-20")
     parser.add_argument("--train-end", type=int, metavar="FRAME", help="training frames end before it (default: the first 70 %%)")
-    world = parser.add_argument_group("where the cameras are (one camera needs none of these: the table gives its pose)")
+    world = parser.add_argument_group("where the cameras are (one camera with depth needs none of these: the table gives its pose)")
     world.add_argument("--poses", type=Path, metavar="JSON", help="camera_to_world or world_to_camera matrices")
     form = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
     world.add_argument("--board", metavar=form, help="a ChArUco board that every camera sees, like 5x7:0.04:0.03:DICT_5X5_100")

@@ -54,11 +54,11 @@ class SearchRanges(Section):
     """Velocity decay per speed, 1/m; searched where `extra` names it."""
     bending: Range = (0.001, 100.0)
     """Stiffness and dashpot of bending springs over those of the others; searched where `extra` names it."""
-    hand_tilt: Range = (-45.0, 90.0)
+    hand_tilt: Range = (-15.0, 60.0)
     """Color alone: tilt of the plane through its grip in which a hand moves, degrees. 0: upright, facing the camera. 90: level."""
     hand_size: Range = (0.0, 1.0)
     """Color alone: how much of a hand's distance follows from its apparent size, the rest from that plane."""
-    hand_depth: Range = (0.85, 1.18)
+    hand_depth: Range = (0.97, 1.03)
     """Color alone: factors on a hand's distance from the camera at its knots (`hand_knots`)."""
 
     def __post_init__(self) -> None:

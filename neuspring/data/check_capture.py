@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, OBJECT, Capture, Description, description_departures, read_description
+from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_departures, read_description
 from neuspring.data.departure import Departure, Inspection, broken, note
 from neuspring.data.intake.plane import cloud, planes
 from neuspring.data.intake.units import FAR, FASTEST, NEAR, SLOWEST
+from neuspring.data.plausible.alone import alone_departures, horizon_departures, object_on_table, size_findings
 from neuspring.data.plausible.masks import Shown, mask_findings
 from neuspring.data.plausible.table import table_departures
 from neuspring.data.plausible.things import (
@@ -39,7 +40,7 @@ def is_capture(folder: Path) -> bool:
 
 
 def check_capture(folder: Path) -> list[Departure]:
-    """Description, calibration, every image, masks of frame 0, tracks."""
+    """Description, calibration, every image, masks of frame 0, tracks, marked points."""
     case, path = Inspection(folder), folder / CAPTURE
     description = case.load(path, read_description)
     if description is None:
@@ -52,7 +53,9 @@ def check_capture(folder: Path) -> list[Departure]:
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         case.departures += view_departures(path, capture.cameras, first, description.up)
-    case.load(folder / "tracks.json", lambda _: capture.tracks())
+    case.load(folder / TRACKS, lambda _: capture.tracks())
+    for name in capture.cameras:
+        case.load(folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
     if not description.masks:
         message = f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"
         case.departures.append(note(path, message))
@@ -79,7 +82,8 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
         try:
             capture.colour(name, frame)
             depth = capture.depth(name, frame)
-            depths.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)
+            if capture.has_depth:
+                depths.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)
             mask = np.zeros(depth.shape, np.uint8)
             if capture.description.masks:
                 mask = capture.mask(name, frame)
@@ -90,7 +94,9 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
             case.departures.append(Departure.of_error(error))
     wrong = depth_departures(capture, name, depths)
     case.departures += wrong
-    if calibrated and not wrong:
+    if calibrated and not capture.has_depth:
+        case.departures += _alone_departures(capture, name, samples)
+    elif calibrated and not wrong:
         case.departures += _world_departures(capture, name, samples)
     masks = capture.folder / "mask" / name
     case.departures += [Departure.of_finding(masks, one) for one in mask_findings(name, shown)]
@@ -118,6 +124,20 @@ def _world_departures(capture: Capture, name: str, samples: dict[int, Sample]) -
     if 0 in bodies:
         departures += obstacle_departures(path, capture.description, bodies[0])
     return departures
+
+
+def _alone_departures(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Departure]:
+    """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
+    path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
+    departures = alone_departures(path, camera, up)
+    if any(d.level == "error" for d in departures) or 0 not in samples:
+        return departures
+    mask = samples[0].mask
+    departures += horizon_departures(path, camera, mask)
+    departures += [Departure.of_finding(path, one) for one in size_findings(camera, mask)]
+    # Obstacles stand on the table: what lies beneath one is met above it.
+    on_table = object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * (1.0 if up == "+z" else -1.0)])
+    return departures + obstacle_departures(path, capture.description, on_table[np.isfinite(on_table[:, 0])])
 
 
 def obstacle_departures(path: Path, description: Description, points: np.ndarray) -> list[Departure]:

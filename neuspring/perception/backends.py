@@ -34,10 +34,10 @@ class Backend:
     """Whether it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
 
     given: bool = False
-    """Whether a user gives it something in the capture, which its `require(capture)` asks for."""
+    """Whether a capture must have something for it that not every one has, which its `require(capture)` asks for."""
 
     def require(self, folder: Path) -> None:
-        """Raise InputError where a capture lacks what a user must give, before any job runs. Damaged ones fail their own jobs."""
+        """Raise InputError where a capture lacks what it needs, before any job runs. Damaged ones fail their own jobs."""
         from neuspring.data.capture import Capture
 
         if not self.given:
@@ -72,7 +72,7 @@ class Backend:
 BACKENDS = {
     "segment": {
         "given": Backend(module="neuspring.perception.segment_given", given=True),
-        "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv"),
+        "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv", given=True),
         "marks": Backend(module="neuspring.perception.segment_marks", section="marks", given=True),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },

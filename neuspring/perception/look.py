@@ -32,14 +32,15 @@ OFTEN = 0.1
 def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
     """Findings about labels [T, H, W] of one camera, with their `mask_facts`."""
     view, where = capture.cameras[camera], f"camera {camera}"
-    samples = {
-        frame: Sample(capture.depth(camera, frame), labels[frame])
-        for frame in sorted(sampled(capture.frame_count))
-        if capture.has(camera, frame)
-    }
     found = mask_findings(camera, shown_by(capture, camera, labels))
-    found += [one for one in depth_findings(view, samples) if one.level != "note"]
-    found += hand_findings(view, samples)
+    if capture.has_depth:
+        samples = {
+            frame: Sample(capture.depth(camera, frame), labels[frame])
+            for frame in sorted(sampled(capture.frame_count))
+            if capture.has(camera, frame)
+        }
+        found += [one for one in depth_findings(view, samples) if one.level != "note"]
+        found += hand_findings(view, samples)
     if facts["hands_inside"] > HANDS_INSIDE:
         value = f"{facts['hands_inside']:.0%} of the hands' pixels lie inside of the object"
         rule = f"at most {HANDS_INSIDE:.0%} are expected; its own colors are taken for hands"

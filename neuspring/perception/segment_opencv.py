@@ -69,8 +69,17 @@ class Palette:
         return cls(_log_probability(risen) - _log_probability(table), _log_probability(hands) - _log_probability(body))
 
 
+def require(capture: Capture) -> None:
+    """Raise InputError for a capture of color alone."""
+    if not capture.has_depth:
+        remedy = "Choose perception.segment.backend: marks (`neuspring annotate`), given or grounded_sam2."
+        rule = "segmentation by opencv needs depth: heights tell what is on the table"
+        raise InputError(f"{capture.folder}, depth", rule, "none", remedy)
+
+
 def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError where nothing rises above the table."""
+    """Labels [T, H, W]. Raises InputError without depth, or where nothing rises above the table."""
+    require(capture)
     palette = learn(capture, camera, settings)
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)

@@ -3,11 +3,12 @@
 A hand is a rigid patch. In the image its grip is at u(t), turned by a(t), at s(t) times its size of frame 0: all tracked, in all
 frames. Its depth z(t) along the optical axis is not seen. It is
 
-    z(t) / z(0) = p(t)^(1 - g) s(t)^(-g) k(t)
+    z(t) / z(0) = min(p(t)^(1 - g) s(t)^(-g) k(t), l(t))
 
 p    from a plane through the grip of frame 0 in which the hand moves: the ray through u(t) meets it at depth p(t) z(0). The plane
      contains the horizontal direction of the image; at a tilt of 0 degrees it is upright and faces the camera, at 90 level.
 g    `hand_size`: how much of the depth follows from the apparent size.
+l    the same of the level plane: a hand that holds a thing on the table does not go below its grip of frame 0.
 k    factors `hand_depth` at a few knots of the training frames, 1 in frame 0, joined by a cubic (PCHIP) of their logarithms, and
      constant after the last knot.
 
@@ -28,6 +29,8 @@ from scipy.spatial.transform import Rotation
 from neuspring import config
 from neuspring.core.artifacts import ImageObservations, Observations, Twin
 
+LEVEL = 90.0
+"""Tilt of the level plane, degrees."""
 NEAREST, FARTHEST = 0.5, 2.0
 """Depth of a hand over that of frame 0: beyond, the plane is seen edge on and says nothing."""
 
@@ -69,7 +72,8 @@ def depths_of(image: ImageObservations, values: Mapping[str, float], train_end: 
     share = values["hand_size"]
     plane = plane_depths(image, values["hand_tilt"], up)
     curve = knot_curve(factors, train_end, len(image.hand_centers))
-    return np.asarray(plane ** (1 - share) * image.hand_sizes.astype(np.float64) ** -share * curve)
+    free = plane ** (1 - share) * image.hand_sizes.astype(np.float64) ** -share * curve
+    return np.minimum(free, plane_depths(image, LEVEL, up))
 
 
 def plane_depths(image: ImageObservations, tilt: float, up: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.intake.choice import Choice
 from neuspring.data.intake.lenses import Straightener, require_lens
 from neuspring.data.intake.units import Unit, find_unit
-from neuspring.data.intake.views import Lens, View
+from neuspring.data.intake.views import Lens, Pair, View
 
 SAMPLED = 5
 """Frames per camera, evenly spaced, in which the unit of depth and the table are looked for."""
@@ -29,19 +29,19 @@ class Seen:
     colors: list[np.ndarray]
     """[H, W, 3] uint8 RGB, without distortion."""
     depths: list[np.ndarray]
-    """[H, W], m, without distortion."""
+    """[H, W], m, without distortion; none with color alone."""
     unit: float | None
-    """m per count of its images; None where they are floating point."""
+    """m per count of its images; None where they are floating point, or there are none."""
 
 
 def look(
     views: Sequence[View], choice: Choice, listed: Mapping[str, Lens], file: Path | None, given_unit: float | None
-) -> tuple[dict[str, Seen], Unit]:
-    """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all.
+) -> tuple[dict[str, Seen], Unit | None]:
+    """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
 
     `listed` are the intrinsics of `file`; those of the source count where there are none. Raises InputError.
     """
-    samples: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    samples: dict[str, list[Pair]] = {}
     lenses: dict[str, Lens] = {}
     for view in views:
         frames = sorted(choice.places[view.name])
@@ -55,30 +55,36 @@ def look(
         color, depth = samples[view.name][0]
         require_aligned(view.path, view.name, color, depth)
         require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
-    if len({stored_as(depth) for pairs in samples.values() for _, depth in pairs}) > 1:
+    depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
+    if len({stored_as(depth) for depth in depths}) > 1:
         raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
     known = {view.unit for view in views}
     if len(known) > 1 and given_unit is None:
         raise InputError("--depth-unit", "all cameras must have one unit of depth", " and ".join(sorted(map(str, known))))
-    depths = [depth for pairs in samples.values() for _, depth in pairs]
-    unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None)
+    unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None) if depths else None
     return {view.name: straightened(view, samples[view.name], lenses[view.name], unit) for view in views}, unit
 
 
-def straightened(view: View, pairs: Sequence[tuple[np.ndarray, np.ndarray]], lens: Lens, unit: Unit) -> Seen:
-    """Pairs of one camera, without distortion and in meters. Raises InputError where their sizes differ."""
+def straightened(view: View, pairs: Sequence[Pair], lens: Lens, unit: Unit | None) -> Seen:
+    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
+    differ."""
     size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
     for color, depth in pairs:
         require_aligned(view.path, view.name, color, depth, size)
     straight = Straightener(lens, size)
     colors = [straight.color(color) for color, _ in pairs]
-    meters = [meters_of(straight.depth(plain(depth)), unit) for _, depth in pairs]
-    return Seen(view.path, size, lens, colors, meters, unit.meters if stored_as(pairs[0][1]) == "png" else None)
+    if unit is None:
+        return Seen(view.path, size, lens, colors, [], None)
+    depths = [depth for _, depth in pairs if depth is not None]
+    meters = [meters_of(straight.depth(plain(depth)), unit) for depth in depths]
+    return Seen(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
 
 
-def require_aligned(where: Path, name: str, color: np.ndarray, depth: np.ndarray, size: tuple[int, int] | None = None) -> None:
-    """Raise InputError unless depth has the size of color, which is `size`."""
-    if color.shape[:2] != depth.shape:
+def require_aligned(
+    where: Path, name: str, color: np.ndarray, depth: np.ndarray | None, size: tuple[int, int] | None = None
+) -> None:
+    """Raise InputError unless depth, where there is any, has the size of color, which is `size`."""
+    if depth is not None and color.shape[:2] != depth.shape:
         received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
         remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
         raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)

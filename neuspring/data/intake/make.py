@@ -21,11 +21,11 @@ from neuspring.data.intake.charuco import Board
 from neuspring.data.intake.choice import Choice, choose
 from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses
 from neuspring.data.intake.look import Seen, look, meters_of, plain, require_aligned, stored_as, straightened
-from neuspring.data.intake.poses import Placed, by_board, by_table, stand
+from neuspring.data.intake.poses import Placed, by_board, by_table, given_alone, stand
 from neuspring.data.intake.raw import Raw
 from neuspring.data.intake.store import close, prepare, written
 from neuspring.data.intake.units import Unit, find_rate
-from neuspring.data.intake.views import View
+from neuspring.data.intake.views import Paired, View
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -42,7 +42,7 @@ class Intake:
     category: str
     """Kind of object: cloth, rope, package, ..."""
     views: Sequence[View]
-    """One per camera: `views.pairs`, `bag.Bag`, `raw.Raw.views`."""
+    """One per camera: `views.pairs`, `bag.Bag`, `raw.Raw.views`. Color alone, without depth, is of one."""
     rate: float | None = None
     """Frames per second at which it was filmed; None: that of the video."""
     frames: str = ""
@@ -79,6 +79,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     for option, name in (("--name", intake.name), *(("--cameras", view.name) for view in intake.views)):
         if not NAMES.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
+    if all(isinstance(view, Paired) and view.depth is None for view in intake.views):
+        _require_for_color_alone(intake)
     choice = choose(intake.views, intake.frames)
     rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
     names = [view.name for view in intake.views]
@@ -92,7 +94,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             "source": "make-capture",
             "files": _digest([file for listed in files.values() for file in listed]),
             "frames": choice.text(),
-            "depth unit": unit.text(),
+            **({} if unit is None else {"depth unit": unit.text()}),
             "poses": how,
             "table": placed.table,
             **{
@@ -108,7 +110,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     jumps = [f"warning: time jumps at {choice.jumps} places, where frame numbers are left out"] if choice.jumps else []
     remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
-    lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {unit.text()}", f"poses: {how}, up {placed.up}"]
+    depth = "none, color alone" if unit is None else unit.text()
+    lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {how}, up {placed.up}"]
     training = made.train_end or int(0.7 * made.frame_count)
     lines += [
         *placed.lines,
@@ -119,7 +122,26 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     return Capture.load(intake.folder), lines
 
 
-def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed, str]:
+def _require_for_color_alone(intake: Intake) -> None:
+    """Raise InputError for options that need depth, and without those that must stand in for it."""
+    deep = {
+        "--level": intake.level,
+        "--top-down": intake.top_down,
+        "--table-at": intake.table_at,
+        "--depth-unit": intake.depth_unit,
+    }
+    for option, value in deep.items():
+        if value:
+            raise InputError(option, "needs depth: with color alone the table is z = 0 as the poses say", "no --depth")
+    if intake.intrinsics is None:
+        remedy = "Give a JSON file with fx, fy, cx, cy. If depth was forgotten, add --depth."
+        raise InputError("--intrinsics", "color alone needs the intrinsics of the camera", "none", remedy)
+    if intake.poses is None and intake.board is None:
+        remedy = "Give --poses FILE, or --board with a ChArUco board on the table. If depth was forgotten, add --depth."
+        raise InputError("--poses", "color alone needs the pose of the camera, in a world with the table at z = 0", "none", remedy)
+
+
+def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit | None) -> tuple[Placed, str]:
     """Poses of all cameras, and where they come from. Raises InputError."""
     names, level, top_down = list(seen), intake.level, intake.top_down
     given = {view.name: view.pose for view in intake.views if view.pose is not None}
@@ -129,6 +151,8 @@ def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed
         raise InputError("--table-at", "is for one camera without poses: others have their world", f"{len(names)} cameras")
     if intake.board_images and intake.board is None:
         raise InputError("--board", "the board of --board-images must be described", "none")
+    if intake.poses is not None and unit is None:
+        return given_alone(read_poses(intake.poses, names), seen, intake.poses), f"of {intake.poses.name}"
     if intake.poses is not None:
         return stand(read_poses(intake.poses, names), seen, level=level, top_down=top_down), f"of {intake.poses.name}"
     if intake.board is not None:
@@ -138,7 +162,10 @@ def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed
                 pairs = list(view.read(range(min(FIRST, len(view.numbers)))))
                 shown[view.name] = straightened(view, pairs, seen[view.name].lens, unit)
         poses, lines = by_board(intake.board, shown, intake.board_images)
-        placed = stand(poses, seen, level=level, top_down=top_down, up="+z")
+        if unit is None:
+            placed = given_alone(poses, seen, intake.views[0].path)
+        else:
+            placed = stand(poses, seen, level=level, top_down=top_down, up="+z")
         return replace(placed, lines=(*lines, *placed.lines)), f"by a ChArUco board of {intake.board}"
     if len(given) == len(names):
         return stand(given, seen, level=level, top_down=top_down, up="-z" if intake.raw else None), "of the source"
@@ -148,7 +175,9 @@ def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit) -> tuple[Placed
     return by_table(names[0], seen[names[0]], top_down=top_down, at=intake.table_at), "by the table's plane"
 
 
-def _describe(intake: Intake, choice: Choice, rate: float, unit: Unit, seen: Mapping[str, Seen], placed: Placed) -> dict[str, Any]:
+def _describe(
+    intake: Intake, choice: Choice, rate: float, unit: Unit | None, seen: Mapping[str, Seen], placed: Placed
+) -> dict[str, Any]:
     """The entries of capture.json."""
     entries = []
     for name, view in seen.items():
@@ -163,15 +192,16 @@ def _describe(intake: Intake, choice: Choice, rate: float, unit: Unit, seen: Map
         "frame_count": len(choice.numbers),
         "frame_rate": rate,
         "cameras": tuple(entries),
-        "depth_unit": unit.meters if is_counted else 0.001,
-        "depth_format": "png" if is_counted else "npy",
+        "depth": "none" if unit is None else "measured",
+        "depth_unit": unit.meters if unit is not None and is_counted else 0.001,
+        "depth_format": "png" if unit is None or is_counted else "npy",
         "up": placed.up,
         "train_end": intake.train_end if intake.train_end is not None else intake.raw.train_end if intake.raw and whole else None,
         "masks": bool(intake.raw and intake.raw.ids),
     }
 
 
-def _write(intake: Intake, made: Description, choice: Choice, unit: Unit, seen: Mapping[str, Seen], placed: Placed) -> None:
+def _write(intake: Intake, made: Description, choice: Choice, unit: Unit | None, seen: Mapping[str, Seen], placed: Placed) -> None:
     recipe = TypeAdapter(Description).dump_python(made, mode="json")
     recipe["distortion"] = {name: view.lens.distortion.tolist() for name, view in seen.items()}
     begun = prepare(intake.folder, recipe, intake.force)
@@ -186,12 +216,15 @@ def _write(intake: Intake, made: Description, choice: Choice, unit: Unit, seen: 
         done += len(kept)
         for frame, (color, depth) in zip(left, view.read([choice.places[view.name][f] for f in left]), strict=True):
             require_aligned(view.path, view.name, color, depth, size)
-            kind = stored_as(depth)
-            if kind != made.depth_format:
-                raise InputError(view.path, f"depth of camera {view.name} must be of one kind", f"another in frame {frame}")
-            stored = straight.depth(plain(depth))
+            stored = None
+            if depth is not None and unit is not None:
+                kind = stored_as(depth)
+                if kind != made.depth_format:
+                    raise InputError(view.path, f"depth of camera {view.name} must be of one kind", f"another in frame {frame}")
+                stored = straight.depth(plain(depth))
+                stored = stored if kind == "png" else meters_of(stored, unit)
             mask = intake.raw.labels(view.name, choice.numbers[frame]) if intake.raw and intake.raw.ids else None
-            writer.frame(view.name, frame, straight.color(color), stored if kind == "png" else meters_of(stored, unit), mask)
+            writer.frame(view.name, frame, straight.color(color), stored, mask)
             done += 1
             progress.update(done)
     tracks = None

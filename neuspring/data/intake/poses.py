@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.data.capture import Camera
 from neuspring.data.departure import refuse
 from neuspring.data.intake.charuco import Board, Sighting, depth_ratio, sight
 from neuspring.data.intake.images import open_images
@@ -16,6 +17,7 @@ from neuspring.data.intake.lenses import Straightener
 from neuspring.data.intake.look import Seen
 from neuspring.data.intake.plane import Plane, cloud, planes
 from neuspring.data.intake.world import center_of, common_plane, find_table, levelling, pose_on
+from neuspring.data.plausible.alone import alone_departures
 from neuspring.data.plausible.table import table_departures
 
 RATIO = 0.04
@@ -61,7 +63,7 @@ def by_board(board: Board, seen: Mapping[str, Seen], images: Sequence[Path]) -> 
         sighting = sight(path, board, pictures, view.lens.matrix)
         poses[name] = sighting.camera_to_world
         line = f"board, camera {name}: {sighting.corners} corners, {sighting.error:.2f} pixels rms"
-        lines.append(line if images else line + _compare(path, sighting, view))
+        lines.append(line if images or not view.depths else line + _compare(path, sighting, view))
     return poses, lines
 
 
@@ -105,6 +107,19 @@ def stand(
     lines += [f"{'warning: ' if d.level == 'warning' else ''}{d.message}" for d in judged[side]]
     text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
+
+
+def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], where: Path) -> Placed:
+    """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
+
+    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible.table`.
+    """
+    (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
+    up = "+z" if pose[2, 3] > 0 else "-z"
+    judged = alone_departures(where, Camera(name, *view.size, view.lens.matrix, pose), up)
+    refuse([d for d in judged if d.level == "error"])
+    lines = tuple(f"{'warning: ' if d.level == 'warning' else ''}{d.message}" for d in judged)
+    return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=lines)
 
 
 def _point(seen: Seen, at: tuple[float, float]) -> np.ndarray:

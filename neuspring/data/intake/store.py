@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.data.capture import CAPTURE, TRACKS, Writer
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Writer
 from neuspring.data.json_file import load_json
 
 RECIPE = ".make-capture.json"
 """What an unfinished folder is made of. It is removed at the end."""
-PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS)
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS)
 """Work of people and of hours, which --force does not remove."""
 
 
@@ -48,9 +48,10 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
 
 
 def written(writer: Writer, camera: str, frames: list[int]) -> set[int]:
-    """The frames of an interrupted folder that are complete: all with both images, but the last, which may be half written."""
+    """The frames of an interrupted folder that are complete: all with their images, but the last, which may be half written."""
     capture = writer.capture
-    there = [f for f in frames if capture.path("color", camera, f).is_file() and capture.path("depth", camera, f).is_file()]
+    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth") if capture.has_depth else ("color",)
+    there = [f for f in frames if all(capture.path(kind, camera, f).is_file() for kind in kinds)]
     return set(there[:-1])
 
 

@@ -22,7 +22,7 @@ KNOWN = {
 }
 """m per count, and where it is used: most cameras, RealSense L515 and D405, L515's default, TUM's data sets, floating point."""
 SLOWEST, FASTEST = 1.0, 240.0
-"""Frames per second of a depth camera."""
+"""Frames per second of a camera."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
         raise InputError("--rate", "all cameras must film at one rate", " and ".join(f"{rate:.3g}" for rate in told))
     rate = given if given is not None else round(told[0], 2)
     if not (np.isfinite(rate) and SLOWEST <= rate <= FASTEST):
-        rule = f"frames per second of a depth camera lie between {SLOWEST:g} and {FASTEST:g}"
+        rule = f"frames per second of a camera lie between {SLOWEST:g} and {FASTEST:g}"
         raise InputError("--rate", rule, f"{rate:g}", "Give the rate at which it was filmed, not a time step.")
     how = "given" if given is not None else "as the video says"
     if given is not None and told and abs(told[0] - given) > 0.02 * given:

@@ -1,4 +1,4 @@
-"""What one camera gave: color and depth in pairs, and what its files say about the camera."""
+"""What one camera gave: color and depth in pairs, or color alone, and what its files say about the camera."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.intake.images import Film, Images, open_images
 
+Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
+"""RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
 COMMON = 0.5
 """Color and depth are paired by their numbers if this part of them is common, else by their order."""
 
@@ -64,8 +66,8 @@ class View(Protocol):
     def remarks(self) -> list[str]:
         """What the user should know about the files."""
 
-    def read(self, places: Sequence[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """RGB [H, W, 3] uint8 and depth [H, W] as stored, of the pairs at ascending places."""
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
+        """The pairs at ascending places: with depth all of them, or none."""
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The files that hold them."""
@@ -73,11 +75,11 @@ class View(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Paired:
-    """Color and depth of two folders or videos."""
+    """Color and depth of two folders or videos, or color alone."""
 
     name: str
     color: Images
-    depth: Images
+    depth: Images | None
     unit: float | None = None
     lens: Lens | None = None
     pose: np.ndarray | None = None
@@ -90,6 +92,8 @@ class Paired:
     @cached_property
     def _pairs(self) -> list[tuple[int, int, int]]:
         """(number, place of color, place of depth). Raises InputError where they cannot be paired."""
+        if self.depth is None:
+            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
         left, right = ({number: place for place, number in enumerate(images.numbers)} for images in (self.color, self.depth))
         common = sorted(left.keys() & right.keys())
         if len(common) >= COMMON * max(len(left), len(right)) and len(common):
@@ -113,36 +117,46 @@ class Paired:
     @cached_property
     def remarks(self) -> list[str]:
         """Images without a partner, dropped pictures of a video."""
-        found = []
-        alone = max(len(self.color.numbers), len(self.depth.numbers)) - len(self._pairs)
+        found, sources = [], [images for images in (self.color, self.depth) if images is not None]
+        alone = max(len(images.numbers) for images in sources) - len(self._pairs)
         if alone:
             found.append(f"camera {self.name}: {alone} images without their partner are left out")
-        for images in (self.color, self.depth):
+        for images in sources:
             if isinstance(images, Film) and (dropped := images.dropped()):
                 found.append(f"{images.path}: about {dropped} pictures were dropped when it was filmed; time jumps there")
         return found
 
-    def read(self, places: Sequence[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
         """See `View`."""
         pairs = [self._pairs[place] for place in places]
-        return zip(self.color.read([left for _, left, _ in pairs]), self.depth.read([right for *_, right in pairs]), strict=True)
+        colors = self.color.read([left for _, left, _ in pairs])
+        if self.depth is None:
+            return zip(colors, [None] * len(pairs), strict=True)
+        return zip(colors, self.depth.read([right for *_, right in pairs]), strict=True)
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """See `View`."""
         pairs = [self._pairs[place] for place in places]
-        return self.color.files([left for _, left, _ in pairs]) + self.depth.files([right for *_, right in pairs])
+        deep = [] if self.depth is None else self.depth.files([right for *_, right in pairs])
+        return self.color.files([left for _, left, _ in pairs]) + deep
 
 
 def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[View]:
-    """The views of folders or videos, one of color and one of depth per camera. Raises InputError."""
-    if not colors or len(colors) != len(depths):
+    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
+
+    Raises InputError.
+    """
+    if len(colors) > 1 and not depths:
+        rule = "without depth one camera is required: color alone is of one view"
+        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
+    if not colors or (depths and len(colors) != len(depths)):
         rule = "as many folders or videos of depth as of color are required, one each per camera"
         raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
     names = names or tuple(map(str, range(len(colors))))
     if len(names) != len(colors) or len(set(names)) < len(names):
         raise InputError("--cameras", f"{len(colors)} different names are required", " ".join(names))
+    deep: list[Images | None] = [open_images(depth, "depth") for depth in depths]
     views: list[View] = [
-        Paired(name, open_images(color, "color"), open_images(depth, "depth"))
-        for name, color, depth in zip(names, colors, depths, strict=True)
+        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
     ]
     return views

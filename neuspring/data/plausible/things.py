@@ -33,6 +33,7 @@ POINTS = 1500
 FEW = 20
 """Points below which nothing is said of a thing in a frame."""
 TABLE = "Look at the mask of frame 0 and at depth_unit; make-capture --level puts the table at z = 0."
+SCALE = "Look at the mask of frame 0, and at the units of depth and poses: meters, with the table at z = 0."
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +109,7 @@ def place_findings(where: str, bodies: Sequence[np.ndarray], up: float) -> list[
     text = " x ".join(f"{100 * side:.0f}" for side in sides)
     value = f"{text} cm, from {100 * low:.1f} to {100 * high:.1f} cm above the table"
     found = [finding("size of the object", "note", where, value, "as its pixels with depth show it", "Is that what was filmed?")]
-    if not SMALL < sides.max() < LARGE:
-        rule = f"{100 * SMALL:g} to {100 * LARGE:g} cm are expected"
-        found.append(finding("implausible size", "warning", where, f"{100 * sides.max():.3g} cm long", rule, TABLE))
+    found += implausible(where, float(sides.max()))
     if low < -SUNK:
         value, rule = f"it reaches {-100 * low:.1f} cm below the table", f"at most {100 * SUNK:g} cm are noise"
         found.append(finding("object below the table", "warning", where, value, rule, TABLE))
@@ -118,6 +117,14 @@ def place_findings(where: str, bodies: Sequence[np.ndarray], up: float) -> list[
         rule = f"at most {HIGH:g} m is expected; walls and people in the mask are no object"
         found.append(finding("object high above the table", "warning", where, f"it is up to {high:.2f} m above it", rule, TABLE))
     return found
+
+
+def implausible(where: str, longest: float) -> list[Finding]:
+    """A warning where the longest side, m, is that of nothing that hands hold on a table."""
+    if SMALL < longest < LARGE:
+        return []
+    rule = f"{100 * SMALL:g} to {100 * LARGE:g} cm are expected"
+    return [finding("implausible size", "warning", where, f"{100 * longest:.3g} cm long", rule, SCALE)]
 
 
 def reach_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Finding]:

@@ -72,7 +72,8 @@ def notes_of(point: Point, trails: Mapping[str, Trail], lifted: Lifted, capture:
     )
     flat = np.any([np.isfinite(trail.places).all(axis=1) for trail in trails.values()] or [np.zeros(len(gap), bool)], axis=0)
     deep = np.isfinite(lifted.track).all(axis=1)
-    add(None, (flat & ~deep).astype(float), lambda _: "no depth here: null in tracks.json")
+    none = "no depth here: null in tracks.json" if capture.has_depth else "color alone: followed in the image, not lifted to 3D"
+    add(None, (flat & ~deep).astype(float), lambda _: none)
     return sorted(notes, key=lambda note: (note.first, note.camera or ""))
 
 

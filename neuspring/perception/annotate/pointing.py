@@ -18,7 +18,7 @@ from neuspring.perception.annotate.document import Document
 from neuspring.perception.annotate.follow import GrayImages, Run, Trail, follow, follow_from
 from neuspring.perception.annotate.job import Busy
 from neuspring.perception.annotate.notes import Note, notes_of
-from neuspring.perception.annotate.world import Lifted, depth_reader, join, lift_places
+from neuspring.perception.annotate.world import Lifted, depth_reader, join, lift_places, require_depth
 
 KEPT_RUNS, KEPT_LIFTS = 20_000, 500_000
 """Results of following from one click to the next, and lifted places, that are kept."""
@@ -85,7 +85,8 @@ class Pointing:
             return self._changed.wait_for(lambda: self._done == self._wanted or self._closed, seconds)
 
     def save(self, *, replace: bool) -> int:
-        """Write tracks.json; returns the number of points. Raises InputError without points, Busy, and Foreign."""
+        """Write tracks.json; returns the number of points. Raises InputError without points or depth, Busy, and Foreign."""
+        require_depth(self.capture)
         with self._changed:
             busy, points, failure = self._done < self._wanted, self._points, self._failure
         if busy or failure:

@@ -9,11 +9,13 @@ from neuspring.data.capture import Capture
 from neuspring.perception.annotate.annotations import ANNOTATIONS, Annotations
 from neuspring.perception.annotate.follow import GrayImages, follow
 from neuspring.perception.annotate.notes import Note, notes_of
-from neuspring.perception.annotate.world import lift_track
+from neuspring.perception.annotate.world import lift_track, require_depth
 
 
 def tracks_of(capture: Capture, annotations: Annotations) -> tuple[np.ndarray, list[Note]]:
-    """Tracks [T, K, 3], m, NaN where unknown, of all annotated points, and what is doubtful. Raises InputError without points."""
+    """Tracks [T, K, 3], m, NaN where unknown, of all annotated points, and what is doubtful. Raises InputError without points or
+    depth."""
+    require_depth(capture)
     if not annotations.points:
         raise InputError(capture.folder / ANNOTATIONS, "a point or more must be clicked", 0)
     images, tracks, notes = GrayImages(capture), [], []

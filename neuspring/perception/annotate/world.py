@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from neuspring.core.errors import InputError
 from neuspring.data.capture import Camera, Capture
 from neuspring.perception.lift import local_depth
 
@@ -62,11 +63,18 @@ def join(points: Sequence[np.ndarray], capture: Capture) -> Lifted:
     return Lifted(track, apart)
 
 
+def require_depth(capture: Capture) -> None:
+    """Raise InputError for a capture of color alone, whose clicks have no place in the world."""
+    if not capture.has_depth:
+        rule = "tracks in the world need depth: color alone cannot lift clicks to 3D"
+        raise InputError(f"{capture.folder}, depth", rule, "none", "Clicks stay in annotations.json. Masks need no depth.")
+
+
 def depth_reader(capture: Capture, camera: str) -> Callable[[int], np.ndarray | None]:
     """Depth images of a camera by frame; None where it has none."""
 
     def read(frame: int) -> np.ndarray | None:
-        if not capture.has(camera, frame) or not capture.path("depth", camera, frame).exists():
+        if not capture.has_depth or not capture.has(camera, frame) or not capture.path("depth", camera, frame).exists():
             return None
         return capture.depth(camera, frame)
 

@@ -54,7 +54,7 @@ class Film:
 
     def depth(self, frame: int, /) -> np.ndarray | None:
         """Depth [H, W] float32, m, 0 where nothing was measured; None: the camera has no depth."""
-        if not self.capture.path("depth", self.camera, self.frames[frame]).exists():
+        if not self.capture.has_depth or not self.capture.path("depth", self.camera, self.frames[frame]).exists():
             return None
         return self.capture.depth(self.camera, self.frames[frame]).astype(np.float32)
 
