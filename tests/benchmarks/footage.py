@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.footage FOLDER [--cases ...] [--masks FOLDER] [--trackers ...]
 
-FOLDER has videos/combine_tracking__CASE.mp4 (the left half is the film), masks/CASE/FRAME.png (0 nothing, 1 object, 2 hands) and
-tracks/CASE.json (points marked by hand, null where hidden). Marks of frame 0 alone (tests/data/marks) are carried through the film.
-Then points are followed from where they were marked in frame 0, and compared in the other frames. With --masks, carried masks are
-kept in a folder, and read from there by the next call.
+FOLDER has videos/combine_tracking__CASE.mp4 or combine_rendering__CASE.mp4 (the left half is the film), masks/CASE/FRAME.png
+(0 nothing, 1 object, 2 hands) and tracks/CASE.json (points marked by hand, null where hidden). Marks of frame 0 alone
+(tests/data/marks) are carried through the film. Then points are followed from where they were marked in frame 0, and compared in
+the other frames. With --masks, carried masks are kept in a folder, and read from there by the next call.
 """
 
 from __future__ import annotations
@@ -72,9 +72,17 @@ class Points:
         return cls(list(values["points"]), values["frames"], xy, ~(uncertain | uncertain[:, :1]) & np.isfinite(xy[..., 0]))
 
 
+VIDEOS = ("combine_tracking", "combine_rendering")
+"""Videos of one case whose left half is the film, the preferred one first."""
+
+
 def film(folder: Path, case: str, most: int | None = None) -> list[np.ndarray]:
-    """RGB images of the left half of a video."""
-    video, colors = cv2.VideoCapture(str(folder / "videos" / f"combine_tracking__{case}.mp4")), []
+    """RGB images of the left half of a video; the first `most`, all by default. Raises FileNotFoundError without a video."""
+    files = [folder / "videos" / f"{kind}__{case}.mp4" for kind in VIDEOS]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        raise FileNotFoundError(files[0])
+    video, colors = cv2.VideoCapture(str(file)), []
     while most is None or len(colors) < most:
         ok, frame = video.read()
         if not ok:
@@ -149,11 +157,12 @@ class Errors:
 def main() -> None:
     parser = ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--cases", nargs="+", help="all that have marks by default")
+    parser.add_argument("--cases", nargs="+", help="all that have marks and drawn masks by default")
     parser.add_argument("--masks", type=Path, help="folder in which carried masks are kept")
     parser.add_argument("--trackers", nargs="*", choices=list(TRACKERS), default=list(TRACKERS))
     a = parser.parse_args()
-    for case in a.cases or sorted(path.stem for path in (MARKS / "phystwin_camera0").glob("*.json")):
+    drawn = (path.stem for path in (MARKS / "phystwin_camera0").glob("*.json") if (a.folder / "masks" / path.stem).is_dir())
+    for case in a.cases or sorted(drawn):
         colors, kept = film(a.folder, case), a.masks / f"{case}.npz" if a.masks else None
         began = time.perf_counter(), time.process_time()
         if kept and kept.exists():

@@ -259,7 +259,11 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
     ("words", "message"),
     [
         ([], "one of --color with --depth, --bag, --phystwin-raw is required; received none"),
-        (["--color", "{root}/color_0"], "as many folders or videos of depth as of color are required"),
+        (["--color", "{root}/color_0"], "color alone needs the intrinsics of the camera; received none"),
+        (
+            ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"],
+            "as many folders or videos of depth as of color are required",
+        ),
         (["--color", "{root}/color_0", "--depth", "{root}/nothing"], "a folder of depth images (.png .npy .tif .tiff) or a video"),
         (
             ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"],

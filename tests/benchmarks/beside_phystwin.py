@@ -1,0 +1,192 @@
+"""Twins of color footage beside PhysTwin's published prediction, on the same frames of the same camera: tables and film strips.
+
+    python -m tests.benchmarks.beside_phystwin FOLDER RESULTS --captures CAPTURES --output OUT
+        [--cases ...] [--methods ...] [--strips FOLDER] [--strip-methods ...] [--force]
+
+FOLDER is that of `tests.benchmarks.footage`, with result/CASE.npz and videos/combine_rendering__CASE.mp4. RESULTS is a folder of
+results of the workflow. CAPTURES has a capture per case (`tests.benchmarks.footage_captures`). Cases are those that RESULTS has
+runs of; without any run, all captures. OUT/summary.md has the tables, OUT/scores.csv every number. Scores of runs that have not
+changed are taken from an earlier OUT/scores.csv; --force computes all anew.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from neuspring.core.files import write_text
+from neuspring.core.records import digest_file
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT
+from neuspring.scores.image_points import point_errors
+from neuspring.scores.pictures import Pair, picture_scores
+from neuspring.splats.draw import COVERED
+from tests.benchmarks.beside_cost import cost_lines
+from tests.benchmarks.beside_data import LEFT_OUT, PHYSTWIN, STILL, Case, Run, cases_of, iou_without_hands, runs_of
+from tests.benchmarks.beside_strips import write_strip
+from tests.benchmarks.beside_tables import COLUMNS, PARTS, tables
+
+IMAGE_METRICS = ("iou", "psnr", "ssim")
+NO_LPIPS = "not compared here"
+Row = dict[str, Any]
+
+
+def drawn_rows(case: Case, silhouettes: Iterable[tuple[int, np.ndarray]]) -> Iterator[Row]:
+    """IoU with the drawn masks, of silhouettes [H, W] by frame. Frames are told by their place among the drawn ones."""
+    parts = dict(zip(case.drawn, PARTS, strict=False))
+    for frame, silhouette in silhouettes:
+        value = iou_without_hands(silhouette, case.drawn[frame])
+        yield {"part": parts[frame], "frame": frame, "metric": "iou_drawn", "value": value}
+
+
+def task_rows(case: Case, values: pd.DataFrame) -> Iterator[Row]:
+    """Means over the frames of both tasks of values by frame and metric. Pictures black on both sides have no finite PSNR."""
+    values = values[np.isfinite(values["value"])]
+    for task, span in case.tasks.items():
+        part = values[values["frame"].isin(span)]
+        for metric in IMAGE_METRICS:
+            own = part.loc[part["metric"] == metric, "value"]
+            if len(own):
+                yield {"part": task, "metric": metric, "value": float(own.mean())}
+
+
+def picture_rows(case: Case, pictures: Iterable[tuple[int, np.ndarray]]) -> Iterator[Row]:
+    """Means as the render stage scores them, of RGBA pictures [H, W, 4] over black by frame."""
+    values = []
+    for frame, rgba in pictures:
+        labels = case.labels(frame)
+        mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        scores = picture_scores(Pair.of(case.color(frame), rgba, mask, hands, COVERED), NO_LPIPS, unit_lpips=False)
+        values += [{"frame": frame, "metric": name, "value": value} for name, value in scores.items()]
+    yield from task_rows(case, pd.DataFrame(values, columns=["frame", "metric", "value"]))
+
+
+def point_rows(case: Case, positions: np.ndarray | None, run: Run | None) -> Iterator[Row]:
+    """Errors of the sure marked points, px: in the last marked frame, and in all marked frames after 0.
+
+    Without positions [T, N, 3] points stay where they are in frame 0.
+    """
+    points = case.points
+    if points is None:
+        return
+    marked = np.where(points.sure[..., None], points.xy, np.nan).transpose(1, 0, 2)
+    if positions is None or run is None:
+        errors = np.linalg.norm(marked - marked[0], axis=2)
+    else:
+        camera = case.capture.cameras[case.camera]
+        chosen = positions[np.minimum(points.frames, len(positions) - 1)]
+        errors = point_errors(camera.intrinsics, camera.camera_to_world, chosen, marked, run.observations.surface_count)
+    for part, own in (("last", errors[-1]), ("later", errors[1:])):
+        found = own[np.isfinite(own)]
+        if len(found):
+            facts = {"median": float(np.median(found)), "mean": float(found.mean()), "count": len(found)}
+            yield from ({"part": part, "metric": f"points_{name}", "value": value} for name, value in facts.items())
+
+
+def published_rows(case: Case) -> list[Row]:
+    """PhysTwin's; empty where its prediction cannot be read back."""
+    published = case.published
+    if published is None:
+        return []
+    frames = range(1, min(case.capture.frame_count, published.frame_count))
+    shift = [{"part": "0", "metric": f"shift_{axis}", "value": value} for axis, value in zip("xy", published.shift, strict=True)]
+    drawn = drawn_rows(case, ((frame, published.silhouette(frame)) for frame in case.drawn if frame < published.frame_count))
+    return [*shift, *drawn, *picture_rows(case, ((frame, published.picture(frame)) for frame in frames))]
+
+
+def still_rows(case: Case) -> list[Row]:
+    """Of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
+    covered = case.labels(0) == OBJECT
+    rgba = np.dstack([np.where(covered[..., None], case.color(0), 0), np.where(covered, 255, 0)]).astype(np.uint8)
+    drawn = drawn_rows(case, ((frame, covered) for frame in case.drawn))
+    pictures = picture_rows(case, ((frame, rgba) for frame in range(1, case.capture.frame_count)))
+    return [*drawn, *pictures, *point_rows(case, None, None)]
+
+
+def run_rows(case: Case, run: Run) -> list[Row]:
+    """Of a run; empty where it has no trajectory."""
+    positions = run.positions()
+    if positions is None:
+        return []
+    rows = list(drawn_rows(case, ((frame, covered) for frame, _, covered in run.pictures(case.capture, set(case.drawn)))))
+    if frames := run.stage("render", "frames"):
+        table = pd.read_parquet(frames)
+        rows += task_rows(case, table[table["camera"].astype(str) == case.camera])
+    return [*rows, *point_rows(case, positions, run)]
+
+
+class Scores:
+    """Tidy scores, and those of an earlier call by the key of what they are of."""
+
+    def __init__(self, path: Path, *, force: bool) -> None:
+        self.path, self.rows = path, []
+        self._kept: dict[str, list[Row]] = {}
+        if path.is_file() and not force:
+            table = pd.read_csv(path, dtype={"part": str, "key": str})
+            self._kept = {str(key): part.to_dict("records") for key, part in table.groupby("key")}
+
+    def add(self, case: str, method: str, seed: int, key: str, compute: Any) -> int:
+        """Rows of one prediction, computed where they are not known; returns how many."""
+        key = f"{case}/{method}/{seed}/{key}"
+        rows = self._kept.get(key)
+        if rows is None:
+            rows = [{"case": case, "method": method, "seed": seed, "key": key} | row for row in compute()]
+        self.rows += rows
+        return len(rows)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        return pd.DataFrame(self.rows, columns=list(COLUMNS))
+
+    def save(self) -> None:
+        """So that an interrupted call loses little."""
+        write_text(self.path, self.table.to_csv(index=False))
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--captures", type=Path, required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--cases", nargs="+")
+    parser.add_argument("--methods", nargs="*", help="all that have runs by default; none: PhysTwin alone")
+    parser.add_argument("--strips", type=Path, help="folder of film strips")
+    parser.add_argument("--strip-methods", nargs="*", default=["neuspring"])
+    parser.add_argument("--force", action="store_true")
+    a = parser.parse_args()
+    cases = cases_of(a.folder, a.captures, a.cases)
+    runs = {case.name: runs_of(a.results, case.name, a.methods) for case in cases}
+    if any(runs.values()) and a.cases is None:
+        cases = [case for case in cases if runs[case.name]]
+    scores, notes = Scores(a.output / "scores.csv", force=a.force), []
+    for case in cases:
+        stamp = digest_file(case.capture.folder / CAPTURE)[:16]
+        if not scores.add(case.name, PHYSTWIN, 0, stamp, lambda case=case: published_rows(case)):
+            notes.append(f"{case.name}: PhysTwin's prediction is not there to be read back.")
+        scores.add(case.name, STILL, 0, stamp, lambda case=case: still_rows(case))
+        for run in runs[case.name]:
+            count = scores.add(
+                case.name, run.method, run.seed, f"{stamp}-{run.key}", lambda case=case, run=run: run_rows(case, run)
+            )
+            if run.record.status == "failed":
+                what = "its last frame stands for the rest" if count else "it has no scores"
+                notes.append(f"{case.name}, {run.method}, seed {run.seed} failed ({run.record.reason}): {what}.")
+        scores.save()
+        print(f"{case.name}: {len(runs[case.name])} runs", flush=True)
+        if a.strips:
+            chosen = {run.method: run for run in reversed(runs[case.name]) if run.method in a.strip_methods}
+            print(write_strip(case, [chosen[name] for name in a.strip_methods if name in chosen], a.strips), flush=True)
+        # Frames of a video are large.
+        case.__dict__.pop("published", None)
+    used = [run for case in cases if case.name not in LEFT_OUT for run in runs[case.name]]
+    lines = [*tables(scores.table, notes), *cost_lines(a.results, used)]
+    write_text(a.output / "summary.md", "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

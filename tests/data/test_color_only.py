@@ -1,0 +1,247 @@
+"""Captures of color alone: made, checked, and refused by what needs depth."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.config.perception import OpenCvSegmentation
+from neuspring.core.errors import InputError
+from neuspring.data.capture import CAPTURE, OBJECT, POINTS, Capture
+from neuspring.data.check import check_layout
+from neuspring.data.intake import make
+from neuspring.data.intake.charuco import Board
+from neuspring.data.intake.make import Intake, make_capture
+from neuspring.data.intake.views import pairs
+from neuspring.data.plausible.alone import on_table
+from neuspring.perception import segment_opencv
+from neuspring.perception.annotate.annotations import Annotations, Click, Point
+from neuspring.perception.annotate.pointing import Pointing
+from neuspring.perception.annotate.tracks import tracks_of
+from neuspring.perception.backends import BACKENDS
+from neuspring.perception.look import look_at_masks
+from neuspring.perception.marks.store import film_of, save_masks
+from neuspring.perception.mask_facts import mask_facts
+from tests.support.board import BOARD, LENS, board_image
+from tests.support.departures import holds, of_level, serious
+from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses, write_video
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From a world with z up to one with z down."""
+
+
+def intake(root, **changes):
+    """Color alone of the folders of `write_folders`, with the true pose."""
+    plain = {"folder": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "views": pairs([root / "color_0"], [])}
+    poses = write_poses(root / "poses.json", 1) if "poses" not in changes else None
+    return Intake(**(plain | {"intrinsics": root / "intrinsics.json", "poses": poses} | changes))
+
+
+def disk(center=(0.05, 0.05), radius=0.14):
+    """A mask of one camera of the desk: a flat disk on the table, m, and beside it a hand."""
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    points = on_table(camera(), np.stack([x, y], axis=-1).reshape(-1, 2))[:, :2].reshape(SIZE[1], SIZE[0], 2)
+    near = np.linalg.norm(points - center, axis=-1) < radius
+    hand = np.linalg.norm(points - np.array(center) - (1.2 * radius, 0), axis=-1) < 0.6 * radius
+    return np.where(near, 1, np.where(hand, 2, 0)).astype(np.uint8)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    made, _ = make_capture(intake(write_folders(tmp_path)))
+    save_masks(made, "0", np.stack([disk()] * FRAMES))
+    return Capture.load(made.folder)
+
+
+def edit(capture, change) -> None:
+    path = capture.folder / CAPTURE
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def errors(capture) -> str:
+    return "\n".join(of_level(check_layout(capture.folder), "error"))
+
+
+@pytest.mark.parametrize(("motion", "up"), [(None, "+z"), (FLIP, "-z")])
+def test_a_folder_of_color_becomes_a_capture_with_the_table_of_the_pose(tmp_path, motion, up):
+    poses = write_poses(tmp_path / "poses.json", 1, motion=motion)
+    made, report = make_capture(intake(write_folders(tmp_path), poses=poses))
+    about = Capture.load(made.folder).description
+    assert (about.depth, about.up, about.frame_count, about.provenance["table"]) == ("none", up, FRAMES, "z = 0 as given")
+    assert not (made.folder / "depth").exists()
+    np.testing.assert_array_equal(made.colour("0", 2), seen(camera(), 2)[0])
+    assert "depth: none, color alone" in report and f"poses: of poses.json, up {up}" in report
+    assert any("the table is z = 0 as given, 0.6" in line for line in report)
+    assert serious(check_layout(made.folder)) == []
+
+
+def test_a_video_by_the_command(tmp_path, capsys):
+    video = write_video(tmp_path / "a.mkv", [seen(camera(), frame)[0] for frame in range(FRAMES)], "ffv1", "bgr0")
+    root = write_folders(tmp_path, frames=1)
+    poses = write_poses(root / "poses.json", 1)
+    words = ["--color", str(video), "--intrinsics", str(root / "intrinsics.json"), "--poses", str(poses), "--category", "ball"]
+    assert main(["make-capture", *words, "--output", str(tmp_path / "capture")]) == 0
+    assert "depth: none, color alone" in capsys.readouterr().out
+    made = Capture.load(tmp_path / "capture")
+    assert made.description.frame_rate == pytest.approx(15, rel=0.01)
+    np.testing.assert_array_equal(made.colour("0", 3), seen(camera(), 3)[0])
+
+
+def test_a_board_gives_the_pose(tmp_path):
+    pose = looking(np.array([0.1, -0.55, 0.45]), np.array([0.1, -0.14, 0]))
+    (tmp_path / "color_0").mkdir()
+    for frame in range(5):
+        cv2.imwrite(str(tmp_path / "color_0" / f"{frame}.png"), board_image(pose))
+    write_json(tmp_path / "intrinsics.json", {"K": LENS.tolist()})
+    made, report = make_capture(intake(tmp_path, poses=None, board=Board.of(BOARD)))
+    np.testing.assert_allclose(made.cameras["0"].camera_to_world, pose, atol=4e-3)
+    assert made.description.up == "+z" and not any("depth on it" in line for line in report)
+
+
+def below(root):
+    """A pose that looks up, away from the table."""
+    return write_json(root / "up.json", {"camera_to_world": [looking(np.array([0, 0, 0.5]), np.array([0.2, 0, 3.0])).tolist()]})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"intrinsics": None}, "--intrinsics: color alone needs the intrinsics of the camera; received none"),
+        ({"poses": None}, "--poses: color alone needs the pose of the camera, in a world with the table at z = 0; received none"),
+        ({"level": True}, "--level: needs depth"),
+        ({"top_down": True}, "--top-down: needs depth"),
+        ({"table_at": (3.0, 4.0)}, "--table-at: needs depth"),
+        ({"depth_unit": 0.001}, "--depth-unit: needs depth"),
+        ({"poses": below}, "up.json: cameras.0.camera_to_world: the table z = 0 must be 0.1 to 10 m away"),
+    ],
+)
+def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
+    root = write_folders(tmp_path)
+    if callable(changes.get("poses")):
+        changes = {"poses": changes["poses"](root)}
+    with pytest.raises(InputError) as caught:
+        make_capture(intake(root, **changes))
+    assert message in str(caught.value)
+    assert not (tmp_path / "capture").exists()
+
+
+def test_several_cameras_need_depth(tmp_path):
+    with pytest.raises(InputError, match="--color: without depth one camera is required"):
+        pairs([tmp_path, tmp_path], [])
+
+
+def test_an_interrupted_call_goes_on_where_it_was(tmp_path, monkeypatch):
+    root, write, written = write_folders(tmp_path), make.Writer.frame, []
+
+    def stop_after_four(self, camera, frame, *images):
+        if len(written) == 4:
+            raise KeyboardInterrupt
+        written.append(frame)
+        write(self, camera, frame, *images)
+
+    monkeypatch.setattr(make.Writer, "frame", stop_after_four)
+    with pytest.raises(KeyboardInterrupt):
+        make_capture(intake(root))
+    monkeypatch.setattr(make.Writer, "frame", lambda *a: (written.append(a[2]), write(*a)))
+    make_capture(intake(root))
+    assert written == [0, 1, 2, 3, 3, 4, 5, 6]
+
+
+def test_a_good_capture_says_how_large_the_object_is(capture):
+    found = check_layout(capture.folder)
+    assert serious(found) == []
+    text = "color alone: table z = 0 as given, object size on the table "
+    note = next(d.message for d in found if "object size" in d.message)
+    assert text in note and holds(found, "note", CAPTURE, "0.35 m below the camera")
+    sides = [int(side) for side in note.split("on the table ")[1].split(" cm")[0].split(" x ")]
+    assert all(26 <= side <= 29 for side in sides)
+    assert not any("depth" in d.message and "hole" in d.message for d in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda pose: FLIP @ pose, "the camera must be above the table z = 0, on the side of it that is up; received"),
+        (lambda pose: pose @ FLIP, "the table z = 0 must be 0.1 to 10 m away in the center of the image; received a view past it"),
+        (
+            lambda pose: np.vstack([pose[:2], pose[2] + [0, 0, 0, 40], pose[3]]),
+            "the table z = 0 must be 0.1 to 10 m away in the center of the image; received ",
+        ),
+    ],
+)
+def test_a_camera_that_does_not_look_at_the_table(capture, change, message):
+    pose = change(capture.cameras["0"].camera_to_world)
+    edit(capture, lambda values: values["cameras"][0].update(camera_to_world=pose.tolist()))
+    assert message in errors(capture)
+
+
+def test_a_mask_above_the_horizon(capture):
+    flat = looking(np.array([0.05, -0.5, 0.1]), np.array([0.05, 0.3, 0.0]))
+    edit(capture, lambda values: values["cameras"][0].update(camera_to_world=flat.tolist()))
+    mask = np.zeros(SIZE[::-1], np.uint8)
+    mask[5:40, 30:50] = OBJECT
+    cv2.imwrite(str(capture.path("mask", "0", 0)), mask)
+    assert "every pixel of the object in frame 0 must look at the table z = 0; received" in errors(capture)
+
+
+def test_a_pose_in_another_unit_makes_an_implausible_size(capture):
+    def five_times(values):
+        for row in values["cameras"][0]["camera_to_world"][:3]:
+            row[3] *= 5.0
+
+    edit(capture, five_times)
+    assert "implausible size: 13" in "\n".join(of_level(check_layout(capture.folder), "warning"))
+
+
+def test_a_camera_high_above_the_table(capture):
+    high = looking(np.array([0.0, -2.0, 4.0]), np.zeros(3))
+    edit(capture, lambda values: values["cameras"][0].update(camera_to_world=high.tolist()))
+    assert "a camera should be at most 3 m above the table" in "\n".join(of_level(check_layout(capture.folder), "warning"))
+
+
+def test_an_obstacle_around_the_object(capture):
+    around = {"shape": "box", "center": [0.05, 0.05, 0.1], "half_sizes": [0.3, 0.3, 0.1]}
+    edit(capture, lambda values: values.update(obstacles=[around]))
+    assert "obstacles[0]: the object of frame 0 must be outside" in errors(capture)
+
+
+def test_points_that_cannot_be_read(capture):
+    (capture.folder / POINTS).write_text('{"0": [[[1, 2]]]}')
+    assert f"{POINTS}: every track needs {FRAMES} entries; received 1" in errors(capture)
+
+
+def test_masks_of_a_run_are_not_judged_by_depth(capture):
+    labels = np.stack([disk()] * FRAMES)
+    names = {one.name for one in look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels))}
+    assert not names & {"depth holes", "hands too large"}
+
+
+def test_segmentation_by_height_is_refused_at_the_start(capture):
+    for refuse in (
+        lambda: segment_opencv.segment(capture, "0", OpenCvSegmentation()),
+        lambda: BACKENDS["segment"]["opencv"].require(capture.folder),
+    ):
+        with pytest.raises(InputError, match=r"segmentation by opencv needs depth.*marks .*, given or grounded_sam2"):
+            refuse()
+    film = film_of(capture, "0")
+    assert film.depth(0) is None and film.height(0) is None
+
+
+def test_clicks_stay_in_the_image(capture):
+    clicks = Annotations(points=(Point(name="corner", clicks={"0": (Click(frame=0, x=40.0, y=30.0),)}),))
+    with pytest.raises(InputError, match=r"color alone cannot lift clicks to 3D; received none. Clicks stay in annotations.json"):
+        tracks_of(capture, clicks)
+    clicks.save(capture.folder)
+    pointing = Pointing(capture)
+    try:
+        assert pointing.wait(10)
+        assert [note["text"] for note in pointing.results(0)["points"][0]["notes"]][-1].startswith("color alone: followed")
+        with pytest.raises(InputError, match="tracks in the world need depth"):
+            pointing.save(replace=False)
+    finally:
+        pointing.close()
+    assert not (capture.folder / "tracks.json").exists()
