@@ -256,7 +256,7 @@ class ImageObservations(Artifact):
     @property
     def hands(self) -> int:
         """How many hands there are."""
-        return self.hand_centers.shape[1]
+        return self.hand_centers.shape[1]  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from neuspring.splats.draw import moved
 from neuspring.splats.model import Splats
 from neuspring.splats.of_run import splats_file
 from neuspring.splats.train import restricted
+from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.motion import initial_velocity
 
 TWIN_RECORDS = ("fit.json", "search.json")
@@ -98,7 +99,7 @@ def read_source(path: Path) -> Source:
     rollout = StageRecord.load(folder / ROLLOUT)
     twin, digests = _twin(_record_of(folder, rollout))
     trajectory = Trajectory.load(rollout.file("trajectory", folder / ROLLOUT))
-    observations = _observations(folder, rollout)
+    observations = with_hands(_observations(folder, rollout), twin)
     if trajectory.diverged_frame is not None:
         raise InputError(
             folder,

@@ -13,6 +13,7 @@ from neuspring.physics.grips import begins
 from neuspring.physics.path import waypoints
 from neuspring.play.results import Run
 from neuspring.play.simulator import Start
+from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.motion import initial_velocity
 
 
@@ -45,6 +46,7 @@ def begin_at(run: Run, seen: Observations, frame: int, repeat: bool) -> Begin:
     twin = run.twin
     if twin is None:
         raise InputError(run.folder, "a run with a twin is required", "none", "Choose a method that makes a twin.")
+    seen = with_hands(seen, twin)
     count, hands = len(twin.topology.controllers), seen.controller_points
     if frame == 0 and not repeat:
         return Begin(0, Start(), Script())

@@ -12,11 +12,12 @@ from neuspring.config.images import Images
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.perception.results import Masks
-from neuspring.scores.images import iou, masked_pair, psnr, silhouettes, ssim
+from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
 from neuspring.scores.lpips import Lpips
 from neuspring.splats.draw import COVERED, picture, view_of
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.ssim import RADIUS, ssim_map
 from neuspring.splats.view import View
 
 
@@ -53,12 +54,24 @@ def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[
     truth, prediction = pair.truth, pair.prediction
     values = {
         "psnr": float(psnr(prediction, truth)),
-        "ssim": float(ssim(prediction, truth)),
+        "ssim": _ssim_on_black(prediction, truth),
         "iou": iou(*pair.silhouettes),
     }
     if not isinstance(lpips, str):
         values["lpips"] = float(lpips(prediction, truth, released_range=unit_lpips))
     return values
+
+
+def _ssim_on_black(a: torch.Tensor, b: torch.Tensor) -> float:
+    """SSIM of pictures [C, H, W] that are black around the object, where it is 1: only the box around what is not black is compared."""
+    shown = ((a != 0) | (b != 0)).any(dim=0)
+    rows, columns = (torch.nonzero(shown.any(dim=axis)).ravel() for axis in (1, 0))
+    if not len(rows):
+        return 1.0
+    # Windows reach this far beyond it.
+    box = [slice(max(int(where[0]) - RADIUS, 0), int(where[-1]) + RADIUS + 1) for where in (rows, columns)]
+    compared = ssim_map(a[:, box[0], box[1]], b[:, box[0], box[1]])
+    return 1.0 + float((compared - 1.0).sum(dtype=torch.float64)) / a.numel()
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from neuspring.report.figures import run as figures
 from neuspring.scores import metrics
 from neuspring.stages import LEARNING
 from neuspring.stages import options as shared
+from neuspring.twin.hand_paths import with_hands
 
 STAGES_BEFORE = ("search", "fit", "train", "rollout", "appearance", "render")
 PICTURE_ROLES = ("strip", "video", "turntable")
@@ -99,6 +100,9 @@ def run(
     stages = Stages(records)
     rollout = stages.records["rollout"]
     observations = Observations.load(observations_path)
+    twin_file = stages.file("fit" if "fit" in stages.paths else "search", "twin")
+    if twin_file:
+        observations = with_hands(observations, Twin.load(twin_file))
     trajectory_file, frames_file = stages.file("rollout", "trajectory"), stages.file("render", "frames")
     trajectory = Trajectory.load(trajectory_file) if trajectory_file else None
     pictures = pd.read_parquet(frames_file) if frames_file else None

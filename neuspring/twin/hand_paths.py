@@ -73,7 +73,7 @@ def depths_of(image: ImageObservations, values: Mapping[str, float], train_end: 
     plane = plane_depths(image, values["hand_tilt"], up)
     curve = knot_curve(factors, train_end, len(image.hand_centers))
     free = plane ** (1 - share) * image.hand_sizes.astype(np.float64) ** -share * curve
-    return np.minimum(free, plane_depths(image, LEVEL, up))
+    return np.minimum(free, plane_depths(image, LEVEL, up))  # type: ignore[no-any-return]
 
 
 def plane_depths(image: ImageObservations, tilt: float, up: float) -> np.ndarray:
@@ -91,7 +91,7 @@ def plane_depths(image: ImageObservations, tilt: float, up: float) -> np.ndarray
     along = rays(image, image.hand_centers.astype(np.float64)) @ normal
     facing = along[0] * along > 0
     ratio = np.divide(np.broadcast_to(along[0], along.shape), along, out=np.full(along.shape, FARTHEST), where=facing)
-    return np.clip(ratio, NEAREST, FARTHEST)
+    return np.clip(ratio, NEAREST, FARTHEST)  # type: ignore[no-any-return]
 
 
 def knot_curve(factors: np.ndarray, train_end: int, frames: int) -> np.ndarray:

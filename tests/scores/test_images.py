@@ -8,6 +8,7 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
+from neuspring.scores.pictures import _ssim_on_black
 from neuspring.splats.ssim import ssim, ssim_map
 from tests.support.devices import DEVICES
 
@@ -179,3 +180,16 @@ def test_bad_masks_are_refused():
             masked_pair(*bad)
     with pytest.raises(InputError, match="rendered"):
         silhouettes(good[1], good[0], good[3])
+
+
+@pytest.mark.parametrize("box", [(10, 20, 12, 30), (0, 6, 0, 9), (30, 40, 40, 48), (0, 40, 0, 48)])
+def test_ssim_of_pictures_on_black_is_that_of_the_whole(box):
+    """Of what a scored pair is: an object on black, also at the border."""
+    top, bottom, left, right = box
+    a, b = torch.zeros(3, 40, 48), torch.zeros(3, 40, 48)
+    generator = torch.Generator().manual_seed(0)
+    for picture in (a, b):
+        picture[:, top:bottom, left:right] = torch.rand(3, bottom - top, right - left, generator=generator)
+    assert _ssim_on_black(a, b) == pytest.approx(float(ssim(a.double(), b.double())), abs=1e-6)
+    assert _ssim_on_black(a, a) == pytest.approx(1.0)
+    assert _ssim_on_black(0 * a, 0 * a) == 1.0

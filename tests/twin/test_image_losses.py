@@ -134,7 +134,7 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
 
 @pytest.mark.parametrize("name", ["image_track", "silhouette", "alpha"])
 def test_gradients_of_stiffness_through_projection_and_simulator(name):
-    """An epoch's gradient against central differences of its loss, in steps so short that few points of a mask change their node."""
+    """An epoch's gradient against central differences of its loss, in steps so short that no contact begins."""
     weights = Losses(**{"image_track": 0.0, "silhouette": 0.0, "alpha": 0.0} | {name: 1.0})
     problem = problem_of()
     twin = candidate(problem, problem.decode(problem.encode()))

@@ -131,7 +131,7 @@ def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: 
     for factor in (1.0, 1.6, 2.5):
         disc = np.zeros_like(inside)
         cv2.circle(disc, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
-        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & disc, blockSize=3)
+        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & disc, blockSize=3)  # type: ignore[operator]
         if found is not None and len(found) >= 3 * LEAST:
             return np.asarray(found.reshape(-1, 2))
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))
@@ -141,7 +141,7 @@ def _flow(before: np.ndarray, now: np.ndarray, points: np.ndarray) -> tuple[np.n
     options = {"winSize": (WINDOW, WINDOW), "maxLevel": 3}
     start = np.ascontiguousarray(points, np.float32)
     moved, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, **options)  # type: ignore[call-overload]
-    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, **options)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, **options)  # type: ignore[call-overload]
     ok = (there.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < FORWARD_BACKWARD)
     return np.asarray(moved), ok
 

@@ -1,0 +1,125 @@
+"""Hands in the image, and what is read of future frames."""
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.config import Config
+from neuspring.config.perception import ColorSettings
+from neuspring.data.capture import HANDS, OBJECT
+from neuspring.perception.color.evidence import silhouettes
+from neuspring.perception.color.hands import follow_hands, grips
+from neuspring.stages import lift, segment, track
+from tests.support.colored import paint
+
+SIZE = 240
+
+
+class Film:
+    """A speckled hand that moves, turns and grows before a still background."""
+
+    def __init__(self, frames: int = 14) -> None:
+        rng = np.random.default_rng(0)
+        texture = cv2.GaussianBlur(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8), (0, 0), 2.0)
+        texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+        self.background = cv2.GaussianBlur(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8), (0, 0), 2.0)
+        hand = np.zeros((SIZE, SIZE), np.uint8)
+        cv2.rectangle(hand, (90, 60), (150, 130), HANDS, -1)
+        self.frame_count = frames
+        self.colors, self.labels, self.true = [], [], []
+        for frame in range(frames):
+            angle, size = 0.02 * frame, 1.02**frame
+            matrix = cv2.getRotationMatrix2D((120, 95), -np.rad2deg(angle), size)
+            matrix[:, 2] += [2.0 * frame, -1.0 * frame]
+            labels = cv2.warpAffine(hand, matrix, (SIZE, SIZE), flags=cv2.INTER_NEAREST)
+            moved = cv2.warpAffine(texture, matrix, (SIZE, SIZE))
+            self.labels.append(labels)
+            self.colors.append(np.where(labels[..., None] == HANDS, moved, self.background).astype(np.uint8))
+            self.true.append((matrix @ [120, 125, 1], angle, size))
+
+    def has(self, camera: str, frame: int) -> bool:
+        return True
+
+    def colour(self, camera: str, frame: int) -> np.ndarray:
+        return self.colors[frame]
+
+
+def test_a_hand_is_followed_with_its_turn_and_size():
+    film = Film()
+    grip = np.array([[120, 125]])
+    motion = follow_hands(film, "0", np.stack(film.labels), [grip], radius=60)  # type: ignore[arg-type]
+    places, angles, sizes = (np.array([one[k] for one in film.true]) for k in range(3))
+    assert motion.lost == 0
+    np.testing.assert_allclose(motion.centers[:, 0], places, atol=1.0)
+    np.testing.assert_allclose(motion.angles[:, 0], angles, atol=0.03)
+    np.testing.assert_allclose(motion.sizes[:, 0], sizes, rtol=0.03)
+
+
+def test_only_pixels_of_hands_are_read():
+    film, other = Film(), Film()
+    other.colors = [
+        np.where(labels[..., None] == HANDS, color, 255 - color) for color, labels in zip(film.colors, film.labels, strict=True)
+    ]
+    grip = np.array([[120, 125]])
+    one, two = (follow_hands(each, "0", np.stack(film.labels), [grip], radius=60) for each in (film, other))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(one.centers, two.centers)
+    np.testing.assert_array_equal(one.sizes, two.sizes)
+
+
+def test_a_hand_that_disappears_goes_on_for_a_moment_and_is_counted():
+    film = Film()
+    labels = np.stack(film.labels)
+    labels[8:] = 0
+    motion = follow_hands(film, "0", labels, [np.array([[120, 125]])], radius=60)  # type: ignore[arg-type]
+    assert motion.lost == 6
+    assert np.isfinite(motion.centers).all()
+    assert np.abs(motion.centers[-1] - motion.centers[7]).max() < 10
+
+
+def test_two_hands_are_told_apart_and_specks_are_none():
+    labels = np.zeros((SIZE, SIZE), np.uint8)
+    labels[100:160, 40:200] = OBJECT
+    labels[60:104, 40:60], labels[60:104, 180:200] = HANDS, HANDS
+    labels[98:100, 120:122] = HANDS
+    held = grips(labels, labels == OBJECT, reach=8, apart=20)
+    assert [round(one[:, 0].mean()) for one in held] == [50, 189]
+    far = np.where(labels == OBJECT, OBJECT, 0)
+    far[20:40, 100:120] = HANDS
+    (nearest,) = grips(far, far == OBJECT, reach=8, apart=20)
+    assert nearest[:, 1].min() >= 36
+    assert not grips(np.where(labels == OBJECT, OBJECT, 0), labels == OBJECT, 8, 20)
+
+
+def test_silhouettes_of_frames():
+    labels = np.zeros((2, 64, 62), np.uint8)
+    labels[0, 20:40, 20:40], labels[0, 10:20, 20:40] = OBJECT, HANDS
+    found = silhouettes(labels, ColorSettings(samples=50, band=6.0, cell=4))
+    inside = found["inside"][0].astype(int)
+    assert (labels[0, inside[:, 1], inside[:, 0]] == OBJECT).all()
+    beside = found["beside"][0].astype(int)
+    assert (labels[0, beside[:, 1], beside[:, 0]] == 0).all()
+    assert (np.abs(beside - 29.5).max(axis=1) <= 10 + 6).all()
+    assert found["outside"].shape == (2, 16, 16)
+    # Hands hide what is behind them: they are not outside.
+    assert found["outside"][0, 3, 7] == 0
+    # Cell (7, 0) is centered at (1.5, 29.5).
+    assert found["outside"][0, 7, 0] == pytest.approx(20 - 1.5, abs=0.5)
+    # A frame without the object says nothing.
+    assert np.isnan(found["inside"][1]).all()
+    assert not found["outside"][1].any()
+
+
+def test_nothing_of_the_object_is_read_in_future_frames(tmp_path):
+    """All that is not hand is painted over in future frames: perception hands on the same."""
+    made = []
+    for name, spoiled in (("plain", False), ("spoiled", True)):
+        capture = paint(tmp_path / name, spoiled=spoiled)
+        out = tmp_path / f"{name}_out"
+        segment.run(capture.folder, "0", Config(), "cpu", out / "masks.json")
+        track.run(capture.folder, "0", out / "masks.json", Config(), "cpu", out / "tracks.json")
+        lift.run(capture.folder, [out / "masks.json"], [out / "tracks.json"], Config(), out / "lifted.json")
+        made.append({file: np.load(out / file) for file in ("image.npz", "lifted.npz")})
+    for file, arrays in made[0].items():
+        for name in arrays.files:
+            if name != "meta":
+                np.testing.assert_array_equal(arrays[name], made[1][file][name], err_msg=f"{file}: {name}")
