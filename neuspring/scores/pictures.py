@@ -63,7 +63,7 @@ def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[
 
 
 def _ssim_on_black(a: torch.Tensor, b: torch.Tensor) -> float:
-    """SSIM of pictures [C, H, W] that are black around the object, where it is 1: only the box around what is not black is compared."""
+    """SSIM of pictures [C, H, W] that are black around the object: it is 1 there, so only the box around the object is compared."""
     shown = ((a != 0) | (b != 0)).any(dim=0)
     rows, columns = (torch.nonzero(shown.any(dim=axis)).ravel() for axis in (1, 0))
     if not len(rows):

@@ -24,9 +24,8 @@ PIXEL = 0.005
 
 def capture_of(category: str, up: str = "+z") -> SimpleNamespace:
     view = camera(np.zeros(3))
-    return SimpleNamespace(
-        folder=Path("painted"), cameras={"0": view}, description=SimpleNamespace(up=up, category=category), frame_count=1, train_end=1
-    )
+    described = SimpleNamespace(up=up, category=category)
+    return SimpleNamespace(folder=Path("painted"), cameras={"0": view}, description=described, frame_count=1, train_end=1)
 
 
 def shown(corners: list[list[float]]) -> np.ndarray:
