@@ -67,7 +67,7 @@ def lift_color(
         hand_sizes=motion.sizes,
         marked=capture.points(name),
     )
-    grip_points = np.concatenate([first.middle(grip) for grip in chosen])
+    grip_points = np.concatenate([first.fingers(grip) for grip in chosen])
     guess = depths_of(image, {"hand_tilt": settings.hand_tilt, "hand_size": 0.0}, capture.train_end, first.up)
     y, x = np.nonzero(first.filled)
     cloud_pixels = np.stack([x, y], axis=1)

@@ -84,9 +84,13 @@ class FirstFrame:
         share = 1.0 if self.kind == "body" else 0.5
         return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
 
-    def middle(self, pixels: np.ndarray) -> np.ndarray:
-        """World points [n, 3], m, in the middle between upper and lower side: where fingers are that hold the object."""
-        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, 0.5 * self._up(pixels)))
+    def fingers(self, pixels: np.ndarray) -> np.ndarray:
+        """World points [n, 3], m, where fingers hold the object: a body at half its height, others by their upper side.
+
+        There is no point of the object there (`points`): a spring between the two would have no length.
+        """
+        share = 0.5 if self.kind == "body" else 1.0
+        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
 
     def _up(self, pixels: np.ndarray) -> np.ndarray:
         """z of the upper side at pixels [n], m."""

@@ -71,7 +71,7 @@ def test_a_body_rests_on_the_table_and_its_silhouette_is_that_of_the_mask():
     upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.back[y, x])
     np.testing.assert_allclose(lower[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(first.camera.project(upper)[0], pixels, atol=1e-6)
-    np.testing.assert_allclose(first.middle(pixels)[:, 2], 0.5 * upper[:, 2], atol=1e-9)
+    np.testing.assert_allclose(first.fingers(pixels)[:, 2], 0.5 * upper[:, 2], atol=1e-9)
     half = 0.5 * 0.2 * np.sin(np.deg2rad(40))
     assert upper[:, 2].max() == pytest.approx(0.8 * 2 * half, rel=0.15)
 
