@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.footage_parts RESULTS --output OUT
 
-RESULTS is the folder of a run with config/data/footage.yaml and config/studies/footage_parts.yaml. The table judges training
-frames: silhouettes' IoU, and the distance in the image between tracked points and their nodes. Future IoU stands beside it, for the reader;
-nothing was chosen by it. OUT/parts.csv has every run, OUT/parts.md the table.
+RESULTS is the folder of a run with config/data/color.yaml, config/studies/footage.yaml and footage_parts.yaml. The table
+judges training frames: silhouettes' IoU, and the distance in the image between tracked points and their nodes. Future IoU stands
+beside it, for the reader; nothing was chosen by it. OUT/parts.csv has every run, OUT/parts.md the table.
 """
 
 from __future__ import annotations

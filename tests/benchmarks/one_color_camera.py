@@ -6,7 +6,7 @@
 CAPTURES is a folder of results of config/data/synthetic.yaml, whose scenarios have <scenario>/capture and its truth. OUT gets, per
 scene, SCENE_three (a link to the capture), SCENE_one and SCENE_color, and scenarios.tsv, for a run with
 
-    --configfile config/data/footage.yaml --config data_root=OUT scenario_table=OUT/scenarios.tsv 'scenarios=[...]'
+    --configfile config/data/color.yaml --config data_root=OUT scenario_table=OUT/scenarios.tsv 'scenarios=[...]'
 
 TABLES/errors.csv has every number, TABLES/summary.md the tables: hands against the truth, the shape in frame 0 against the true
 surface, track errors of predictions in 3D.
