@@ -13,6 +13,8 @@ import numpy as np
 
 from neuspring.data.capture import Camera
 
+FLAT = 0.015
+"""m above the table, below which a point lies on it."""
 NEIGHBORS = 4
 """Nodes that a marked pixel moves with."""
 CANDIDATES = 8
@@ -59,6 +61,41 @@ def carried_in_image(
             index, weights = _around(pixel, pixels[0], depth[0])
             places[:, k] = pixel + np.einsum("i,fij->fj", weights, pixels[:, index] - pixels[0, index])
     return places
+
+
+def points_on_table(
+    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, marked: np.ndarray, surface: int, up: float
+) -> np.ndarray:
+    """As `points_in_image`, m on the table, of points of flat things that touch it: NaN where there is none.
+
+    A thing is flat if no node of frame 0 is FLAT or more above the table z = 0, on the side `up`, +1 or -1. A point touches the
+    table in a frame in which the nodes that carry it are less than FLAT above it. There the marked pixel is lifted onto the plane at
+    their height; the error is its distance from where they carry the point.
+    """
+    errors = np.full((len(positions), marked.shape[1]), np.nan)
+    if (up * positions[0, :, 2]).max() < FLAT:
+        camera = Camera("", 0, 0, intrinsics, camera_to_world)
+        nodes = positions[:, :surface].astype(np.float64)
+        pixels, depth = camera.project(nodes[0])
+        for k, pixel in enumerate(marked[0]):
+            if not np.isfinite(pixel).all():
+                continue
+            index, weights = _around(pixel, pixels, depth)
+            start = _on_plane(camera, pixel[None], np.array([weights @ nodes[0, index, 2]]))[0]
+            carried = start + np.einsum("i,fij->fj", weights, nodes[:, index] - nodes[0, index])
+            touching = (up * carried[:, 2] < FLAT) & np.isfinite(marked[: len(nodes), k]).all(axis=1)
+            seen = _on_plane(camera, marked[: len(nodes), k][touching], carried[touching, 2])
+            errors[touching, k] = np.linalg.norm(seen - carried[touching], axis=1)
+    known = np.isfinite(errors)
+    count, total = known.sum(axis=1), np.where(known, errors, 0.0).sum(axis=1)
+    mean: np.ndarray = np.divide(total, count, out=np.full(len(errors), np.nan), where=count > 0)
+    return mean
+
+
+def _on_plane(camera: Camera, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """World points [n, 3], m, at which the rays of pixels [n, 2] meet the planes at z [n], m."""
+    rays = camera.lift(pixels, np.ones(len(pixels))) - camera.camera_to_world[:3, 3]
+    return np.asarray(camera.lift(pixels, (z - camera.camera_to_world[2, 3]) / rays[:, 2]))
 
 
 def _around(pixel: np.ndarray, pixels: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -130,7 +130,17 @@ _ALL = (
         paper_name="iou", paper_heading="IoU %", paper_unit="%", paper_factor=100.0, paper_digits=1,
     ),
 )  # fmt: skip
-METRICS = {metric.name: metric for metric in _ALL}
+MARKED = (
+    Metric(
+        name="image_error", title="error of marked points in the image", heading="Marked", unit="px", digits=1, tolerance=1e-3,
+    ),
+    Metric(
+        name="table_error", title="error of marked points that lie on the table", heading="On the table", unit="m", factor=1e3,
+        digits=1, tolerance=1e-6,
+    ),
+)  # fmt: skip
+"""Of points that were marked in images, where there is color alone (image_points.py)."""
+METRICS = {metric.name: metric for metric in (*_ALL, *MARKED)}
 """By name, in the order of summaries. Tolerances of distances are those of single precision and its order of summation. Pictures
 agree within 1e-6 dB with a drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU. Other rasterizers
 lie between."""
@@ -141,11 +151,12 @@ IN_STUDIES = IN_PAPER | {"track_error_bound": METRICS["track_error_bound"]}
 DISTANCES = tuple(metric for metric in _ALL if not metric.of_pictures)
 PUBLISHED = tuple(metric for metric in DISTANCES if metric.paper_name)
 PICTURES = tuple(metric for metric in _ALL if metric.of_pictures)
-UNITS = {metric.name: metric.unit for metric in _ALL}
+UNITS = {metric.name: metric.unit for metric in METRICS.values()}
 Headings = Mapping[tuple[str, str], str]
 """Task and metric to the heading of their column."""
 HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in DISTANCES}
 IMAGE_HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in PICTURES}
+MARKED_HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in MARKED}
 TRANSFER_HEADINGS = {("transfer", m.name): f"Transfer {m.heading}" for m in DISTANCES}
 
 
@@ -239,6 +250,22 @@ def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[
     }
 
 
+def marked_errors(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
+    """Errors of points marked in the image per frame [F], px and m, by the name of their metric, for positions [F, N, 3].
+
+    NaN in frames without marks. Empty for captures with depth, and where no point was marked.
+    """
+    image = observations.image
+    if image is None or not image.marked.shape[1]:
+        return {}
+    # OpenCV is imported for captures alone.
+    from neuspring.scores.image_points import points_in_image, points_on_table
+
+    view = image.intrinsics, image.camera_to_world, positions, image.marked.astype(np.float64), observations.surface_count
+    up = 1.0 if observations.scenario.up == "+z" else -1.0
+    return {"image_error": points_in_image(*view), "table_error": points_on_table(*view, up)}
+
+
 def floors(observations: Observations) -> dict[str, float]:
     """Every distance in frame 0, m, where the prediction is given: it measures how far points are from nodes, and no motion.
 
@@ -277,7 +304,7 @@ def score_tasks(
     """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
-    per_frame = errors_per_frame(trajectory.positions, observations)
+    per_frame = errors_per_frame(trajectory.positions, observations) | marked_errors(trajectory.positions, observations)
     for task, frames in tasks.items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neuspring.core.artifacts import Trajectory
 from neuspring.data.capture import Camera
-from neuspring.scores.image_points import BEHIND, carried_in_image, points_in_image
+from neuspring.report.tables.summary import marked_lines
+from neuspring.scores import metrics
+from neuspring.scores.image_points import BEHIND, carried_in_image, points_in_image, points_on_table
+from tests.support.colored import observed
 
 K = np.array([[400.0, 0, 320], [0, 410.0, 240], [0, 0, 1]])
 DEPTH = 0.8
@@ -88,3 +95,41 @@ def test_what_is_not_marked_says_nothing():
     assert np.isnan(errors[[1, 3]]).all()
     assert points_in_image(K, pose(), positions[:2], marked, positions.shape[1]).shape == (2,)
     assert points_in_image(K, pose(), positions, np.zeros((4, 0, 2)), 10).shape == (4,)
+
+
+def test_points_on_the_table_are_measured_on_it():
+    """A sheet on the table that is shifted along it: the mark is where it was, so the error is the shift. Lifted, nothing touches."""
+    line = np.linspace(-0.1, 0.1, 15)
+    x, y = np.meshgrid(line, line)
+    nodes = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.002)])
+    view = Camera("", 0, 0, K, np.array([[1, 0, 0, 0], [0, -0.6, 0.8, -0.5], [0, -0.8, -0.6, 0.5], [0, 0, 0, 1.0]]))
+    shift = np.array([0.02, -0.01, 0.0])
+    positions = np.stack([nodes, nodes + shift, nodes + [0, 0, 0.1]])
+    start = view.project(np.array([[0.031, 0.012, 0.002], [-0.05, 0.04, 0.002]]))[0]
+    marked = np.stack([start] * 3)
+    found = points_on_table(K, view.camera_to_world, positions, marked, len(nodes), 1.0)
+    assert found[:2] == pytest.approx([0.0, np.linalg.norm(shift)], abs=1e-9)
+    assert np.isnan(found[2])
+    # A thing that is high in frame 0 is not flat.
+    high = np.concatenate([positions, positions[:, :1] + [0, 0, 0.05]], axis=1)
+    assert np.isnan(points_on_table(K, view.camera_to_world, high, marked, len(nodes), 1.0)).all()
+
+
+def test_scores_of_color_alone_have_the_errors_of_marked_points():
+    seen = observed()
+    view = Camera("", 0, 0, seen.image.intrinsics, seen.image.camera_to_world)
+    still = np.repeat(seen.nodes[None], seen.scenario.frame_count, axis=0)
+    pixel = view.project(seen.nodes[:1].astype(float))[0]
+    marked = np.full((seen.scenario.frame_count, 1, 2), np.nan)
+    marked[0], marked[3], marked[-1] = pixel, pixel + [3.0, 4.0], pixel + [0.0, 12.0]
+    own = replace(seen, image=replace(seen.image, marked=marked))
+    rows = metrics.score(Trajectory(positions=still, frame_count=len(still)), own, "still", 0)
+    found = rows[rows["metric"] == "image_error"].set_index("task")
+    assert found["value"].to_dict() == pytest.approx({"reconstruction": 5.0, "future": 12.0}, abs=1e-3)
+    assert set(found["unit"]) == {"px"}
+    assert not len(
+        metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0).query("metric == 'image_error'")
+    )
+    lines = marked_lines(rows, pd.DataFrame({"method": ["still"], "scenario": ["small"], "status": ["ok"]}))
+    assert "Recon. Marked" in "\n".join(lines)
+    assert "12.0" in "\n".join(lines)

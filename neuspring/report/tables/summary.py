@@ -27,11 +27,13 @@ from neuspring.scores.metrics import (
     DISTANCES,
     HEADINGS,
     IMAGE_HEADINGS,
+    MARKED_HEADINGS,
     METRICS,
     TRANSFER_HEADINGS,
     Headings,
     averages,
     headings_of,
+    present,
     published,
 )
 from neuspring.scores.runs import Collected, comparable, finished_scores, mixed_settings, pairs
@@ -84,6 +86,7 @@ def summary_text(
         intro = f"Paired difference to {baseline}, mm [95 % bootstrap interval over scenarios and seeds], same scenario and seed:"
         lines += ["", intro, "", *by_method(differences, headings, _interval)]
     lines += image_lines(collected, scores, differences, baseline)
+    lines += marked_lines(scores, runs)
     runs = everything.runs
     footnote = differing_markdown(differing(everything.records.values(), {name: name for name in dict.fromkeys(runs["method"])}))
     lines += ["", footnote] if footnote else []
@@ -258,6 +261,17 @@ def image_lines(collected: Collected, scores: pd.DataFrame, differences: pd.Data
         lines += ["", f"Paired difference to {baseline} [95 % interval], same scenario and seed:", ""]
         lines += by_method(own, headings, _interval)
     return lines
+
+
+def marked_lines(scores: pd.DataFrame, runs: pd.DataFrame) -> list[str]:
+    """The section on points that were marked in images; nothing where there are none."""
+    headings = {key: text for key, text in MARKED_HEADINGS.items() if key in present(scores)} if len(scores) else {}
+    if not headings:
+        return []
+    own = scores[scores["metric"].isin([metric for _, metric in headings])]
+    have, asked = own["scenario"].nunique(), runs["scenario"].nunique()
+    intro = f"Points marked in images ({have} of {asked} scenarios), lower is better: px in the image; mm on the table."
+    return ["", intro, "", *_method_table(own, runs, runs[runs["scenario"].isin(own["scenario"])], headings)]
 
 
 def _unseen(runs: pd.DataFrame) -> str:
