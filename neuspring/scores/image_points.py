@@ -69,8 +69,8 @@ def points_on_table(
     """As `points_in_image`, m on the table, of points of flat things that touch it: NaN where there is none.
 
     A thing is flat if no node of frame 0 is FLAT or more above the table z = 0, on the side `up`, +1 or -1. A point touches the
-    table in a frame in which the nodes that carry it are less than FLAT above it. There the marked pixel is lifted onto the plane at
-    their height; the error is its distance from where they carry the point.
+    table in a frame in which the nodes that carry it are less than FLAT above it. There the marked pixel is lifted onto the plane
+    at their height; the error is its distance from where they carry the point.
     """
     errors = np.full((len(positions), marked.shape[1]), np.nan)
     if (up * positions[0, :, 2]).max() < FLAT:

@@ -98,20 +98,20 @@ def test_what_is_not_marked_says_nothing():
 
 
 def test_points_on_the_table_are_measured_on_it():
-    """A sheet on the table that is shifted along it: the mark is where it was, so the error is the shift. Lifted, nothing touches."""
+    """A sheet on the table that is shifted along it: the mark is where it was, so the error is the shift."""
     line = np.linspace(-0.1, 0.1, 15)
     x, y = np.meshgrid(line, line)
     nodes = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.002)])
     view = Camera("", 0, 0, K, np.array([[1, 0, 0, 0], [0, -0.6, 0.8, -0.5], [0, -0.8, -0.6, 0.5], [0, 0, 0, 1.0]]))
     shift = np.array([0.02, -0.01, 0.0])
-    positions = np.stack([nodes, nodes + shift, nodes + [0, 0, 0.1]])
+    positions = np.stack([nodes, nodes + shift, nodes + np.array([0, 0, 0.1])])
     start = view.project(np.array([[0.031, 0.012, 0.002], [-0.05, 0.04, 0.002]]))[0]
     marked = np.stack([start] * 3)
     found = points_on_table(K, view.camera_to_world, positions, marked, len(nodes), 1.0)
     assert found[:2] == pytest.approx([0.0, np.linalg.norm(shift)], abs=1e-9)
     assert np.isnan(found[2])
     # A thing that is high in frame 0 is not flat.
-    high = np.concatenate([positions, positions[:, :1] + [0, 0, 0.05]], axis=1)
+    high = np.concatenate([positions, positions[:, :1] + np.array([0, 0, 0.05])], axis=1)
     assert np.isnan(points_on_table(K, view.camera_to_world, high, marked, len(nodes), 1.0)).all()
 
 
@@ -121,7 +121,7 @@ def test_scores_of_color_alone_have_the_errors_of_marked_points():
     still = np.repeat(seen.nodes[None], seen.scenario.frame_count, axis=0)
     pixel = view.project(seen.nodes[:1].astype(float))[0]
     marked = np.full((seen.scenario.frame_count, 1, 2), np.nan)
-    marked[0], marked[3], marked[-1] = pixel, pixel + [3.0, 4.0], pixel + [0.0, 12.0]
+    marked[0], marked[3], marked[-1] = pixel, pixel + np.array([3.0, 4.0]), pixel + np.array([0.0, 12.0])
     own = replace(seen, image=replace(seen.image, marked=marked))
     rows = metrics.score(Trajectory(positions=still, frame_count=len(still)), own, "still", 0)
     found = rows[rows["metric"] == "image_error"].set_index("task")
