@@ -3,9 +3,11 @@
 With up as +z, the pixel p shows the object's upper side at height t(p), where its ray meets the plane z = t(p):
 
     sheets   (`flat`, such as cloth)  t = `sheet_thickness`; nodes lie at t / 2
-    ropes    (`round`)                t = c(p) s, a round cross-section on the table; nodes lie at t / 2
-    bodies   (all others)             t = `body_thickness` c(p) s; the lower side is the table: the silhouette inflated
-                                      symmetrically about its middle t / 2, which rests on the table
+    ropes    (`round`)                t = c(p) s, a round cross-section on the table
+    bodies   (all others)             t = `body_thickness` c(p) s
+
+The lower side of ropes and bodies is the table: the silhouette is inflated symmetrically about its middle t / 2, and rests. Nodes
+fill it, as single nodes in the middle would fall to the table.
 
 c(p) is the width of the silhouette at p, in pixels, rounded towards its edge (shape_back.round_chord), and s the width of a pixel.
 """
@@ -77,19 +79,19 @@ class FirstFrame:
         return self._depths(0.0)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """World points [n, 3], m, of pixels (x, y) [n, 2]: of a body its upper side, of the others their middle.
+        """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
 
         Pixels outside of the silhouette have the height of its nearest pixel.
         """
-        share = 1.0 if self.kind == "body" else 0.5
+        share = 0.5 if self.kind == "flat" else 1.0
         return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
 
     def fingers(self, pixels: np.ndarray) -> np.ndarray:
-        """World points [n, 3], m, where fingers hold the object: a body at half its height, others by their upper side.
+        """World points [n, 3], m, where fingers hold the object: a sheet by its upper side, others at half their height.
 
         There is no point of the object there (`points`): a spring between the two would have no length.
         """
-        share = 0.5 if self.kind == "body" else 1.0
+        share = 1.0 if self.kind == "flat" else 0.5
         return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
 
     def _up(self, pixels: np.ndarray) -> np.ndarray:

@@ -33,8 +33,8 @@ def from_color(
 ) -> tuple[LiftedTracks, ShapePrior, ImageObservations]:
     """What `lift` and `shape_prior` make of captures with depth, and the evidence of the image.
 
-    A body's prior is what lies between its supposed upper side and the table (`first_frame`), or a mesh that is placed on the upper
-    side. Sheets and ropes have none. Raises InputError without object, hands or tracks.
+    The prior of ropes and bodies is what lies between their supposed upper side and the table (`first_frame`), or a mesh that is
+    placed on the upper side. Sheets have none. Raises InputError without object, hands or tracks.
     """
     name = next(iter(capture.cameras))
     labels = masks[name].labels
@@ -43,11 +43,11 @@ def from_color(
     supposed = Supposed(capture.folder, capture.description, first.front)
     whole = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
     shape = settings.shape
-    if first.kind != "body" and shape.backend == "auto":
+    if first.kind == "flat" and shape.backend == "auto":
         return lifted, no_prior(), image
     y, x = np.nonzero(first.filled)
     lower = first.camera.lift(np.stack([x, y], axis=1).astype(float), first.back[y, x])
     cloud = lifted.cloud if shape.backend == "mesh" else np.concatenate([lifted.cloud, lower])
-    # Behind the upper side all belongs to the body, down to the table.
+    # Behind the upper side all belongs to the object, down to the table.
     prior = shape_prior(supposed, {name: whole}, cloud, replace(shape, back="none"))
     return lifted, replace(prior, backend=f"{prior.backend}, {lifted.backend}"), image

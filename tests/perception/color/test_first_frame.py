@@ -56,10 +56,10 @@ def test_a_sheet_has_its_size_on_the_table():
 
 def test_a_rope_is_as_thick_as_it_is_wide():
     first = FirstFrame.of(capture_of("rope"), shown([[-0.15, -0.02], [0.15, -0.02], [0.15, 0.02], [-0.15, 0.02]]), ColorSettings())
-    middle = object_points(first)[:, 2]
-    # 4 cm of the table are 2.6 cm in the image at 40 degrees; the middle is at half of that.
-    assert np.median(middle[middle > 0.5 * middle.max()]) == pytest.approx(0.0128, abs=PIXEL)
-    assert middle.min() > 0
+    upper = object_points(first)[:, 2]
+    # 4 cm of the table are 2.6 cm in the image at 40 degrees.
+    assert np.median(upper[upper > 0.5 * upper.max()]) == pytest.approx(0.0257, abs=1.5 * PIXEL)
+    assert upper.min() > 0
 
 
 def test_a_body_rests_on_the_table_and_its_silhouette_is_that_of_the_mask():
@@ -118,7 +118,7 @@ def test_rays_beyond_the_horizon_never_meet_the_table():
     assert np.isinf(camera_depth(view, np.array([[80.0, 0.0]]), 0.0)).all()
 
 
-@pytest.mark.parametrize("category", ["cloth", "zebra"])
+@pytest.mark.parametrize("category", ["cloth", "rope", "zebra"])
 def test_observations_of_a_painted_capture(tmp_path, category):
     """Nodes where the square is, controllers at its far edge; a body's hull is closed and above the table."""
     capture = paint(tmp_path, category)
@@ -146,4 +146,6 @@ def test_observations_of_a_painted_capture(tmp_path, category):
         corners = prior.vertices[prior.faces].astype(float)
         volume = (np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6
         assert volume > 0.2 * 0.2 * 0.02
+        # Nodes lie on the table, and do not fall to it.
+        assert nodes[:, 2].min() < 0.01
         assert 0.1 < prior.facts["invented_share"] < 0.9
