@@ -71,6 +71,11 @@ class Stages:
         return record.file(role, self.paths[stage]) if record and role in record.files else None
 
     @property
+    def twin_file(self) -> Path | None:
+        """The run's twin; None if it has none."""
+        return self.file("fit" if "fit" in self.paths else "search", "twin")
+
+    @property
     def learning(self) -> list[str]:
         """The stages that learned the run's model, in order."""
         return [name for name in LEARNING if name in self.paths]
@@ -100,9 +105,8 @@ def run(
     stages = Stages(records)
     rollout = stages.records["rollout"]
     observations = Observations.load(observations_path)
-    twin_file = stages.file("fit" if "fit" in stages.paths else "search", "twin")
-    if twin_file:
-        observations = with_hands(observations, Twin.load(twin_file))
+    if stages.twin_file:
+        observations = with_hands(observations, Twin.load(stages.twin_file))
     trajectory_file, frames_file = stages.file("rollout", "trajectory"), stages.file("render", "frames")
     trajectory = Trajectory.load(trajectory_file) if trajectory_file else None
     pictures = pd.read_parquet(frames_file) if frames_file else None
@@ -169,7 +173,7 @@ def _artifacts(
 ) -> dict[str, list[Path]]:
     """Kind -> files to look at or to load: the twin, plots that are drawn now, pictures of earlier stages."""
     artifacts: dict[str, list[Path]] = {}
-    twin_file = stages.file("fit" if "fit" in stages.paths else "search", "twin")
+    twin_file = stages.twin_file
     searched_file = stages.file("search", "twin")
     if twin_file:
         artifacts["twin"] = [twin_file]

@@ -128,8 +128,9 @@ class SearchProblem:
 
     @property
     def polished(self) -> tuple[str, ...]:
-        """Names of what is polished."""
-        return tuple(name for name in self.variables if name.partition(".")[0] in self.search.polish.variables)
+        """Names of what is polished, in the order of the settings."""
+        bases = self.search.polish.variables
+        return tuple(name for base in bases for name in self.variables if name.partition(".")[0] == base)
 
     @property
     def bending_reach(self) -> tuple[float, float]:
