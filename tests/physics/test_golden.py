@@ -54,8 +54,8 @@ class Frame(NamedTuple):
     grad_collide: np.ndarray
 
 
-@cache
 def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool, threads: bool) -> FrameSolver:
+    """A clip's solver, a new one each time: it keeps the parameters that were last set, whichever test set them."""
     twin = clip(name).twin
     if threads == (device != "cpu"):
         return solver_for(twin, device, dtype, differentiable=differentiable)
