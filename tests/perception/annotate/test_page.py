@@ -168,7 +168,7 @@ def test_frames_and_cameras_are_reached_by_keys(page):
     page.browser.click("#overlay")  # a clicked button does not take the keys
     page.browser.key("Home")
     page.browser.key(" ")
-    page.browser.wait("annotate.frame === 11")
+    page.browser.wait("annotate.frame === 11 && !annotate.timeline.playing")  # it plays on from where it is put before
     assert page.browser.run("annotate.view.showOverlay") is False
     page.browser.key("k")
     page.browser.run("annotate.go(4)")
