@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from neuspring.core.job_records import read_jobs
@@ -23,6 +24,8 @@ GROUPS = {
     "rest": ("rollout", "predict", "score", "transfer"),
 }
 """Rules of the workflow by what they are for."""
+COSTED = "neuspring"
+"""Whose cost is shown by scenario."""
 UPSTREAM = ("search", "fit", "train", "appearance")
 """Inputs of records that are records of other jobs."""
 
@@ -85,31 +88,35 @@ def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
 
 
-def cost_lines(results: Path, runs: Sequence[Run]) -> list[str]:
-    """Tables of processor minutes: of a run by method, mean over cases and seeds; of all jobs by scenario."""
-    table = costs(results, runs)
+def merged(costs: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
+    """Costs, and those of an earlier call of runs that these do not have."""
+    names = ["scenario", "method", "seed"]
+    there = set(costs[names].itertuples(index=False, name=None))
+    rest = [row not in there for row in earlier[names].itertuples(index=False, name=None)]
+    return pd.concat([costs, earlier[rest]], ignore_index=True)
+
+
+def cost_lines(table: pd.DataFrame) -> list[str]:
+    """Tables of processor minutes of one run, mean over its seeds: by method, and of the method last in the table by scenario."""
     if not len(table):
         return []
-    wide = table.pivot_table(index="method", columns="group", values="minutes", sort=False).reindex(columns=list(GROUPS))
-    counts = table.groupby("method")[["scenario", "seed"]].apply(lambda part: len(part.drop_duplicates()))
-    rows = [[str(m), str(counts[m]), *(f"{v:.1f}" for v in row), f"{row.sum():.1f}"] for m, row in wide.iterrows()]
     lines = ["", "## Cost: processor minutes of one run", ""]
     lines += ["Mean over runs. What runs share (perception, a search, splats) counts in each of them.", ""]
-    lines += markdown(["method", "runs", *GROUPS, "sum"], rows)
-    scenarios = {run.scenario.name for run in runs}
-    jobs = [(_scenario(name), group_of(_rule(name)), value) for name, value in minutes_by_job(results).items()]
-    every = pd.DataFrame([job for job in jobs if job[0] in scenarios], columns=["scenario", "group", "minutes"])
-    if len(every):
-        wide = every.pivot_table(index="scenario", columns="group", values="minutes", aggfunc="sum", fill_value=0.0)
-        wide = wide.reindex(columns=list(GROUPS), fill_value=0.0)
-        rows = [[str(name), *(f"{v:.1f}" for v in row), f"{row.sum():.1f}"] for name, row in wide.iterrows()]
-        lines += [
-            "",
-            "All jobs of a scenario, of all methods and seeds together:",
-            "",
-            *markdown(["scenario", *GROUPS, "sum"], rows),
-        ]
+    lines += markdown(["method", "runs", *GROUPS, "sum"], _minutes(table, "method"))
+    shown = COSTED if (table["method"] == COSTED).any() else table["method"].iloc[-1]
+    lines += ["", f"The same of `{shown}`, by scenario:", ""]
+    lines += markdown(["scenario", "runs", *GROUPS, "sum"], _minutes(table[table["method"] == shown], "scenario"))
     return lines
+
+
+def _minutes(table: pd.DataFrame, by: str) -> list[list[str]]:
+    """Rows of text: a name, how many runs it has, minutes of each group and their sum."""
+    wide = table.pivot_table(index=by, columns="group", values="minutes", sort=False).reindex(columns=list(GROUPS))
+    counts = table.groupby(by)[["scenario", "method", "seed"]].apply(lambda part: len(part.drop_duplicates()))
+    return [
+        [str(name), str(counts[name]), *("–" if np.isnan(v) else f"{v:.1f}" for v in row), f"{row.sum():.1f}"]
+        for name, row in wide.iterrows()
+    ]
 
 
 def _rule(job: str) -> str:

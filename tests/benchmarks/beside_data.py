@@ -123,6 +123,12 @@ class Case:
         return truths(self.folder, self.name)
 
     @functools.cached_property
+    def labeled(self) -> dict[int, np.ndarray]:
+        """Labels [H, W] of four frames: drawn ones, or, where none were drawn, the capture's, carried from marks."""
+        last = self.capture.frame_count - 1
+        return self.drawn or {frame: self.labels(frame) for frame in (0, last // 3, 2 * last // 3, last)}
+
+    @functools.cached_property
     def points(self) -> Points | None:
         """Points marked by hand."""
         path = self.folder / "tracks" / f"{self.name}.json"

@@ -1,12 +1,13 @@
 """Twins of color footage beside PhysTwin's published prediction, on the same frames of the same camera: tables and film strips.
 
     python -m tests.benchmarks.beside_phystwin FOLDER RESULTS --captures CAPTURES --output OUT
-        [--cases ...] [--methods ...] [--strips FOLDER] [--strip-methods ...] [--force]
+        [--cases ...] [--methods ...] [--strips FOLDER] [--strip-methods ...] [--force] [--keep]
 
 FOLDER is that of `tests.benchmarks.footage`, with result/CASE.npz and videos/combine_rendering__CASE.mp4. RESULTS is a folder of
 results of the workflow. CAPTURES has a capture per case (`tests.benchmarks.footage_captures`). Cases are those that RESULTS has
-runs of; without any run, all captures. OUT/summary.md has the tables, OUT/scores.csv every number. Scores of runs that have not
-changed are taken from an earlier OUT/scores.csv; --force computes all anew.
+runs of; without any run, all captures. OUT/summary.md has the tables, OUT/scores.csv every number, OUT/costs.csv the times. Scores
+of runs that have not changed are taken from an earlier OUT/scores.csv; --force computes all anew. With --keep, runs of the earlier
+files that RESULTS does not have stay in them: so one table may hold the runs of several machines.
 """
 
 from __future__ import annotations
@@ -22,25 +23,27 @@ import pandas as pd
 from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT
-from neuspring.scores.image_points import point_errors
+from neuspring.scores.image_points import point_errors, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import COVERED
-from tests.benchmarks.beside_cost import cost_lines
-from tests.benchmarks.beside_data import LEFT_OUT, PHYSTWIN, STILL, Case, Run, cases_of, iou_without_hands, runs_of
+from tests.benchmarks.beside_cost import cost_lines, costs, merged
+from tests.benchmarks.beside_data import PHYSTWIN, STILL, Case, Run, cases_of, iou_without_hands, runs_of
 from tests.benchmarks.beside_strips import write_strip
 from tests.benchmarks.beside_tables import COLUMNS, PARTS, tables
 
 IMAGE_METRICS = ("iou", "psnr", "ssim")
 NO_LPIPS = "not compared here"
+COSTS = "costs.csv"
+MM = 1e3
 Row = dict[str, Any]
 
 
-def drawn_rows(case: Case, silhouettes: Iterable[tuple[int, np.ndarray]]) -> Iterator[Row]:
-    """IoU with the drawn masks, of silhouettes [H, W] by frame. Frames are told by their place among the drawn ones."""
-    parts = dict(zip(case.drawn, PARTS, strict=False))
+def labeled_rows(case: Case, silhouettes: Iterable[tuple[int, np.ndarray]]) -> Iterator[Row]:
+    """IoU in the labeled frames, of silhouettes [H, W] by frame. Frames are told by their place among the labeled ones."""
+    parts, metric = dict(zip(case.labeled, PARTS, strict=True)), "iou_drawn" if case.drawn else "iou_carried"
     for frame, silhouette in silhouettes:
-        value = iou_without_hands(silhouette, case.drawn[frame])
-        yield {"part": parts[frame], "frame": frame, "metric": "iou_drawn", "value": value}
+        value = iou_without_hands(silhouette, case.labeled[frame])
+        yield {"part": parts[frame], "frame": frame, "metric": metric, "value": value}
 
 
 def task_rows(case: Case, values: pd.DataFrame) -> Iterator[Row]:
@@ -68,7 +71,7 @@ def picture_rows(case: Case, pictures: Iterable[tuple[int, np.ndarray]]) -> Iter
 def point_rows(case: Case, positions: np.ndarray | None, run: Run | None) -> Iterator[Row]:
     """Errors of the sure marked points, px: in the last marked frame, and in all marked frames after 0.
 
-    Without positions [T, N, 3] points stay where they are in frame 0.
+    Of flat things also in mm, of points that touch the table. Without positions [T, N, 3] points stay where they are in frame 0.
     """
     points = case.points
     if points is None:
@@ -79,7 +82,11 @@ def point_rows(case: Case, positions: np.ndarray | None, run: Run | None) -> Ite
     else:
         camera = case.capture.cameras[case.camera]
         chosen = positions[np.minimum(points.frames, len(positions) - 1)]
-        errors = point_errors(camera.intrinsics, camera.camera_to_world, chosen, marked, run.observations.surface_count)
+        view = camera.intrinsics, camera.camera_to_world, chosen, marked, run.observations.surface_count
+        errors = point_errors(*view)
+        distances = points_on_table(*view, 1.0 if run.observations.scenario.up == "+z" else -1.0)[1:]
+        if np.isfinite(distances).any():
+            yield {"part": "later", "metric": "points_table", "value": MM * float(np.nanmean(distances))}
     for part, own in (("last", errors[-1]), ("later", errors[1:])):
         found = own[np.isfinite(own)]
         if len(found):
@@ -94,17 +101,17 @@ def published_rows(case: Case) -> list[Row]:
         return []
     frames = range(1, min(case.capture.frame_count, published.frame_count))
     shift = [{"part": "0", "metric": f"shift_{axis}", "value": value} for axis, value in zip("xy", published.shift, strict=True)]
-    drawn = drawn_rows(case, ((frame, published.silhouette(frame)) for frame in case.drawn if frame < published.frame_count))
-    return [*shift, *drawn, *picture_rows(case, ((frame, published.picture(frame)) for frame in frames))]
+    own = labeled_rows(case, ((frame, published.silhouette(frame)) for frame in case.labeled if frame < published.frame_count))
+    return [*shift, *own, *picture_rows(case, ((frame, published.picture(frame)) for frame in frames))]
 
 
 def still_rows(case: Case) -> list[Row]:
     """Of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
     covered = case.labels(0) == OBJECT
     rgba = np.dstack([np.where(covered[..., None], case.color(0), 0), np.where(covered, 255, 0)]).astype(np.uint8)
-    drawn = drawn_rows(case, ((frame, covered) for frame in case.drawn))
+    own = labeled_rows(case, ((frame, covered) for frame in case.labeled))
     pictures = picture_rows(case, ((frame, rgba) for frame in range(1, case.capture.frame_count)))
-    return [*drawn, *pictures, *point_rows(case, None, None)]
+    return [*own, *pictures, *point_rows(case, None, None)]
 
 
 def run_rows(case: Case, run: Run) -> list[Row]:
@@ -112,7 +119,7 @@ def run_rows(case: Case, run: Run) -> list[Row]:
     positions = run.positions()
     if positions is None:
         return []
-    rows = list(drawn_rows(case, ((frame, covered) for frame, _, covered in run.pictures(case.capture, set(case.drawn)))))
+    rows = list(labeled_rows(case, ((frame, covered) for frame, _, covered in run.pictures(case.capture, set(case.labeled)))))
     if frames := run.stage("render", "frames"):
         table = pd.read_parquet(frames)
         rows += task_rows(case, table[table["camera"].astype(str) == case.camera])
@@ -120,27 +127,35 @@ def run_rows(case: Case, run: Run) -> list[Row]:
 
 
 class Scores:
-    """Tidy scores, and those of an earlier call by the key of what they are of."""
+    """Tidy scores, and those of an earlier call by the key of what they are of. `keep`: those that this call has not stay."""
 
-    def __init__(self, path: Path, *, force: bool) -> None:
-        self.path, self.rows = path, []
-        self._kept: dict[str, list[Row]] = {}
-        if path.is_file() and not force:
+    def __init__(self, path: Path, *, force: bool, keep: bool) -> None:
+        self.path, self.rows, self.keep = path, list[Row](), keep
+        self._earlier: dict[str, list[Row]] = {}
+        self._fresh: set[tuple[str, str, int]] = set()
+        self._force = force
+        if path.is_file():
             table = pd.read_csv(path, dtype={"part": str, "key": str})
-            self._kept = {str(key): part.to_dict("records") for key, part in table.groupby("key")}
+            self._earlier = {str(key): part.to_dict("records") for key, part in table.groupby("key", sort=False)}
 
     def add(self, case: str, method: str, seed: int, key: str, compute: Any) -> int:
         """Rows of one prediction, computed where they are not known; returns how many."""
         key = f"{case}/{method}/{seed}/{key}"
-        rows = self._kept.get(key)
+        rows = None if self._force else self._earlier.get(key)
         if rows is None:
             rows = [{"case": case, "method": method, "seed": seed, "key": key} | row for row in compute()]
         self.rows += rows
+        self._fresh.add((case, method, seed))
         return len(rows)
 
     @property
     def table(self) -> pd.DataFrame:
-        return pd.DataFrame(self.rows, columns=list(COLUMNS))
+        rows = list(self.rows)
+        for kept in self._earlier.values() if self.keep else ():
+            first = kept[0]
+            if (first["case"], first["method"], int(first["seed"])) not in self._fresh:
+                rows += kept
+        return pd.DataFrame(rows, columns=list(COLUMNS))
 
     def save(self) -> None:
         """So that an interrupted call loses little."""
@@ -158,12 +173,13 @@ def main() -> None:
     parser.add_argument("--strips", type=Path, help="folder of film strips")
     parser.add_argument("--strip-methods", nargs="*", default=["neuspring"])
     parser.add_argument("--force", action="store_true")
+    parser.add_argument("--keep", action="store_true", help="runs of an earlier call that RESULTS does not have stay in the tables")
     a = parser.parse_args()
     cases = cases_of(a.folder, a.captures, a.cases)
     runs = {case.name: runs_of(a.results, case.name, a.methods) for case in cases}
     if any(runs.values()) and a.cases is None:
         cases = [case for case in cases if runs[case.name]]
-    scores, notes = Scores(a.output / "scores.csv", force=a.force), []
+    scores, notes = Scores(a.output / "scores.csv", force=a.force, keep=a.keep), []
     for case in cases:
         stamp = digest_file(case.capture.folder / CAPTURE)[:16]
         if not scores.add(case.name, PHYSTWIN, 0, stamp, lambda case=case: published_rows(case)):
@@ -183,8 +199,11 @@ def main() -> None:
             print(write_strip(case, [chosen[name] for name in a.strip_methods if name in chosen], a.strips), flush=True)
         # Frames of a video are large.
         case.__dict__.pop("published", None)
-    used = [run for case in cases if case.name not in LEFT_OUT for run in runs[case.name]]
-    lines = [*tables(scores.table, notes), *cost_lines(a.results, used)]
+    spent = costs(a.results, [run for case in cases for run in runs[case.name]])
+    if a.keep and (a.output / COSTS).is_file():
+        spent = merged(spent, pd.read_csv(a.output / COSTS))
+    write_text(a.output / COSTS, spent.to_csv(index=False, float_format="%.3f"))
+    lines = [*tables(scores.table, notes), *cost_lines(spent)]
     write_text(a.output / "summary.md", "\n".join(lines) + "\n")
 
 

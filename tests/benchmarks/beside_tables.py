@@ -9,14 +9,19 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from neuspring.config.parse import read_yaml
 from neuspring.core.markdown import markdown
-from tests.benchmarks.beside_data import LEFT_OUT, PHYSTWIN, STILL
+from tests.benchmarks.beside_data import LEFT_OUT, METHODS, PHYSTWIN, STILL
 
 COLUMNS = ("case", "method", "seed", "part", "frame", "metric", "value", "key")
 PARTS = ("0", "1/3", "2/3", "last")
 """Places of the drawn frames in a film."""
 DASH = "–"
-DIGITS = {"iou": 3, "iou_drawn": 3, "psnr": 2, "ssim": 4}
+LABELED = {
+    "iou_drawn": "IoU with masks drawn by hand",
+    "iou_carried": "IoU with masks carried from marks, in cases without drawn ones",
+}
+DIGITS = {"iou": 3, "iou_drawn": 3, "iou_carried": 3, "psnr": 2, "ssim": 4}
 HEADINGS = {"iou": "IoU", "psnr": "PSNR [dB]", "ssim": "SSIM"}
 SHORT = {"reconstruction": "Recon.", "future": "Future"}
 COMPARED = {
@@ -76,7 +81,7 @@ def tables(table: pd.DataFrame, notes: Sequence[str]) -> list[str]:
         f"without {', '.join(LEFT_OUT)}; ±: standard deviation over seeds of the mean over cases. PSNR and SSIM are those of the",
         "render stage. PhysTwin's colors are of Gaussians seen by three cameras, in a video: its PSNR says less than its IoU.",
         "",
-        *_drawn(table),
+        *(line for metric in LABELED for line in _labeled(table, metric)),
         *_means(table),
         *_points(table),
         *_paired(table),
@@ -87,24 +92,26 @@ def tables(table: pd.DataFrame, notes: Sequence[str]) -> list[str]:
 
 
 def _methods(table: pd.DataFrame) -> list[str]:
-    """Names in the order of first appearance; PhysTwin and the still object last."""
-    names = list(dict.fromkeys(table["method"]))
+    """Names in the order of methods.yaml, others behind; PhysTwin and the still object last."""
+    order = list(read_yaml(METHODS)) if METHODS.is_file() else []
+    names = sorted(dict.fromkeys(table["method"]), key=lambda name: order.index(name) if name in order else len(order))
     return [name for name in names if name not in (PHYSTWIN, STILL)] + [name for name in (PHYSTWIN, STILL) if name in names]
 
 
-def _drawn(table: pd.DataFrame) -> list[str]:
-    drawn = table[table["metric"] == "iou_drawn"]
-    if not len(drawn):
+def _labeled(table: pd.DataFrame, metric: str) -> list[str]:
+    """IoU in the four labeled frames, with one kind of masks: means and cases."""
+    own_rows = table[table["metric"] == metric]
+    if not len(own_rows):
         return []
     rows = []
-    for method in _methods(drawn):
-        own = drawn[drawn["method"] == method]
-        cells = [cell(select(own, "iou_drawn", part), DIGITS["iou"]) for part in PARTS]
-        rows.append([method, str(mean_and_spread(select(own, "iou_drawn", PARTS[-1]))[2]), *cells])
-    lines = ["## IoU with drawn masks", "", *markdown(["method", "cases", *PARTS], rows), ""]
+    for method in _methods(own_rows):
+        own = own_rows[own_rows["method"] == method]
+        cells = [cell(select(own, metric, part), DIGITS[metric]) for part in PARTS]
+        rows.append([method, str(mean_and_spread(select(own, metric, PARTS[-1]))[2]), *cells])
+    lines = [f"## {LABELED[metric]}", "", *markdown(["method", "cases", *PARTS], rows), ""]
     rows = []
-    for (case, method), own in _by_case(drawn):
-        rows.append([case, method, *(cell(select(own, "iou_drawn", part, all_cases=True), DIGITS["iou"]) for part in PARTS[1:])])
+    for (case, method), own in _by_case(own_rows):
+        rows.append([case, method, *(cell(select(own, metric, part, all_cases=True), DIGITS[metric]) for part in PARTS[1:])])
     return [*lines, *markdown(["case", "method", *PARTS[1:]], rows), ""]
 
 
@@ -132,16 +139,20 @@ def _points(table: pd.DataFrame) -> list[str]:
         return []
     keys = [(part, name) for part in ("last", "later") for name in ("median", "mean")]
     titles = {"last": "last frame", "later": "all later frames"}
-    header, rows = [f"{name}, {titles[part]}" for part, name in keys], []
+    header, rows = [*(f"{name}, {titles[part]}" for part, name in keys), "on the table, mm"], []
     for method in _methods(points):
         own = points[points["method"] == method]
-        rows.append([f"mean of {own['case'].nunique()}", method, "", *(cell(select(own, f"points_{n}", p), 1) for p, n in keys)])
+        cells = [cell(select(own, f"points_{name}", part), 1) for part, name in keys]
+        rows.append([f"mean of {own['case'].nunique()}", method, "", *cells, ""])
     for (case, method), own in _by_case(points):
         counts = [f"{select(own, 'points_count', part, all_cases=True)['value'].max():.0f}" for part in ("last", "later")]
         cells = [cell(select(own, f"points_{name}", part, all_cases=True), 1) for part, name in keys]
-        rows.append([case, method, " / ".join(counts), *cells])
-    about = "Pixels; points marked surely in frame 0 and in the frame. PhysTwin's particles cannot be told apart in its video."
-    return ["## Points marked by hand", "", about, "", *markdown(["case", "method", "points", *header], rows), ""]
+        rows.append([case, method, " / ".join(counts), *cells, cell(select(own, "points_table", "later", all_cases=True), 1)])
+    about = [
+        "Pixels; points marked surely in frame 0 and in the frame. PhysTwin's particles cannot be told apart in its video.",
+        "On the table: points of flat things, in all later frames in which they touch it.",
+    ]
+    return ["## Points marked by hand", "", *about, "", *markdown(["case", "method", "points", *header], rows), ""]
 
 
 def _paired(table: pd.DataFrame) -> list[str]:

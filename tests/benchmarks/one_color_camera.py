@@ -40,6 +40,7 @@ def make(results: Path, out: Path) -> None:
     """Captures of all arms, and the table of scenarios."""
     rows = ["scenario\tsource\tcategory\tpath\tself_collision\tground"]
     known = read_scenarios(Path("config/scenarios.tsv"))
+    out.mkdir(parents=True, exist_ok=True)
     for folder in sorted(path.parent for path in results.glob("*/capture/capture.json")):
         capture, scene = Capture.load(folder), folder.parent.name
         for arm in ARMS:

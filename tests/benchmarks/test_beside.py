@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from neuspring.data.capture import HANDS, OBJECT
-from tests.benchmarks.beside_cost import GROUPS, costs, minutes_by_job
+from tests.benchmarks.beside_cost import GROUPS, cost_lines, costs, merged, minutes_by_job
 from tests.benchmarks.beside_data import LEFT_OUT, PHYSTWIN, STILL, Published, Run, fitted_shift, iou_without_hands, shifted
+from tests.benchmarks.beside_phystwin import Scores, labeled_rows
 from tests.benchmarks.beside_strips import WHITE, frames_shown, layout, over_white, surroundings
 from tests.benchmarks.beside_tables import COLUMNS, cell, differences, mean_and_spread, tables
 
@@ -112,6 +114,34 @@ def test_tables_leave_cases_out_of_means_and_put_methods_first():
     assert "Paired differences" in "\n".join(tables(table(*rows), []))
 
 
+@pytest.mark.parametrize("keep", [False, True])
+def test_runs_of_another_machine_stay_if_they_are_to_be_kept(tmp_path, keep):
+    def scores(keep: bool) -> Scores:
+        return Scores(tmp_path / "scores.csv", force=False, keep=keep)
+
+    def rows(value: float):
+        return lambda: [{"part": "future", "metric": "iou", "value": value}]
+
+    first = scores(False)
+    first.add("a", "m", 0, "old", rows(0.5))
+    first.add("a", "m", 1, "same", rows(0.6))
+    first.add("b", "m", 0, "there", rows(0.7))
+    first.save()
+    second = scores(keep)
+    second.add("a", "m", 0, "new", rows(0.9))
+    second.add("a", "m", 1, "same", rows(99.0))
+    found = second.table.set_index(["case", "seed"])["value"].to_dict()
+    assert found == {("a", 0): 0.9, ("a", 1): 0.6} | ({("b", 0): 0.7} if keep else {})
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_cases_without_drawn_masks_are_compared_with_carried_ones(drawn):
+    labels = np.where(block(slice(10, 20), slice(10, 20)), OBJECT, 0).astype(np.uint8)
+    case = SimpleNamespace(drawn={0: labels} if drawn else {}, labeled=dict.fromkeys((0, 3, 6, 9), labels))
+    rows = list(labeled_rows(case, [(9, block(slice(10, 20), slice(10, 15)))]))
+    assert [(row["part"], row["metric"], row["value"]) for row in rows] == [("last", "iou_drawn" if drawn else "iou_carried", 0.5)]
+
+
 def test_no_scores_make_no_tables():
     assert not any(line.startswith("|") for line in tables(table(), []))
 
@@ -169,3 +199,15 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
     assert "fit/s/n/0" not in minutes_by_job(tmp_path)
     found = costs(tmp_path, [Run(tmp_path / "s" / "m" / "0")]).set_index("group")["minutes"].to_dict()
     assert found == dict(zip(GROUPS, (1.0, 3.0, 5.0, 5.5, 0.5), strict=True))
+
+
+def test_costs_of_two_machines_are_one_table():
+    def cost(*rows: tuple) -> pd.DataFrame:
+        return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
+
+    earlier = cost(("s", "neuspring", 0, "search", 50.0), ("s", "neuspring", 1, "search", 3.0))
+    both = merged(cost(("s", "neuspring", 0, "search", 1.0)), earlier)
+    assert sorted(both["minutes"]) == [1.0, 3.0]
+    line = next(line for line in cost_lines(both) if line.startswith("| s "))
+    assert [cell.strip() for cell in line.split("|")[2:-1]][:3] == ["2", "–", "2.0"]
+    assert cost_lines(cost()) == []
