@@ -3,10 +3,12 @@
     python -m tests.benchmarks.one_color_camera make CAPTURES OUT       # captures of one camera, with and without depth
     python -m tests.benchmarks.one_color_camera table OUT RESULTS --output TABLES
 
-CAPTURES is a folder of results of config/data/synthetic.yaml, whose scenarios have <scenario>/capture and its truth. OUT gets, per
-scene, SCENE_three (a link to the capture), SCENE_one and SCENE_color, and scenarios.tsv, for a run with
+CAPTURES is a folder of results of config/data/synthetic.yaml (`--until synthesise` is enough), whose scenarios have
+<scenario>/capture and its truth. OUT gets, per scene, SCENE_three (a link to the capture), SCENE_one and SCENE_color, and
+scenarios.tsv, for a run with
 
-    --configfile config/data/color.yaml --config data_root=OUT scenario_table=OUT/scenarios.tsv 'scenarios=[...]'
+    --configfile config/data/color.yaml config/studies/one_color_camera.yaml \
+    --config data_root=OUT scenario_table=OUT/scenarios.tsv scenarios="[$(tail -n +2 OUT/scenarios.tsv | cut -f1 | paste -sd,)]"
 
 TABLES/errors.csv has every number, TABLES/summary.md the tables: hands against the truth, the shape in frame 0 against the true
 surface, track errors of predictions in 3D.
