@@ -1,4 +1,4 @@
-"""What one color camera costs, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
+r"""What one color camera costs, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
 
     python -m tests.benchmarks.one_color_camera make CAPTURES OUT       # captures of one camera, with and without depth
     python -m tests.benchmarks.one_color_camera table OUT RESULTS --output TABLES
