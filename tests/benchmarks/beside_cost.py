@@ -1,6 +1,7 @@
 """Processor time of runs of the workflow, by groups of stages, from the records of jobs.
 
-Of a job, only the last successful attempt counts. A launch of several fits (rule `fits`, for accelerators) is in no run's cost.
+Of a job, only the last successful attempt counts. Of a launch of several fits (rule `fits`) each has the share that its record says,
+in seconds that passed.
 """
 
 from __future__ import annotations
@@ -71,6 +72,12 @@ def jobs_of_run(run: Run, known: Mapping[str, Path]) -> set[str]:
     return jobs
 
 
+def together(path: Path) -> float:
+    """Minutes of a fit that ran together with others, its share of the launch; 0 of one that ran alone."""
+    record = StageRecord.load(path) if path.is_file() else None
+    return record.seconds / 60 if record and record.facts.get("epochs_together") else 0.0
+
+
 def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
     """Processor minutes of every run: columns scenario, method, seed, group, minutes. What runs share counts in each of them."""
     minutes, rows = minutes_by_job(results), []
@@ -84,7 +91,8 @@ def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
             rows.append(identity | {"group": "perception", "minutes": perception})
             for group in (group for group in GROUPS if group != "perception"):
                 total = sum(value for name, value in seen.items() if name in own and group_of(_rule(name)) == group)
-                rows.append(identity | {"group": group, "minutes": total})
+                shared = together(run.folder / "fit.json") if group == "fit" else 0.0
+                rows.append(identity | {"group": group, "minutes": max(total, shared)})
     return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
 
 

@@ -178,8 +178,9 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
         ]
         write(tmp_path / "jobs" / f"{name}.json", {"rule": name.split("/")[0], "name": name, "log": "x", "attempts": made})
 
-    def record(place: str, **inputs: str) -> str:
-        write(tmp_path / "s" / f"{place}.json", {"stage": place.rsplit("/", 1)[1], "status": "ok", "inputs": inputs})
+    def record(place: str, more: dict | None = None, **inputs: str) -> str:
+        values = {"stage": place.rsplit("/", 1)[1], "status": "ok", "inputs": inputs} | (more or {})
+        write(tmp_path / "s" / f"{place}.json", values)
         return digest_file(tmp_path / "s" / f"{place}.json")
 
     search, splats = record("search-uniform/0/search"), record("appearance/0/appearance")
@@ -199,6 +200,11 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
     assert "fit/s/n/0" not in minutes_by_job(tmp_path)
     found = costs(tmp_path, [Run(tmp_path / "s" / "m" / "0")]).set_index("group")["minutes"].to_dict()
     assert found == dict(zip(GROUPS, (1.0, 3.0, 5.0, 5.5, 0.5), strict=True))
+    # Of a launch of several fits, the fit's record has its share.
+    fit = record("o/0/fit", {"seconds": 480.0, "facts": {"epochs_together": 20}}, search=search)
+    record("o/0/rollout", fit=fit)
+    job("fit/s/o/0", ("ok", 0.1))
+    assert costs(tmp_path, [Run(tmp_path / "s" / "o" / "0")]).set_index("group")["minutes"]["fit"] == 8
 
 
 def test_costs_of_two_machines_are_one_table():
