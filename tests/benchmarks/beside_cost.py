@@ -1,7 +1,7 @@
 """Processor time of runs of the workflow, by groups of stages, from the records of jobs.
 
-Of a job, only the last successful attempt counts. Of a launch of several fits (rule `fits`) each has the share that its record says,
-in seconds that passed.
+Of a job, only the last successful attempt counts. Of a launch of several fits (rule `fits`) each has the share that its record
+says, in time that passed.
 """
 
 from __future__ import annotations
