@@ -213,6 +213,8 @@ class ColorSettings(Section):
     """What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
     grip_reach: Positive = 0.02
     """Distance from the object, m at the object, up to which pixels of a hand hold it in frame 0."""
+    grip_length: Positive = 0.04
+    """Distance from a hand's tip, its pixel farthest along the arm, up to which its pixels hold a sheet, m at the object."""
     hands_apart: Positive = 0.04
     """Distance between the grips of different hands, m at the object."""
     hand_radius: Positive = 0.08

@@ -45,7 +45,10 @@ def lift_color(
     points[0] = first.points(places)
     known = np.zeros((frames, len(places)), bool)
     known[0] = True
-    held = grips(labels[0], first.filled, settings.grip_reach / first.pixel_size, settings.hands_apart / first.pixel_size)
+    # A hand above a sheet hides more of it than its fingers hold.
+    length = settings.grip_length if first.kind == "flat" else np.inf
+    sizes = (settings.grip_reach, settings.hands_apart, length)
+    held = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
     if not held:
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", "Mark the hands in frame 0.")
     motion = follow_hands(capture, name, labels, held, settings.hand_radius / first.pixel_size)

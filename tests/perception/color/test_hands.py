@@ -7,8 +7,10 @@ import pytest
 from neuspring.config import Config
 from neuspring.config.perception import ColorSettings
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.color.evidence import silhouettes
-from neuspring.perception.color.hands import follow_hands, grips
+from neuspring.perception.color.evidence import lift_color, silhouettes
+from neuspring.perception.color.first_frame import FirstFrame
+from neuspring.perception.color.hands import along_arms, follow_hands, grips
+from neuspring.perception.results import PixelTracks
 from neuspring.stages import lift, segment, track
 from tests.support.colored import paint
 
@@ -88,6 +90,50 @@ def test_two_hands_are_told_apart_and_specks_are_none():
     (nearest,) = grips(far, far == OBJECT, reach=8, apart=20)
     assert nearest[:, 1].min() >= 36
     assert not grips(np.where(labels == OBJECT, OBJECT, 0), labels == OBJECT, 8, 20)
+
+
+def test_fingers_above_a_sheet_hold_it_and_not_all_that_the_hand_hides():
+    labels = np.zeros((SIZE, SIZE), np.uint8)
+    labels[60:200, 20:220] = OBJECT
+    # An arm that enters from the left and turns down: its tip is the pixel farthest along it, not the one farthest from its entry.
+    labels[80:100, :150], labels[100:150, 130:150] = HANDS, HANDS
+    (all_of_it,) = grips(labels, labels == OBJECT, reach=8, apart=20)
+    (held,) = grips(labels, labels == OBJECT, reach=8, apart=20, length=25)
+    assert np.ptp(all_of_it, axis=0).min() > 60
+    assert held[:, 1].max() == 149
+    assert np.ptp(held[:, 1]) <= 25
+    assert held[:, 0].min() >= 130
+    assert {tuple(pixel) for pixel in held} < {tuple(pixel) for pixel in all_of_it}
+    # Where no arm enters the image, nothing says where its tip is.
+    labels[:, :40] = 0
+    assert len(grips(labels, labels == OBJECT, 8, 20, length=25)[0]) == len(grips(labels, labels == OBJECT, 8, 20)[0])
+
+
+def test_the_way_along_an_arm_is_within_its_mask():
+    arm = np.zeros((40, 60), bool)
+    arm[10:14, :50], arm[10:36, 46:50] = True, True
+    along = along_arms(arm)
+    assert along[11, 0] == 0
+    assert along[11, 40] == pytest.approx(40, abs=1)
+    # Around the corner: 46 to the right and 25 down, corners cut by diagonals.
+    assert 60 < along[35, 49] < 49 + 25
+    assert not along[~arm].any()
+
+
+@pytest.mark.parametrize(("category", "fingers"), [("cloth", True), ("toy", False)])
+def test_sheets_alone_are_held_by_fingers_alone(tmp_path, category, fingers):
+    capture = paint(tmp_path, category=category, frames=3)
+    labels = np.stack([capture.mask("0", frame) for frame in range(3)])
+    y, x = np.nonzero(labels[0] == HANDS)
+    # The painted hand gets an arm.
+    labels[0, : y.max(), x.min() : x.max()] = HANDS
+    first = FirstFrame.of(capture, labels[0], ColorSettings())
+    y, x = np.nonzero(labels[0] == OBJECT)
+    pixels = np.repeat(np.stack([x, y], axis=1)[None, ::50].astype(np.float32), 3, axis=0)
+    tracks = PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="test")
+    settings = ColorSettings(grip_length=3 * first.pixel_size)
+    _, image = lift_color(capture, labels, tracks, first, settings, 30)
+    assert (len(image.hand_of) < 30) == fingers
 
 
 def test_silhouettes_of_frames():
