@@ -155,7 +155,8 @@ class Scores:
             first = kept[0]
             if (first["case"], first["method"], int(first["seed"])) not in self._fresh:
                 rows += kept
-        return pd.DataFrame(rows, columns=list(COLUMNS))
+        # By case, so that a table is the same whichever runs were added last.
+        return pd.DataFrame(rows, columns=list(COLUMNS)).sort_values("case", kind="stable", ignore_index=True)
 
     def save(self) -> None:
         """So that an interrupted call loses little."""
