@@ -105,7 +105,7 @@ def merged(costs: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def cost_lines(table: pd.DataFrame) -> list[str]:
-    """Tables of processor minutes of one run, mean over its seeds: by method, and of the method last in the table by scenario."""
+    """Tables of processor minutes of one run, mean over its seeds: by method, and of COSTED by scenario, or of the last method."""
     if not len(table):
         return []
     lines = ["", "## Cost: processor minutes of one run", ""]
