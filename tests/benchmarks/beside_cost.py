@@ -16,6 +16,7 @@ from neuspring.core.job_records import read_jobs
 from neuspring.core.markdown import markdown
 from neuspring.core.records import StageRecord, digest_file
 from tests.benchmarks.beside_data import Run
+from tests.benchmarks.beside_tables import in_order
 
 GROUPS = {
     "perception": ("capture", "segment", "track", "lift", "judge", "observe"),
@@ -97,11 +98,13 @@ def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def merged(costs: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
-    """Costs, and those of an earlier call of runs that these do not have."""
+    """Costs, and those of an earlier call of runs that these do not have; by scenario, and methods in the order of methods.yaml."""
     names = ["scenario", "method", "seed"]
     there = set(costs[names].itertuples(index=False, name=None))
     rest = [row not in there for row in earlier[names].itertuples(index=False, name=None)]
-    return pd.concat([costs, earlier[rest]], ignore_index=True)
+    both = pd.concat([costs, earlier[rest]], ignore_index=True)
+    order = in_order(both["method"])
+    return both.sort_values(names, key=lambda column: column.map(order.index) if column.name == "method" else column, kind="stable")
 
 
 def cost_lines(table: pd.DataFrame) -> list[str]:

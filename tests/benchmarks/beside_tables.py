@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -91,10 +91,10 @@ def tables(table: pd.DataFrame, notes: Sequence[str]) -> list[str]:
     return lines
 
 
-def _methods(table: pd.DataFrame) -> list[str]:
+def in_order(methods: Iterable[str]) -> list[str]:
     """Names in the order of methods.yaml, others behind; PhysTwin and the still object last."""
     order = list(read_yaml(METHODS)) if METHODS.is_file() else []
-    names = sorted(dict.fromkeys(table["method"]), key=lambda name: order.index(name) if name in order else len(order))
+    names = sorted(dict.fromkeys(methods), key=lambda name: order.index(name) if name in order else len(order))
     return [name for name in names if name not in (PHYSTWIN, STILL)] + [name for name in (PHYSTWIN, STILL) if name in names]
 
 
@@ -104,7 +104,7 @@ def _labeled(table: pd.DataFrame, metric: str) -> list[str]:
     if not len(own_rows):
         return []
     rows = []
-    for method in _methods(own_rows):
+    for method in in_order(own_rows["method"]):
         own = own_rows[own_rows["method"] == method]
         cells = [cell(select(own, metric, part), DIGITS[metric]) for part in PARTS]
         rows.append([method, str(mean_and_spread(select(own, metric, PARTS[-1]))[2]), *cells])
@@ -121,7 +121,7 @@ def _means(table: pd.DataFrame) -> list[str]:
     if not len(own_rows):
         return []
     header, rows = [f"{SHORT[part]} {HEADINGS[metric]}" for part, metric in keys], []
-    for method in _methods(own_rows):
+    for method in in_order(own_rows["method"]):
         own = own_rows[own_rows["method"] == method]
         cells = [cell(select(own, metric, part), DIGITS[metric]) for part, metric in keys]
         rows.append([method, str(mean_and_spread(select(own, "iou", "future"))[2]), *cells])
@@ -140,7 +140,7 @@ def _points(table: pd.DataFrame) -> list[str]:
     keys = [(part, name) for part in ("last", "later") for name in ("median", "mean")]
     titles = {"last": "last frame", "later": "all later frames"}
     header, rows = [*(f"{name}, {titles[part]}" for part, name in keys), "on the table, mm"], []
-    for method in _methods(points):
+    for method in in_order(points["method"]):
         own = points[points["method"] == method]
         cells = [cell(select(own, f"points_{name}", part), 1) for part, name in keys]
         rows.append([f"mean of {own['case'].nunique()}", method, "", *cells, ""])
@@ -159,7 +159,7 @@ def _paired(table: pd.DataFrame) -> list[str]:
     rows = []
     for (part, metric), title in COMPARED.items():
         own, digits = select(table, metric, part), DIGITS[metric]
-        names = _methods(own)
+        names = in_order(own["method"])
         pairs = [(name, PHYSTWIN) for name in names if name != PHYSTWIN]
         pairs += [pair[::-1] for pair in combinations([name for name in names if name not in (PHYSTWIN, STILL)], 2)]
         for first, second in pairs:
@@ -177,7 +177,7 @@ def _paired(table: pd.DataFrame) -> list[str]:
 
 def _by_case(rows: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:
     """((case, method), rows), cases in their order, methods in that of tables."""
-    pairs = [(case, method) for case in dict.fromkeys(rows["case"]) for method in _methods(rows)]
+    pairs = [(case, method) for case in dict.fromkeys(rows["case"]) for method in in_order(rows["method"])]
     found = [(pair, rows[(rows["case"] == pair[0]) & (rows["method"] == pair[1])]) for pair in pairs]
     return [(pair, own) for pair, own in found if len(own)]
 

@@ -211,9 +211,9 @@ def test_costs_of_two_machines_are_one_table():
     def cost(*rows: tuple) -> pd.DataFrame:
         return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
 
-    earlier = cost(("s", "neuspring", 0, "search", 50.0), ("s", "neuspring", 1, "search", 3.0))
+    earlier = cost(("s", "neuspring", 0, "search", 50.0), ("s", "neuspring", 1, "search", 3.0), ("s", "static", 0, "search", 0.0))
     both = merged(cost(("s", "neuspring", 0, "search", 1.0)), earlier)
-    assert sorted(both["minutes"]) == [1.0, 3.0]
+    assert both[["method", "minutes"]].to_numpy().tolist() == [["static", 0.0], ["neuspring", 1.0], ["neuspring", 3.0]]
     line = next(line for line in cost_lines(both) if line.startswith("| s "))
     assert [cell.strip() for cell in line.split("|")[2:-1]][:3] == ["2", "–", "2.0"]
     assert cost_lines(cost()) == []
