@@ -20,8 +20,11 @@ from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.core.markdown import markdown
 from neuspring.core.run_record import RunRecord
 from neuspring.data.capture import Camera
+from tests.benchmarks.beside_tables import DASH, differences
 
 STUDY = Path(__file__).parents[2] / "config" / "studies" / "footage_parts.yaml"
+WHOLE = "search_only"
+"""The row that others are compared with."""
 COLUMNS = {"iou": "IoU, training frames", "points": "tracked points, px, median", "future": "IoU, future frames"}
 
 
@@ -53,7 +56,11 @@ def read_run(results: Path, scenario: str, method: str, seed: str) -> dict[str, 
 
 
 def summary(runs: pd.DataFrame) -> str:
-    """Markdown: means over scenarios, and over seeds within them; ± is the standard deviation over seeds."""
+    """Markdown: means over scenarios, and over seeds within them; ± is the standard deviation over seeds.
+
+    The last column is the training frames' IoU less that of WHOLE, paired by scenario, with its 95 % t interval over scenarios.
+    """
+    compared = runs.rename(columns={"scenario": "case", "iou": "value"})
     rows = []
     for method, own in runs.groupby("method", sort=False):
         cells = [str(method), str(own["scenario"].nunique())]
@@ -62,8 +69,10 @@ def summary(runs: pd.DataFrame) -> str:
             digits = 1 if column == "points" else 3
             spread = f" ± {by_seed.std(ddof=1):.{digits}f}" if len(by_seed) > 1 else ""
             cells.append(f"{own.groupby('scenario')[column].mean().mean():.{digits}f}{spread}")
+        found = differences(compared, str(method), WHOLE) if method != WHOLE else None
+        cells.append("{:+.3f} [{:+.3f}, {:+.3f}]".format(*found) if found and found[-1] > 1 else DASH)
         rows.append(cells)
-    return "\n".join(markdown(["row", "scenes", *COLUMNS.values()], rows)) + "\n"
+    return "\n".join(markdown(["row", "scenes", *COLUMNS.values(), f"IoU, training frames, less {WHOLE}"], rows)) + "\n"
 
 
 def main() -> None:

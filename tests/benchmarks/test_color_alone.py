@@ -58,3 +58,8 @@ def test_tables_average_over_scenes():
         columns=["scenario", "method", "seed", "status", "iou", "future", "points"],
     )
     assert "0.550 ± 0.071" in parts_summary(runs)
+    # Paired by scenario: better by 0.1 and 0.3, whose 95 % t interval is 0.2 ± 12.706 · 0.1.
+    pairs = [("a", "search_only", 0.4), ("b", "search_only", 0.6), ("a", "m", 0.5), ("b", "m", 0.9)]
+    runs = pd.DataFrame([(case, name, 0, "ok", iou, 0.3, 2.0) for case, name, iou in pairs], columns=runs.columns)
+    assert "+0.200 [-1.071, +1.471]" in parts_summary(runs)
+    assert "[" not in parts_summary(runs[runs["scenario"] == "a"])
