@@ -80,7 +80,7 @@ def spoiled(answer):
     [
         ("simulator", "_frames"),
         ("simulator", "_frame_gradient"),
-        ("rasteriser", "_picture"),
+        ("rasterizer", "_picture"),
         ("skinning", "_carried"),
         ("spring_gaus", "roll_out_anchors"),
         ("spring_gaus", "_anchor_gradients"),

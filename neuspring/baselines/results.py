@@ -44,7 +44,7 @@ class Prediction:
     """Of the structure points, in the order of `Observations.nodes`."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
-    centres: np.ndarray | None = None
+    centers: np.ndarray | None = None
     """[F, G, 3] m: centers of the model's own splats in every frame. None: it has none, and the platform's splats are skinned to
     the trajectory."""
 

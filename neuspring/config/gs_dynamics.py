@@ -23,7 +23,7 @@ class GsDynamics(Section):
     take rope, cloth and package take cloth, all others take animals."""
     radius: Positive | None = None
     """Distance below which nodes feel each other, m. rope 0.08, animals 0.08, cloth 0.075."""
-    neighbours: Count | None = None
+    neighbors: Count | None = None
     """Number k of nearest particles that a particle feels, itself included. rope 5, animals 6, cloth 6."""
     particles: Count | None = None
     """Largest number of particles of a graph. rope 100, animals 100, cloth 150."""

@@ -53,7 +53,7 @@ class Appearance(Section):
     """Learning rate of means after `position_steps`, per extent; log-linear between."""
     position_steps: Count = 30_000
     """Steps over which the learning rate of means falls to `position_rate_end`."""
-    colour_rate: Positive = 2.5e-3
+    color_rate: Positive = 2.5e-3
     """Learning rate of the first harmonic; that of the others is a twentieth."""
     opacity_rate: Positive = 0.025
     """Learning rate of opacity logits."""

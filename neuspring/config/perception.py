@@ -116,11 +116,11 @@ class Lift(Section):
     """Side of the window, pixels, whose median depth inside the mask a track gets; 1: as released."""
     whole_pixels: bool = False
     """Lift the nearest whole pixel of a track, as released."""
-    neighbourhood: Positive = 0.01
+    neighborhood: Positive = 0.01
     """Distance, m, within which masks and motions look for neighbors."""
-    outlier_neighbours: NonNegative = 40.0
+    outlier_neighbors: NonNegative = 40.0
     """Number of neighbors that a masked pixel must exceed, at a focal length of 430 pixels."""
-    least_neighbours: Count = 5
+    least_neighbors: Count = 5
     """Smallest number of neighbors of a motion that is trusted, itself included."""
     agreement: Positive = 0.005
     """Distance, m, within which at least half of a motion's neighbors must move alike."""

@@ -17,7 +17,7 @@ EXTRA = ("drag_quadratic", "bending")
 """Variables beyond the released ones."""
 HANDS = ("hand_tilt", "hand_size", "hand_depth")
 """Variables of how far hands are from a camera without depth; of captures with depth there are none."""
-TOPOLOGY = ("object_radius", "object_neighbours", "controller_radius", "controller_neighbours")
+TOPOLOGY = ("object_radius", "object_neighbors", "controller_radius", "controller_neighbors")
 """Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
 
@@ -29,12 +29,12 @@ class SearchRanges(Section):
     """Stiffness Y of the springs, N."""
     object_radius: Range = (1.2, 5.0)
     """Radius within which object nodes are joined, in units of `lengths`."""
-    object_neighbours: Range = (10, 50)
+    object_neighbors: Range = (10, 50)
     """Most neighbors of an object node, itself included."""
     controller_radius: Range = (0.5, 5.0)
     """Radius within which a controller is joined to object nodes, m; with `lengths: spacing` how far it goes beyond the smallest
     distance between a controller and a node, in spacings."""
-    controller_neighbours: Range = (10, 80)
+    controller_neighbors: Range = (10, 80)
     """Most object nodes that a controller is joined to."""
     ground_elasticity: Range = (0.0, 1.0)
     """Restitution on the ground."""
@@ -67,7 +67,7 @@ class SearchRanges(Section):
             if not (0 <= low < high or (spec.name == "hand_tilt" and -90 < low < high)):
                 raise ValueError(f"{spec.name}: 0 <= low < high is required, received [{low}, {high}]")
         # An object node counts itself among its neighbors.
-        for name, least in (("object_neighbours", 2), ("controller_neighbours", 1)):
+        for name, least in (("object_neighbors", 2), ("controller_neighbors", 1)):
             if getattr(self, name)[0] < least:
                 raise ValueError(f"{name}: at least {least} is required, received {getattr(self, name)[0]}")
         if self.contact_distance[0] <= 0:
@@ -82,11 +82,11 @@ class SearchScales(Section):
     """Stiffness Y of the springs."""
     object_radius: Scale = "linear"
     """Radius within which object nodes are joined."""
-    object_neighbours: Scale = "linear"
+    object_neighbors: Scale = "linear"
     """Most neighbors of an object node."""
     controller_radius: Scale = "linear"
     """Radius within which a controller is joined to object nodes."""
-    controller_neighbours: Scale = "linear"
+    controller_neighbors: Scale = "linear"
     """Most object nodes that a controller is joined to."""
     ground_elasticity: Scale = "linear"
     """Restitution on the ground."""
@@ -122,11 +122,11 @@ class SearchStart(Section):
     """Stiffness Y of the springs, N."""
     object_radius: float = 2.5
     """Radius within which object nodes are joined."""
-    object_neighbours: float = 30
+    object_neighbors: float = 30
     """Most neighbors of an object node, itself included."""
     controller_radius: float = 2.0
     """Radius within which a controller is joined to object nodes."""
-    controller_neighbours: float = 50
+    controller_neighbors: float = 50
     """Most object nodes that a controller is joined to."""
     ground_elasticity: float = 0.5
     """Restitution on the ground."""
@@ -200,8 +200,8 @@ class Search(Section):
     candidate."""
     freed_sigma: Positive = 0.06
     """Step in normalized variables after `tied_rollouts`, when each region becomes free."""
-    isolated_nodes: Literal["repair", "penalise", "allow"] = "repair"
-    """Nodes without any spring. repair: join them to their 3 nearest nodes. penalise: refuse the candidate. allow: leave them, as
+    isolated_nodes: Literal["repair", "penalize", "allow"] = "repair"
+    """Nodes without any spring. repair: join them to their 3 nearest nodes. penalize: refuse the candidate. allow: leave them, as
     released."""
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `ranges` and `start`. spacing: the distance between

@@ -19,9 +19,9 @@ class SpringGaus(Section):
     from the structure points; this needs no images."""
     anchors: Count = 1024
     """Number N of anchors, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are too few cells."""
-    neighbours: Count = 20
+    neighbors: Count = 20
     """Number K of nearest anchors that an anchor feels."""
-    full_neighbours: Count = 16
+    full_neighbors: Count = 16
     """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
     bound_anchors: Count = 16
     """Number of nearest anchors that a splat or a structure point follows."""
@@ -83,7 +83,7 @@ class SpringGaus(Section):
     """Iterations between checkpoints from which a killed job continues."""
 
     def __post_init__(self) -> None:
-        if self.full_neighbours > self.neighbours:
-            raise ValueError(f"full_neighbours: at most neighbours ({self.neighbours}), received {self.full_neighbours}")
+        if self.full_neighbors > self.neighbors:
+            raise ValueError(f"full_neighbors: at most neighbors ({self.neighbors}), received {self.full_neighbors}")
         if self.max_substeps < self.substeps:
             raise ValueError(f"max_substeps: at least substeps ({self.substeps}), received {self.max_substeps}")

@@ -1,7 +1,7 @@
 """The nouns that cross a rule boundary: frozen, validated dataclasses, each saved to one file.
 
 Every array is declared with its shape, dtype and unit (`array(...)`). Symbolic dimensions (T frames, N nodes, S springs,
-...) must agree within one artefact. Files are `.npz` without pickle: the arrays, plus one JSON text under `meta` that
+...) must agree within one artifact. Files are `.npz` without pickle: the arrays, plus one JSON text under `meta` that
 holds the kind, the format version and the plain fields. Writes go to a temporary file that is renamed when complete, so
 a killed job never leaves a half file that looks whole.
 """
@@ -49,7 +49,7 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, op
 
 @dataclass(frozen=True, kw_only=True)
 class Artifact:
-    """Base of all artefacts: validation against the declaration, `save` and `load`."""
+    """Base of all artifacts: validation against the declaration, `save` and `load`."""
 
     kind: ClassVar[str] = "artifact"
 
@@ -90,7 +90,7 @@ class Artifact:
         """Raise InputError if fields contradict each other."""
 
     def save(self, path: Path) -> None:
-        """Write this artefact to `path` (.npz) atomically."""
+        """Write this artifact to `path` (.npz) atomically."""
         arrays: dict[str, np.ndarray] = {}
         plain = self._flatten(arrays, "")
         meta = {"kind": self.kind, "format": FORMAT_VERSION, "fields": plain}
@@ -116,7 +116,7 @@ class Artifact:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read an artefact of this kind from `path`. Raises InputError if the file is missing, damaged or of another kind."""
+        """Read an artifact of this kind from `path`. Raises InputError if the file is missing, damaged or of another kind."""
         path = Path(path)
         if not path.is_file():
             raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that makes it first.")
@@ -309,7 +309,7 @@ class Observations(Artifact):
 
     @property
     def nodes(self) -> np.ndarray:
-        """Nodes of frame 0 [N, 3], metres."""
+        """Nodes of frame 0 [N, 3], meters."""
         return np.concatenate([self.object_points[0], self.surface_points, self.interior_points])
 
     @property
@@ -532,8 +532,8 @@ class Trajectory(Artifact):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatCentres(Artifact):
+class SplatCenters(Artifact):
     """Where a method's own model puts its splats; their other properties are those of frame 0."""
 
-    kind: ClassVar[str] = "splat_centres"
-    positions: np.ndarray = array("F,G,3", np.float32, "m", "centre of each splat at the end of each frame")
+    kind: ClassVar[str] = "splat_centers"
+    positions: np.ndarray = array("F,G,3", np.float32, "m", "center of each splat at the end of each frame")

@@ -29,7 +29,7 @@ _loaded: set[tuple[int, str]] = set()
 
 @functools.cache
 def start_warp() -> None:
-    """Initialise Warp once, quietly: kernels here carry their own adjoints."""
+    """Initialize Warp once, quietly: kernels here carry their own adjoints."""
     wp.config.enable_backward = False
     quiet()
     with _without_driver_warning():

@@ -63,7 +63,7 @@ class Attempt:
     """Resident memory of all its processes, MiB."""
     peak_gpu_memory_mb: float | None = None
     """Memory in use on its GPUs, MiB; None where it cannot be read."""
-    gpu_utilisation: float | None = None
+    gpu_utilization: float | None = None
     """Mean over time and GPUs, %."""
     cpu_seconds: float = 0.0
     samples: list[list[float | None]] = field(default_factory=list)

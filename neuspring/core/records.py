@@ -1,4 +1,4 @@
-"""Stage and run records: small JSON files that say what a step did, beside the artefacts they name.
+"""Stage and run records: small JSON files that say what a step did, beside the artifacts they name.
 
 A stage record is the declared output of a workflow rule. It is written last, so its presence means that the files it names
 are complete. A numerical failure is a record too (`status: failed` with its reason); later stages pass it on.

@@ -186,7 +186,7 @@ class Capture:
         ending = self.description.depth_format if what == "depth" else "png"
         return self.folder / what / camera / f"{frame:05d}.{ending}"
 
-    def colour(self, camera: str, frame: int) -> np.ndarray:
+    def color(self, camera: str, frame: int) -> np.ndarray:
         """RGB [H, W, 3] uint8. Raises InputError."""
         return self._image("color", camera, frame, cv2.IMREAD_COLOR)[..., ::-1]
 
@@ -258,9 +258,9 @@ class Writer:
         for name in (CAPTURE, TRACKS, POINTS):
             (self.capture.folder / name).unlink(missing_ok=True)
 
-    def frame(self, camera: str, frame: int, colour: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
+    def frame(self, camera: str, frame: int, color: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
         """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
-        _write_png(self.capture.path("color", camera, frame), colour[..., ::-1])
+        _write_png(self.capture.path("color", camera, frame), color[..., ::-1])
         path = self.capture.path("depth", camera, frame)
         if depth is None:
             assert not self.capture.has_depth, "depth was measured"

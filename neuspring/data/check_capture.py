@@ -80,7 +80,7 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
         if not capture.has(name, frame):
             continue
         try:
-            capture.colour(name, frame)
+            capture.color(name, frame)
             depth = capture.depth(name, frame)
             if capture.has_depth:
                 depths.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)

@@ -70,7 +70,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     if settings.grip == "clamp":
         # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
         recorded = np.asarray(raw)[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
-        normals = _transported_normals(centreline(markers[0], settings.spacing, settings.rings)[1])[[0, -1]]
+        normals = _transported_normals(centerline(markers[0], settings.spacing, settings.rings)[1])[[0, -1]]
         turning = clamps(recorded, normals, settings.radius, settings.ring, MIN_DISTANCE, str(file))
         controllers = np.concatenate([controllers, turning[:: settings.stride]], axis=1)
         if len(rest_shape):
@@ -122,12 +122,12 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number
     in all, or the spacing nearest to `spacing` that divides the arc evenly. Each circle lies in the plane normal to the tangent.
     Its first node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
     """
-    centres, tangents = centreline(markers, spacing, number)
+    centers, tangents = centerline(markers, spacing, number)
     normals = _transported_normals(tangents)
     binormals = np.cross(tangents, normals)
     angle = 2 * np.pi * np.arange(count) / count
     offsets = np.cos(angle)[:, None] * normals[:, None] + np.sin(angle)[:, None] * binormals[:, None]
-    nodes: np.ndarray = (centres[:, None] + radius * offsets).reshape(-1, 3)
+    nodes: np.ndarray = (centers[:, None] + radius * offsets).reshape(-1, 3)
     return nodes
 
 
@@ -141,11 +141,11 @@ def straightened(markers: np.ndarray, number: int, radius: float, count: int) ->
     line[:, 0] = np.interp(knots, dense, arc)
     angle = 2 * np.pi * np.arange(count) / count
     circle = radius * np.stack([np.zeros(count), np.cos(angle), np.sin(angle)], axis=1)
-    centres = np.linspace(0.0, arc[-1], number)[:, None, None] * np.array([1.0, 0.0, 0.0])
-    return line, (centres + circle).reshape(-1, 3)
+    centers = np.linspace(0.0, arc[-1], number)[:, None, None] * np.array([1.0, 0.0, 0.0])
+    return line, (centers + circle).reshape(-1, 3)
 
 
-def centreline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def centerline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit tangents [R, 3] of a natural cubic spline through `markers`, equally spaced along its arc."""
     spline, _, dense, arc = _arc(markers)
     number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number

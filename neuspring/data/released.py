@@ -102,7 +102,7 @@ class Released:
         return paths[0] if paths else folder / "*" / SPLATS
 
     @property
-    def colours(self) -> Path:
+    def colors(self) -> Path:
         """Pictures of the first camera that the evaluation compares with: its own copy, or those that were copied."""
         copy = self.root / "data" / "render_eval_data" / self.name / "color" / "0"
         return copy if copy.is_dir() else self.folder / "color" / "0"
@@ -141,9 +141,9 @@ def parameter_departures(path: Path, parameters: Any) -> list[Departure]:
             departures.append(broken(path, key, "this key is missing"))
         elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
             departures.append(broken(path, key, "a finite number is required", value))
-        elif key.endswith("neighbours") and value != int(value):
+        elif key.endswith("neighbors") and value != int(value):
             departures.append(broken(path, key, "a whole number is required", value))
-        elif key.endswith(("neighbours", "radius")) and value <= 0:
+        elif key.endswith(("neighbors", "radius")) and value <= 0:
             departures.append(broken(path, key, "a positive number is required", value))
     departures += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
     return departures

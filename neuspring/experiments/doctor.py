@@ -28,7 +28,7 @@ from neuspring.experiments import needs
 from neuspring.experiments.tracking import store
 from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
 from neuspring.scores import lpips_weights
-from neuspring.splats.rasterise import choose_backend, rasterise
+from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.view import View
 
 State = Literal["ok", "absent", "broken"]
@@ -199,7 +199,7 @@ def _small_picture(device: str) -> torch.Tensor:
         return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
 
     intrinsics = tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
-    return rasterise(
+    return rasterize(
         tensor(random.uniform([-0.4, -0.4, 0.8], [0.4, 0.4, 1.2], (50, 3))),
         tensor(random.normal(size=(50, 4))),
         tensor(random.uniform(0.01, 0.1, (50, 3))),

@@ -150,13 +150,13 @@ def expected_size(body: Expected, search: Search, simulation: Simulation) -> tup
     start, spacing = search.start, body.spacing
     # How far controllers are from the nodes is not known before there are observations.
     unit = spacing if search.lengths == "meter" else 1.0
-    neighbours = min(start.object_neighbours - 1, math.pi * (start.object_radius / unit) ** 2)
-    held = min(start.controller_neighbours, math.pi * (start.controller_radius / unit) ** 2, body.nodes)
-    neighbours = min(neighbours, body.nodes - 1)
-    length = 2 / 3 * spacing * math.sqrt(neighbours / math.pi)
-    stiffness, damping = neighbours * start.stiffness / length, neighbours * start.dashpot
+    neighbors = min(start.object_neighbors - 1, math.pi * (start.object_radius / unit) ** 2)
+    held = min(start.controller_neighbors, math.pi * (start.controller_radius / unit) ** 2, body.nodes)
+    neighbors = min(neighbors, body.nodes - 1)
+    length = 2 / 3 * spacing * math.sqrt(neighbors / math.pi)
+    stiffness, damping = neighbors * start.stiffness / length, neighbors * start.dashpot
     # dt = 1 / x, with x the positive root of 4 safety x^2 - 2 D x - K = 0.
     limit = 4 * simulation.safety
     per_second = (damping + math.sqrt(damping**2 + limit * stiffness)) / limit
-    springs = body.nodes * neighbours / 2 + body.controllers * held
+    springs = body.nodes * neighbors / 2 + body.controllers * held
     return springs, min(float(int(per_second / body.frame_rate) + 1), float(simulation.max_substeps))

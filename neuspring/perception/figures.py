@@ -27,7 +27,7 @@ def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path
     """Frames of the video side by side: object tinted green, hands blue."""
     tiles = []
     for frame in _frames(capture, camera):
-        image = capture.colour(camera, frame).astype(float)
+        image = capture.color(camera, frame).astype(float)
         for label, tint in TINTS.items():
             own = masks.labels[frame] == label
             image[own] = 0.5 * image[own] + 0.5 * tint
@@ -44,7 +44,7 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
     colors = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int).tolist()
     tiles = []
     for frame in _frames(capture, camera):
-        image = np.ascontiguousarray(capture.colour(camera, frame))
+        image = np.ascontiguousarray(capture.color(camera, frame))
         recent = slice(max(frame - TRAIL, 0), frame + 1)
         for point, color in zip(shown, colors, strict=True):
             if tracks.visible[frame, point]:
@@ -59,7 +59,7 @@ def hands_strip(capture: Capture, image: ImageObservations, path: Path) -> Path:
     """Frames of the video with the grip of each hand: its place, turn and size, and where it was."""
     tiles, camera = [], next(iter(capture.cameras))
     for frame in _frames(capture, camera):
-        tile = np.ascontiguousarray(capture.colour(camera, frame))
+        tile = np.ascontiguousarray(capture.color(camera, frame))
         for hand in range(image.hands):
             way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
             cv2.polylines(tile, [way[:, None]], False, (255, 210, 0), 1, cv2.LINE_AA)
@@ -86,7 +86,7 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
                     if name == "side":
                         axis.plot([], [], "s", color=color, label=label)
             points = lifted.object_points[frame, seen]
-            axis.scatter(points[:, across], points[:, up], s=2, c=lifted.object_colours[seen], linewidths=0)
+            axis.scatter(points[:, across], points[:, up], s=2, c=lifted.object_colors[seen], linewidths=0)
             hands = lifted.controller_points[frame]
             axis.plot(hands[:, across], hands[:, up], "r.", ms=4)
             axis.set_title(f"frame {frame}, from {'the ' if name == 'side' else ''}{name}: {seen.sum()} points", fontsize=9)

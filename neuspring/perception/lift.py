@@ -20,7 +20,7 @@ from neuspring.perception.release import Body, Holding, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
-"""Pixels: the focal length that `outlier_neighbours` is meant for. A longer one shows a surface in more pixels."""
+"""Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""
 STRIDE = 3
 """Of the pixels of object and hands each third says how near they are."""
 
@@ -33,7 +33,7 @@ class Seen:
     """[T, n, 3], m; zeros where not visible."""
     visible: np.ndarray
     """[T, n] bool."""
-    colours: np.ndarray
+    colors: np.ndarray
     """[n, 3] RGB in frame 0, 0 to 1."""
 
     @classmethod
@@ -41,7 +41,7 @@ class Seen:
         """What several cameras saw."""
         points = np.concatenate([camera.points for camera in cameras], axis=1)
         visible = np.concatenate([camera.visible for camera in cameras], axis=1)
-        return cls(points, visible, np.concatenate([camera.colours for camera in cameras]))
+        return cls(points, visible, np.concatenate([camera.colors for camera in cameras]))
 
 
 def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTracks], settings: Lift) -> LiftedTracks:
@@ -60,7 +60,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
         usable = sum(int((label[0] == OBJECT).sum()) for label in labels.values())
         received = f"{shown} pixels of the object's masks, {usable} of them with depth in range and enough neighbors, no track"
-        remedy = "Look at masks and tracks; perception.lift has depth_range, neighbourhood and outlier_neighbours."
+        remedy = "Look at masks and tracks; perception.lift has depth_range, neighborhood and outlier_neighbors."
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
@@ -81,11 +81,11 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_points=objects.points,
         object_visibility=objects.visible,
         object_motion_valid=valid,
-        object_colours=objects.colours,
+        object_colors=objects.colors,
         controller_points=controllers,
         controller_valid=holds.valid,
         cloud=cloud,
-        cloud_colours=colors,
+        cloud_colors=colors,
         backend="released" if settings.sequential_motion_filter else "vectorised",
         facts=facts,
     )
@@ -142,7 +142,7 @@ def clean_masks(
     cloud, colors = np.zeros((0, 3)), np.zeros((0, 3))
     # The density of the points that a camera sees on a surface goes with the square of its focal length.
     focal = {name: camera.intrinsics[0, 0] for name, camera in cameras.items()}
-    least = {name: settings.outlier_neighbours * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
+    least = {name: settings.outlier_neighbors * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
     low, high = settings.depth_range
     for frame in range(frames or capture.frame_count):
         names = [name for name in cameras if capture.has(name, frame)]
@@ -157,13 +157,13 @@ def clean_masks(
                 y, x = pixels[name]
                 points.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
             needed = np.concatenate([np.full(len(part), least[name]) for name, part in zip(names, points, strict=True)])
-            stays = _crowded(np.concatenate(points), settings.neighbourhood, needed, settings.coordinate_outliers)
+            stays = _crowded(np.concatenate(points), settings.neighborhood, needed, settings.coordinate_outliers)
             for name, own in zip(names, np.split(stays, np.cumsum([len(part) for part in points])[:-1]), strict=True):
                 y, x = pixels[name]
                 labels[name][frame, y[own], x[own]] = label
             if frame == 0 and label == OBJECT:
                 cloud = np.concatenate(points)[stays]
-                colors = np.concatenate([capture.colour(name, 0)[pixels[name]] / 255.0 for name in names])[stays]
+                colors = np.concatenate([capture.color(name, 0)[pixels[name]] / 255.0 for name in names])[stays]
     return labels, cloud, colors
 
 
@@ -181,20 +181,20 @@ def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
 
 def _simultaneous(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
     """Every point judged by all others: independent of their order."""
-    pairs = cKDTree(points).query_pairs(settings.neighbourhood, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(settings.neighborhood, output_type="ndarray")
     alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < settings.agreement
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
     agreeing = np.bincount(pairs[alike].ravel(), minlength=len(points)) + 1
-    return (count >= settings.least_neighbours) & (agreeing >= 0.5 * count)
+    return (count >= settings.least_neighbors) & (agreeing >= 0.5 * count)
 
 
 def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
     """As released: points in order, each judged by those not dropped before it."""
     valid = np.ones(len(points), dtype=bool)
-    for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighbourhood)):
+    for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighborhood)):
         neighbors = np.array([j for j in near if valid[j]], dtype=int)
         alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < settings.agreement
-        valid[i] = len(neighbors) >= settings.least_neighbours and alike.sum() >= 0.5 * len(neighbors)
+        valid[i] = len(neighbors) >= settings.least_neighbors and alike.sum() >= 0.5 * len(neighbors)
     return valid
 
 
@@ -215,7 +215,7 @@ def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.nd
             depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y, settings.depth_window)
             points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
     x, y = rounded[0].T
-    return Seen(points, visible, capture.colour(camera.name, 0)[y, x] / 255.0)
+    return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)
 
 
 def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray, window: int) -> np.ndarray:

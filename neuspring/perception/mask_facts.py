@@ -53,7 +53,7 @@ def _flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarr
     flips = total = 0
     for index in np.unique(np.linspace(0, max(len(frames) - 2, 0), min(PAIRS, max(len(frames) - 1, 0))).astype(int)):
         here, there = frames[index], frames[index + 1]
-        gray = [cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, int(k))), cv2.COLOR_RGB2GRAY) for k in (here, there)]
+        gray = [cv2.cvtColor(np.ascontiguousarray(capture.color(camera, int(k))), cv2.COLOR_RGB2GRAY) for k in (here, there)]
         still = cv2.blur(cv2.absdiff(*gray), (5, 5)) < STILL
         flips += int((still & (labels[here] != labels[there])).sum())
         total += int((labels[here] > 0).sum())

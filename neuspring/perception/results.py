@@ -46,13 +46,13 @@ class LiftedTracks(_Result):
     object_points: np.ndarray = array("T,No,3", np.float32, "m", "zeros where invisible")
     object_visibility: np.ndarray = array("T,No", np.bool_, "1", "seen by its camera, inside the cleaned mask")
     object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from t to t + 1 agrees with its neighbors")
-    object_colours: np.ndarray = array("No,3", np.float32, "1", "RGB in frame 0")
+    object_colors: np.ndarray = array("No,3", np.float32, "1", "RGB in frame 0")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "chosen points of the hands")
     controller_valid: np.ndarray = array(
         "T,C", np.bool_, "1", "whether each controller holds in each frame; empty: all do in all frames", omitted=True
     )
     cloud: np.ndarray = array("P,3", np.float32, "m", "all object points of frame 0")
-    cloud_colours: np.ndarray = array("P,3", np.float32, "1", "their RGB")
+    cloud_colors: np.ndarray = array("P,3", np.float32, "1", "their RGB")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,7 +98,7 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
     table, above = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
     views = []
     for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
-        image, height = capture.colour(camera, frames[index]), _heights(capture, camera, frames[index])
+        image, height = capture.color(camera, frames[index]), _heights(capture, camera, frames[index])
         risen = (height > settings.height) & _region(capture, camera, frames[index], settings)
         views.append((image, risen))
         above += _count(_bins(image)[risen])
@@ -137,7 +137,7 @@ def _heights(capture: Capture, camera: str, frame: int) -> np.ndarray:
 
 def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings: OpenCvSegmentation) -> np.ndarray:
     """Labels [H, W] of one frame."""
-    image = capture.colour(camera, frame)
+    image = capture.color(camera, frame)
     bins, height = _bins(image), _heights(capture, camera, frame)
     ratio = cv2.GaussianBlur(palette.rise[bins], (0, 0), 1.0)
     flat = np.nan_to_num(height, nan=0.0) < settings.height

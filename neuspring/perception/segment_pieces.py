@@ -70,7 +70,7 @@ def changing(capture: Capture, camera: str) -> np.ndarray:
     frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
     grays = []
     for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED).astype(int)):
-        gray = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frames[index])), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frames[index])), cv2.COLOR_RGB2GRAY)
         grays.append(cv2.GaussianBlur(gray, (0, 0), 1.0))
     return np.asarray(np.ptp(np.stack(grays), axis=0) > CHANGES)
 

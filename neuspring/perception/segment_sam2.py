@@ -48,7 +48,7 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     """Labels [T, H, W]. Raises InputError where weights are missing or the prompt finds no object or no hand."""
     models = models or load(settings, device)
     frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    images = [capture.colour(camera, frame) for frame in frames]
+    images = [capture.color(camera, frame) for frame in frames]
     prompt = settings.prompt or capture.description.category
     detections = detect(images[0], prompt, settings, models, device)
     is_hand = [settings.hand_prompt.lower() in detection.words.replace(".", " ").split() for detection in detections]

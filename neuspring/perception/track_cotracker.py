@@ -37,7 +37,7 @@ def track(
         return result
     model = (load(settings) if model is None else model).to(device)
     frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    video = torch.from_numpy(np.stack([capture.colour(camera, frame) for frame in frames])).permute(0, 3, 1, 2)[None]
+    video = torch.from_numpy(np.stack([capture.color(camera, frame) for frame in frames])).permute(0, 3, 1, 2)[None]
     queries = torch.from_numpy(np.concatenate([np.zeros((len(start), 1)), start], axis=1)[None]).float().to(device)
     places, seen = _windows(model, video, queries, device)
     for k, frame in enumerate(frames):

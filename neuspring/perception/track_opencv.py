@@ -219,7 +219,7 @@ def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def gray(capture: Capture, camera: str, frame: int, settings: OpenCvTracking) -> np.ndarray:
     """The gray image [H, W] uint8; for Lucas-Kanade less its local mean and divided by its local deviation."""
-    plain = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+    plain = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY)
     if settings.method == "dis":
         return np.asarray(plain)
     centered = plain.astype(np.float32) - cv2.GaussianBlur(plain.astype(np.float32), (0, 0), LOCAL)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.figures.twin import COLORS, region_colours, stiffness_limits
+from neuspring.report.figures.twin import COLORS, region_colors, stiffness_limits
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
 DIVERGING = "coolwarm"
@@ -124,7 +124,7 @@ def strain_scale(far: float) -> Scale:
 def node_colors(twin: Twin) -> np.ndarray:
     """RGB [N, 3] uint8: a node's region."""
     names, region = np.unique(twin.topology.labels, return_inverse=True)
-    return np.asarray(255 * region_colours(len(names))[region][:, :3] + 0.5, np.uint8)
+    return np.asarray(255 * region_colors(len(names))[region][:, :3] + 0.5, np.uint8)
 
 
 def _regions(twin: Twin) -> np.ndarray:
@@ -146,7 +146,7 @@ def region_legend(twin: Twin) -> str:
     names, counts = np.unique(twin.topology.labels, return_counts=True)
     rows = [
         f"<span style='color:{_hex(color)}'>&#9632;</span> region {name} ({count} nodes)"
-        for name, count, color in zip(names, counts, region_colours(len(names)), strict=True)
+        for name, count, color in zip(names, counts, region_colors(len(names)), strict=True)
     ]
     rows.append("<span style='color:#464646'>&#9632;</span> springs between regions")
     rows.append("<span style='color:#969696'>&#9632;</span> springs of hands")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from neuspring.core.artifacts import SplatCentres
+from neuspring.core.artifacts import SplatCenters
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
@@ -31,7 +31,7 @@ class Dress:
     """The splats of one run in the scene, made in the frame in which the nodes are at `nodes` [N, 3], m."""
 
     def __init__(
-        self, scene: viser.SceneApi, name: str, splats: Splats, nodes: np.ndarray, centers: SplatCentres | None = None
+        self, scene: viser.SceneApi, name: str, splats: Splats, nodes: np.ndarray, centers: SplatCenters | None = None
     ) -> None:
         chosen = np.arange(len(splats.means))
         if len(chosen) > MOST_SPLATS:

@@ -22,7 +22,7 @@ from neuspring.report.figures.views import sample
 from neuspring.report.video import Video
 from neuspring.splats.draw import WHITE, picture, view_of
 from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.skinning import Skin
 
 WIDTH, HEIGHT, OPENING = 960, 720, math.radians(45)

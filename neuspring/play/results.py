@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Observations, SplatCentres, Trajectory, Twin
+from neuspring.core.artifacts import Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RUN_RECORD, RunRecord
@@ -71,12 +71,12 @@ class Run:
         return splats if self.centers_path else restricted(splats, Images().opacity)
 
     @cached_property
-    def centers(self) -> SplatCentres | None:
+    def centers(self) -> SplatCenters | None:
         """Where the method's own model puts its splats, if it does. Raises InputError."""
         if self.centers_path is None:
             return None
         require_modest(self.centers_path)
-        return SplatCentres.load(self.centers_path)
+        return SplatCenters.load(self.centers_path)
 
     @cached_property
     def twin_digest(self) -> str:
@@ -163,10 +163,10 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
         record = StageRecord.load(rollout)
         if record.status == "failed":
             notes.append(f"failed: {record.reason}")
-        for role in {"trajectory", "centres"} & set(record.files):
+        for role in {"trajectory", "centers"} & set(record.files):
             # The digest is checked by `file`; a name that leads elsewhere is refused before it is read.
             inside(scenario_folder, folder / str(record.files[role][0]))
-        trajectory, centers = (record.file(role, rollout) if role in record.files else None for role in ("trajectory", "centres"))
+        trajectory, centers = (record.file(role, rollout) if role in record.files else None for role in ("trajectory", "centers"))
     except (InputError, TypeError, ValueError, IndexError) as error:
         notes.append(f"no prediction: {error}")
     try:

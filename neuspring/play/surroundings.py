@@ -85,7 +85,7 @@ class Surroundings:
         if frame >= self._capture.frame_count or not self._capture.has(name, frame):
             return None
         try:
-            image = self._capture.colour(name, frame)
+            image = self._capture.color(name, frame)
         except InputError:
             return None
         factor = WIDEST / max(image.shape[:2])

@@ -16,7 +16,7 @@ from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
 from neuspring.scores.lpips import Lpips
 from neuspring.splats.draw import COVERED, picture, view_of
 from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.rasterize import Backend, choose_backend
 from neuspring.splats.ssim import RADIUS, ssim_map
 from neuspring.splats.view import View
 
@@ -109,4 +109,4 @@ class Scored:
         labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
         mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
         rendered = picture(gaussians, self.views[name], self.backend)
-        return Pair.of(self.capture.colour(name, frame), rendered, mask, hands, self.covered)
+        return Pair.of(self.capture.color(name, frame), rendered, mask, hands, self.covered)

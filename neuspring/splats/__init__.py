@@ -3,7 +3,7 @@
 | what | modules |
 |---|---|
 | the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors) |
-| drawing | `rasterise`: the entry, and the choice of backend; `reference`: its float64 specification |
+| drawing | `rasterize`: the entry, and the choice of backend; `reference`: its float64 specification |
 | | `view`, `project`, `tiles`, `blend`, `harmonics`: our backend; `gsplat_backend`: the other |
 | training | `train`, `losses`, `ssim`, `densify`; `alpha`: first points inside an alpha shape |
 | motion | `skinning`, `skinning_kernels`: nodes carry splats |

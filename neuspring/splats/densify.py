@@ -12,7 +12,7 @@ import torch
 
 from neuspring.config.images import Appearance
 from neuspring.splats.project import rotations
-from neuspring.splats.rasterise import Rendered
+from neuspring.splats.rasterize import Rendered
 
 CHILDREN = 2
 SHRINK = 1.6

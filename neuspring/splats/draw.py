@@ -16,7 +16,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import Camera
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend
+from neuspring.splats.rasterize import Backend
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 
@@ -41,13 +41,13 @@ def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) ->
         yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
 
 
-def placed(splats: Splats, centres: np.ndarray, device: str) -> Iterator[Gaussians]:
+def placed(splats: Splats, centers: np.ndarray, device: str) -> Iterator[Gaussians]:
     """The splats with the centers [F, G, 3], m, in every frame; their orientations stay."""
     start = Gaussians.of(splats, device)
-    if centres.shape[1] != len(splats.means):
-        rule = f"one centre for each of {len(splats.means)} splats is required"
-        raise InputError("splat centres", rule, centres.shape[1], "Splats and rollout must be of the same method and seed.")
-    for means in torch.tensor(centres, device=device):
+    if centers.shape[1] != len(splats.means):
+        rule = f"one center for each of {len(splats.means)} splats is required"
+        raise InputError("splat centers", rule, centers.shape[1], "Splats and rollout must be of the same method and seed.")
+    for means in torch.tensor(centers, device=device):
         yield replace(start, means=means)
 
 
@@ -61,11 +61,11 @@ def picture(gaussians: Gaussians, view: View, backend: Backend, background: tupl
 
 def turned(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
     """RGB [H, W, 3] uint8 over white: the view `like`, turned about the object by `angle` degrees."""
-    centre = gaussians.means.median(0).values.double().cpu().numpy()
+    center = gaussians.means.median(0).values.double().cpu().numpy()
     turn = Rotation.from_euler("z", angle, degrees=True)
     pose = np.linalg.inv(like.world_to_camera.double().cpu().numpy())
     pose[:3, :3] = turn.as_matrix() @ pose[:3, :3]
-    pose[:3, 3] = centre + turn.apply(pose[:3, 3] - centre)
+    pose[:3, 3] = center + turn.apply(pose[:3, 3] - center)
     view = View.of(pose, like.intrinsics.cpu().numpy(), like.width, like.height, str(like.intrinsics.device), shift=0.0)
     return picture(gaussians, view, backend, WHITE)[..., :3]
 

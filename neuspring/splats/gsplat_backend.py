@@ -6,11 +6,11 @@ from __future__ import annotations
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.splats.rasterise import Rendered
+from neuspring.splats.rasterize import Rendered
 from neuspring.splats.view import LIMITS, Limits, View
 
 
-def rasterise(
+def rasterize(
     means: torch.Tensor,
     quaternions: torch.Tensor,
     scales: torch.Tensor,
@@ -21,7 +21,7 @@ def rasterise(
     background: tuple[float, float, float],
     limits: Limits,
 ) -> Rendered:
-    """As `neuspring.splats.rasterise.rasterise`; raises InputError for thresholds that gsplat would not keep."""
+    """As `neuspring.splats.rasterize.rasterize`; raises InputError for thresholds that gsplat would not keep."""
     from gsplat import rasterization
 
     own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)

@@ -46,7 +46,7 @@ def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
     return torch.stack(rows, dim=-1)
 
 
-def colours(coefficients: torch.Tensor, offsets: torch.Tensor, degree: int) -> torch.Tensor:
+def colors(coefficients: torch.Tensor, offsets: torch.Tensor, degree: int) -> torch.Tensor:
     """RGB [N, 3] of coefficients [N, K, 3] seen along `offsets` [N, 3] (any length); bands above `degree` are not used."""
     used = (degree + 1) ** 2
     values = basis(torch.nn.functional.normalize(offsets, dim=-1), degree)

@@ -16,7 +16,7 @@ import torch
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
-from neuspring.splats.rasterise import Rendered
+from neuspring.splats.rasterize import Rendered
 from neuspring.splats.ssim import ssim_map
 from neuspring.splats.view import View
 
@@ -30,7 +30,7 @@ class Shot:
 
     name: str
     view: View
-    colour: torch.Tensor
+    color: torch.Tensor
     """[H, W, 3] in 0..1, black outside the object's mask."""
     mask: torch.Tensor
     """[H, W] 1 where the object is seen."""
@@ -43,14 +43,14 @@ class Shot:
 
     @classmethod
     def of(
-        cls, name: str, view: View, colour: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
+        cls, name: str, view: View, color: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
     ) -> Shot | None:
         """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands are dilated by a square of `margin` pixels.
 
         None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
         """
         size = (view.height, view.width)
-        for what, array in {"image": colour, "mask": mask, "mask of hands": hands, "depth": depth}.items():
+        for what, array in {"image": color, "mask": mask, "mask of hands": hands, "depth": depth}.items():
             if array.shape[:2] != size:
                 raise InputError(f"camera {name}, {what} of frame 0", f"must have the camera's size {size}", array.shape[:2])
         square = np.ones((max(round(margin), 1),) * 2, np.uint8)
@@ -69,7 +69,7 @@ class Shot:
         def on_device(values: np.ndarray) -> torch.Tensor:
             return torch.tensor(values.astype(np.float32), device=view.intrinsics.device)
 
-        on_black = np.where(seen[..., None], colour, 0).astype(np.float32) / 255
+        on_black = np.where(seen[..., None], color, 0).astype(np.float32) / 255
         measured = np.where(seen, depth, 0.0)
         return cls(name, view, on_device(on_black), on_device(seen), on_device(known), on_device(measured), box)
 
@@ -83,10 +83,10 @@ class Shot:
 def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
     """The training loss of one picture."""
     color = rendered.rgb * shot.known[..., None]
-    total = settings.l1 * (color - shot.colour).abs().mean()
+    total = settings.l1 * (color - shot.color).abs().mean()
     if settings.dssim:
         top, bottom, left, right = shot.box
-        pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.colour)]
+        pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.color)]
         total = total + settings.dssim * (1 - ssim_map(*pair)).sum() / color.numel()
     if settings.mask:
         total = total + settings.mask * (rendered.alpha * shot.known - shot.mask).abs().mean()

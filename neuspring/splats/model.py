@@ -14,7 +14,7 @@ import torch
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.splats.rasterise import Rendered, rasterise
+from neuspring.splats.rasterize import Rendered, rasterize
 from neuspring.splats.view import View
 
 PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
@@ -159,7 +159,7 @@ class Gaussians:
         return torch.exp(self.log_scales).expand(-1, 3)
 
     def draw(self, view: View, *, degree: int = 3, **options: Any) -> Rendered:
-        """A picture; harmonics above `degree` are not used. Options as in `rasterise`: background, limits, backend."""
+        """A picture; harmonics above `degree` are not used. Options as in `rasterize`: background, limits, backend."""
         degree = min(degree, math.isqrt(self.harmonics.shape[1]) - 1)
         tensors = (self.means, self.quaternions, self.scales, self.opacities, self.harmonics)
-        return rasterise(*tensors, view, degree=degree, **options)
+        return rasterize(*tensors, view, degree=degree, **options)

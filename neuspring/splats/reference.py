@@ -9,7 +9,7 @@ from neuspring.splats.project import project
 from neuspring.splats.view import LIMITS, Limits, View
 
 
-def rasterise(
+def rasterize(
     means: torch.Tensor,
     quaternions: torch.Tensor,
     scales: torch.Tensor,
@@ -21,13 +21,13 @@ def rasterise(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     limits: Limits = LIMITS,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """rgb [H, W, 3], alpha [H, W] and depth [H, W]; arguments as `neuspring.splats.rasterise.rasterise`."""
+    """rgb [H, W, 3], alpha [H, W] and depth [H, W]; arguments as `neuspring.splats.rasterize.rasterize`."""
     ellipses = project(means, quaternions, scales, view, limits)
     order = torch.sort(ellipses.depths.detach(), stable=True).indices
     index, flat, conics, depths = ellipses.index[order], ellipses.means[order], ellipses.conics[order], ellipses.depths[order]
     shade = colors[index]
     if degree is not None:
-        shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
+        shade = harmonics.colors(shade, means[index] - view.position.to(means), degree)
     rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).reshape(-1, 1, 2).to(means) + 0.5
     offset = pixels - flat

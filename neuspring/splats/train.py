@@ -21,7 +21,7 @@ from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend
+from neuspring.splats.rasterize import Backend
 
 NEAREST = 3
 """The first scale of a splat is its mean distance to this many neighbors."""
@@ -133,8 +133,8 @@ class _Optimizer:
             "quaternions": settings.rotation_rate,
             "log_scales": 0.0 if settings.fixed_radius else settings.scale_rate,
             "opacity_logits": settings.opacity_rate,
-            "base": settings.colour_rate,
-            "bands": settings.colour_rate / 20,
+            "base": settings.color_rate,
+            "bands": settings.color_rate / 20,
         }
         self._values = {name: tensor.clone().requires_grad_() for name, tensor in values.items()}
         groups = [{"params": [tensor], "lr": rates[name], "name": name} for name, tensor in self._values.items()]

@@ -33,7 +33,7 @@ from neuspring.splats.densify import REFERENCE_WIDTH
 from neuspring.splats.draw import COVERED, picture, turned, view_of
 from neuspring.splats.losses import Shot
 from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.train import NEAREST, first_splats, train
 from neuspring.stages import options as shared
 from neuspring.stages.lengths import require_length
@@ -168,7 +168,7 @@ def _shots(
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
         margin = images.appearance.hand_margin * camera.width / REFERENCE_WIDTH
-        seen = (capture.colour(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
+        seen = (capture.color(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
         shot = Shot.of(name, view_of(camera, images, device), *seen, margin)
         if shot is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
@@ -203,7 +203,7 @@ class _Surface:
         distance, nearest = self._to_cloud
         if start == "shape_prior" and self.has_prior:
             return self.prior, self.colors[nearest]
-        # What was seen, and where nothing was the prior, in the colours of what is nearest.
+        # What was seen, and where nothing was the prior, in the colors of what is nearest.
         new = distance > self.reach
         return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colors, self.colors[nearest[new]]])
 
@@ -241,7 +241,7 @@ def _surface(
         lifted = LiftedTracks.load(record.file("lifted", lifted_record))
         prior = ShapePrior.load(record.file("shape", lifted_record))
         apart = max(settings.images.appearance.spacing, 1.0) * width
-        return _Surface(lifted.cloud, lifted.cloud_colours, _surface_points(prior, apart, seed), NEAR_SEEN * width, True)
+        return _Surface(lifted.cloud, lifted.cloud_colors, _surface_points(prior, apart, seed), NEAR_SEEN * width, True)
     if observations_path is None:
         raise InputError("--lifted, --observations", "one of the two is required", "neither")
     observations = Observations.load(observations_path)
@@ -249,7 +249,7 @@ def _surface(
     chosen = settings.perception.lift
     _, cloud, colors = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
     if not len(cloud):
-        remedy = "perception.lift has depth_range, neighbourhood and outlier_neighbours."
+        remedy = "perception.lift has depth_range, neighborhood and outlier_neighbors."
         raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none", remedy)
     return _Surface(cloud, colors, observations.surface_points, NEAR_SEEN * width, False)
 
@@ -272,15 +272,15 @@ def _behind_hands(shot: Shot, drawn: np.ndarray) -> float:
 def _quality(shot: Shot, drawn: np.ndarray) -> float:
     """PSNR of a training view, dB."""
     splats = torch.tensor(drawn[..., :3].astype(np.float32) / 255) * shot.known.cpu()[..., None]
-    return float(psnr(splats.permute(2, 0, 1), shot.colour.cpu().permute(2, 0, 1)))
+    return float(psnr(splats.permute(2, 0, 1), shot.color.cpu().permute(2, 0, 1)))
 
 
 def _require_outside(capture: Capture, points: np.ndarray) -> None:
     """A camera within the object's box sees nothing that could be right."""
     low, high = points.min(axis=0), points.max(axis=0)
     for name, camera in capture.cameras.items():
-        centre = camera.camera_to_world[:3, 3]
-        if ((centre > low) & (centre < high)).all():
+        center = camera.camera_to_world[:3, 3]
+        if ((center > low) & (center < high)).all():
             rule = f"cameras.{name}.camera_to_world: the camera must stand outside the object"
-            remedy = "Poses are camera-to-world, metres; an inverted or unscaled one puts the camera elsewhere."
-            raise InputError(capture.folder / CAPTURE, rule, np.round(centre, 3).tolist(), remedy)
+            remedy = "Poses are camera-to-world, meters; an inverted or unscaled one puts the camera elsewhere."
+            raise InputError(capture.folder / CAPTURE, rule, np.round(center, 3).tolist(), remedy)

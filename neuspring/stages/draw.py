@@ -14,7 +14,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.splats.draw import BLACK, WHITE, picture, save_picture, view_of
-from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.rasterize import choose_backend
 from neuspring.stages import options as shared
 from neuspring.stages.render import posed
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.baselines import BASELINES
-from neuspring.core.artifacts import Observations, SplatCentres
+from neuspring.core.artifacts import Observations, SplatCenters
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
@@ -35,7 +35,7 @@ def command(a: Namespace) -> None:
 def run(
     observations_path: Path, model: str, train_record: Path | None, appearance_record: Path | None, device: str, output: Path
 ) -> None:
-    """Write trajectory.npz, centres.npz (of models with splats of their own) and the record `output`.
+    """Write trajectory.npz, centers.npz (of models with splats of their own) and the record `output`.
 
     A model whose training failed is rolled out too, and the run remains a failure. Raises InputError if the record of a training
     is missing.
@@ -62,10 +62,10 @@ def run(
     files = record.beside(trajectory="trajectory.npz")
     trajectory.save(files["trajectory"])
     facts = {"frames": len(trajectory.positions), **prediction.facts}
-    if prediction.centres is not None:
-        files |= record.beside(centres="centres.npz")
-        SplatCentres(positions=prediction.centres).save(files["centres"])
-        facts |= _scores_of_centers(prediction.centres, observations)
+    if prediction.centers is not None:
+        files |= record.beside(centers="centers.npz")
+        SplatCenters(positions=prediction.centers).save(files["centers"])
+        facts |= _scores_of_centers(prediction.centers, observations)
     reasons = [f"train: {before['train'].reason}"] if "train" in before and before["train"].reason else []
     reasons += [f"rollout: {trajectory.reason}"] if trajectory.reason else []
     record.save(files, facts, failure="; ".join(reasons))
@@ -84,5 +84,5 @@ def _scores_of_centers(centers: np.ndarray, observations: Observations) -> dict[
             continue
         values = [metrics.visible_to_surface(centers[t], points[t], visible[t], centers.shape[1]) for t in frames]
         if np.isfinite(values).any():
-            scores[f"centres_chamfer_{task}"] = float(np.nanmean(values))
+            scores[f"centers_chamfer_{task}"] = float(np.nanmean(values))
     return scores

@@ -15,7 +15,7 @@ import pandas as pd
 from neuspring import config
 from neuspring.config import Config
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Observations, SplatCentres, Trajectory
+from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_table
@@ -148,10 +148,10 @@ def posed(
     """
     splats = Splats.load(StageRecord.load(appearance_record).file("splats", appearance_record))
     rollout = StageRecord.load(rollout_record)
-    if "centres" not in rollout.files:
+    if "centers" not in rollout.files:
         splats = restricted(splats, images.opacity)
         return splats, moved(splats, trajectory.positions, images, device)
-    return splats, placed(splats, SplatCentres.load(rollout.file("centres", rollout_record)).positions, device)
+    return splats, placed(splats, SplatCenters.load(rollout.file("centers", rollout_record)).positions, device)
 
 
 def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:

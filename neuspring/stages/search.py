@@ -139,4 +139,4 @@ def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
     judged = trace[trace["stage"] != SLOPES]
     best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     decisive = [name for name in variables if not name.startswith(SURFACES)]
-    return [name for name in decisive if not END <= best[f"normalised.{name}"] <= 1 - END]
+    return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]

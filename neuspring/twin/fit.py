@@ -1,7 +1,7 @@
 """First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
 An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training span) one
-optimiser step is made with the gradient through those frames; the state is detached there and goes on while parameters change. The
+optimizer step is made with the gradient through those frames; the state is detached there and goes on while parameters change. The
 best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the training frames, to which the
 start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
 parameters of the epoch's start, halves the learning rates and is reported.
@@ -170,7 +170,7 @@ class TwinFit:
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
-        self.optimiser = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas, eps=settings.epsilon)
+        self.optimizer = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
         """Loss units per m^2."""
         self.gradients: list[float] | None = None
@@ -183,7 +183,7 @@ class TwinFit:
 
     @property
     def one_step(self) -> bool:
-        """Whether an epoch is a single optimiser step, so that its losses belong to the values before it."""
+        """Whether an epoch is a single optimizer step, so that its losses belong to the values before it."""
         return self.horizon >= self.head_end - 1
 
     def solver(self) -> FrameSolver | Seat:
@@ -255,7 +255,7 @@ class TwinFit:
         factor = rate * min((epoch + 1) / (settings.warmup_epochs + 1), 1.0)
         if settings.schedule == "cosine":
             factor *= LOWEST_RATE + (1 - LOWEST_RATE) * (1 + math.cos(math.pi * epoch / settings.epochs)) / 2
-        for group in self.optimiser.param_groups:
+        for group in self.optimizer.param_groups:
             group["lr"] = factor * group["base_rate"]
 
     def epoch(self) -> dict[str, float]:
@@ -268,7 +268,7 @@ class TwinFit:
         total, largest, row = 0.0, 0.0, {}
         for start in range(1, self.head_end, self.horizon):
             window = range(start, min(start + self.horizon, self.head_end))
-            self.optimiser.zero_grad(set_to_none=True)
+            self.optimizer.zero_grad(set_to_none=True)
             packed = self.settled()
             state, mean = self._simulate(state, window, packed)
             if not bool(torch.isfinite(mean)):
@@ -323,13 +323,13 @@ class TwinFit:
         limit = self.problem.fit.clip_gradient_norm
         if limit:
             torch.nn.utils.clip_grads_with_norm_(tensors, limit, norm)
-        self.optimiser.step()
+        self.optimizer.step()
         return float(norm)
 
     def restore(self, values: dict[str, np.ndarray], moments: dict[str, np.ndarray]) -> None:
         """Set parameters and Adam's state."""
         self.parameters.restore(values)
-        restore_adam(self.optimiser, moments)
+        restore_adam(self.optimizer, moments)
 
     def figures(self, state: _State) -> dict[str, Any]:
         """What the fit's record says of the selected values, which are the present ones."""
@@ -427,7 +427,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
     run.start_epoch(epoch, state.rate)
-    row["learning_rate"] = run.optimiser.param_groups[0]["lr"]
+    row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
         before = (state.values, state.substeps)
         run.gradients = [] if state.gradient_over_epsilon is None else None
@@ -439,7 +439,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
             losses["tail_loss"] = run.tail_loss()
         state.values, state.moments, state.substeps = (
             run.parameters.copy(),
-            adam_arrays(run.optimiser),
+            adam_arrays(run.optimizer),
             run.twin.simulation.substeps,
         )
         row |= losses

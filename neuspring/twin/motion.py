@@ -7,7 +7,7 @@ from scipy.interpolate import RBFInterpolator
 
 from neuspring.core.artifacts import InitialVelocity, Observations
 
-NEIGHBOURS = 16
+NEIGHBORS = 16
 """Nearest points that a node's value is interpolated from."""
 SMOOTHING = 1e-6
 """Keeps the interpolation solvable where two points coincide; in meters, far below any distance between points."""
@@ -19,7 +19,7 @@ def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndar
     values = values[first].astype(np.float64)
     if len(places) == 1:
         return np.repeat(values, len(nodes), axis=0)
-    interpolate = RBFInterpolator(places, values, min(NEIGHBOURS, len(places)), SMOOTHING, "linear")
+    interpolate = RBFInterpolator(places, values, min(NEIGHBORS, len(places)), SMOOTHING, "linear")
     result: np.ndarray = interpolate(nodes.astype(np.float64))
     return result
 

@@ -46,7 +46,7 @@ class PooledFit(TwinFit):
         # The copy has the same trained tensors.
         member.parameters = copy.copy(self.parameters)
         member.parameters.start = start
-        member.optimiser = self.optimiser
+        member.optimizer = self.optimizer
         # Frame 0 of each recording has a spacing of its own; a meter must weigh the same in all.
         member.loss_scale = self.loss_scale
         return member

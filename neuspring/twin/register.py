@@ -69,9 +69,9 @@ def residual(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(squares.mean()))
 
 
-def spacing(points: np.ndarray, neighbours: int = 1) -> float:
+def spacing(points: np.ndarray, neighbors: int = 1) -> float:
     """Median distance, m, of the points [N, 3] to their neighbor of that rank; of the farthest where there are fewer."""
-    rank = min(neighbours, len(points) - 1)
+    rank = min(neighbors, len(points) - 1)
     return float(np.median(cKDTree(points).query(points, k=rank + 1)[0].reshape(len(points), -1)[:, -1]))
 
 

@@ -65,14 +65,14 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     factor = scale_between(old, there[:count])
     _, nearest = cKDTree(old.canonical[:nodes]).query(laid.points)
     labels = old.labels[nearest]
-    radii, neighbours = asked(old)
+    radii, neighbors = asked(old)
     reach, held = held_by_hands(old)
     new = piecewise_topology(
         observations.nodes,
         observations.controller_points[0],
         labels,
         [radius * factor for radius in radii],
-        neighbours,
+        neighbors,
         reach,
         max(round(held * count / nodes), 1),
         repair=True,
@@ -112,13 +112,13 @@ def asked(topology: Topology) -> tuple[list[float], list[int]]:
     ranks = [tree.query_ball_point(points[springs[:, end]], length * MARGIN, return_length=True) for end in (0, 1)]
     rank = np.minimum(*ranks)
     region = topology.labels[springs]
-    radii, neighbours = [], []
+    radii, neighbors = [], []
     for label in range(int(topology.labels.max()) + 1):
         within = (region == label).all(axis=1)
         within = within if within.any() else np.ones(len(springs), dtype=bool)
         radii.append(float(length[within].max()) * MARGIN)
-        neighbours.append(max(int(rank[within].max()), 2))
-    return radii, neighbours
+        neighbors.append(max(int(rank[within].max()), 2))
+    return radii, neighbors
 
 
 def held_by_hands(topology: Topology) -> tuple[float, int]:

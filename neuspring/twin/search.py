@@ -43,8 +43,8 @@ from neuspring.twin.spacing import controller_reach, node_spacing
 from neuspring.twin.topology import isolated, piecewise_topology, regions
 from neuspring.twin.trials import Outcome, motions, outcomes
 
-INTEGERS = ("object_neighbours", "controller_neighbours")
-REGIONAL = ("object_radius", "object_neighbours")
+INTEGERS = ("object_neighbors", "controller_neighbors")
+REGIONAL = ("object_radius", "object_neighbors")
 """Variables of which every region has its own."""
 PENALTY = 1e6
 """Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
@@ -220,9 +220,9 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         observations.controller_points[0],
         problem.labels,
         problem.of_regions(values, "object_radius"),
-        [int(n) for n in problem.of_regions(values, "object_neighbours")],
+        [int(n) for n in problem.of_regions(values, "object_neighbors")],
         values["controller_radius"],
-        int(values["controller_neighbours"]),
+        int(values["controller_neighbors"]),
         repair=isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
         controller_rest=problem.search.controller_rest,
@@ -232,7 +232,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     if count == 0:
         raise NumericalFailure("no node has a spring")
     lonely = isolated(len(topology.nodes), topology.springs[~topology.is_bending])
-    if isolated_nodes == "penalise" and len(lonely):
+    if isolated_nodes == "penalize" and len(lonely):
         raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
     material = replace(homogeneous(values, count), mass=problem.mass)
     if "bending" in values:
@@ -402,7 +402,7 @@ def _polished(
     best = min(trace, key=lambda row: row["cost"])
     if not problem.search.rounds_of(len(problem.polished)) or best["cost"] >= PENALTY:
         return
-    start = np.array([best[f"normalised.{name}"] for name in problem.variables])
+    start = np.array([best[f"normalized.{name}"] for name in problem.variables])
     columns = [problem.variables.index(name) for name in problem.polished]
     polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
     while not polish.done:
@@ -523,7 +523,7 @@ def _made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any
     values = problem.decode(normalized)
     row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
-    row |= values | {f"normalised.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
+    row |= values | {f"normalized.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
     family: tuple[Twin, ...] = ()
     try:
         twin = candidate(problem, values)

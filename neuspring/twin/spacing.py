@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.core.errors import InputError
 
-NEIGHBOURS = 16
+NEIGHBORS = 16
 """Nearest nodes among which the tree is looked for: more than a ring or a voxel's corner has."""
 SHARE = 0.9
 """Quantile of the tree's edges."""
@@ -25,7 +25,7 @@ def node_spacing(nodes: np.ndarray) -> float:
     Scales with the nodes and does not depend on their order. Raises InputError if no two nodes lie apart.
     """
     points = np.asarray(nodes, np.float64)
-    count = min(NEIGHBOURS + 1, len(points))
+    count = min(NEIGHBORS + 1, len(points))
     distance, partner = cKDTree(points).query(points, k=count)
     first = np.repeat(np.arange(len(points)), count)
     # Where all neighbors are nearer than the next part of the body, the tree is a forest: the few edges between are not missed.

@@ -38,7 +38,7 @@ def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
     least = max(count, settings.connectivity + 1)
     if len(nodes) < least:
         rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
-        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbours.")
+        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbors.")
     # Imported here: it takes longer than most commands that need a topology.
     from sklearn.cluster import AgglomerativeClustering
     from sklearn.neighbors import kneighbors_graph
@@ -49,7 +49,7 @@ def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
         directed = kneighbors_graph(points, settings.connectivity)
         graph = directed.maximum(directed.T)
     clusters = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
-    # Micrometres: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
+    # Micrometers: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
     centroids = np.round([points[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
@@ -77,18 +77,18 @@ def isolated(count: int, springs: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.bincount(springs.ravel(), minlength=count)[:count] == 0)
 
 
-def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Springs between object nodes, [S, 2], in the order in which they are first asked for.
 
-    Node i asks for its `neighbours[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
+    Node i asks for its `neighbors[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
     """
     count = len(nodes)
-    k = int(min(neighbours.max(), count))
+    k = int(min(neighbors.max(), count))
     distance, partner = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=float(radius.max()))
     distance, partner = distance.reshape(count, k), partner.reshape(count, k)
     rank = np.arange(k)
     # The first hit is the node itself (or an exact duplicate, which the length rule would refuse anyway).
-    wanted = (rank > 0) & (rank < neighbours[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
+    wanted = (rank > 0) & (rank < neighbors[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
     first, column = np.nonzero(wanted)
     return _first_of_each(np.stack([first, partner[first, column]], axis=1), count)
 
@@ -101,9 +101,9 @@ def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
     return unique
 
 
-def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbours: int) -> np.ndarray:
+def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
     """Springs from controllers to object nodes, [S, 2] as (N + controller, node)."""
-    k = min(neighbours, len(nodes))
+    k = min(neighbors, len(nodes))
     distance, partner = cKDTree(nodes).query(controllers, k=k, distance_upper_bound=radius)
     distance, partner = distance.reshape(len(controllers), k), partner.reshape(len(controllers), k)
     controller, column = np.nonzero(distance < radius)
@@ -176,9 +176,9 @@ def piecewise_topology(
     controllers: np.ndarray,
     labels: np.ndarray,
     object_radius: Sequence[float],
-    object_neighbours: Sequence[int],
+    object_neighbors: Sequence[int],
     controller_radius: float,
-    controller_neighbours: int,
+    controller_neighbors: int,
     *,
     repair: bool = False,
     rest_shape: np.ndarray = NO_REST_SHAPE,
@@ -193,8 +193,8 @@ def piecewise_topology(
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
-    inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbours)[labels])
-    outer = controller_springs(points, hands, controller_radius, controller_neighbours)
+    inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbors)[labels])
+    outer = controller_springs(points, hands, controller_radius, controller_neighbors)
     if repair:
         inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
     across = bending_springs(points, inner, bending) if bending else np.zeros((0, 2), inner.dtype)
@@ -210,15 +210,13 @@ def uniform_topology(
     nodes: np.ndarray,
     controllers: np.ndarray,
     object_radius: float,
-    object_neighbours: int,
+    object_neighbors: int,
     controller_radius: float,
-    controller_neighbours: int,
+    controller_neighbors: int,
 ) -> Topology:
     """One radius [m] and one neighbor count (self included) for the whole object.
 
     Raises InputError if a controller coincides with a node.
     """
     one = np.zeros(len(nodes), np.int32)
-    return piecewise_topology(
-        nodes, controllers, one, [object_radius], [object_neighbours], controller_radius, controller_neighbours
-    )
+    return piecewise_topology(nodes, controllers, one, [object_radius], [object_neighbors], controller_radius, controller_neighbors)

@@ -39,6 +39,6 @@ def recorded(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, fl
 def replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
     """Whether recorded candidates are those that CMA-ES proposes now."""
     return all(
-        np.array_equal(np.array([row.get(f"normalised.{name}", np.nan) for name in variables]), normalized)
+        np.array_equal(np.array([row.get(f"normalized.{name}", np.nan) for name in variables]), normalized)
         for row, normalized in zip(rows, population, strict=False)
     )

@@ -42,18 +42,18 @@ def moves(points: torch.Tensor, tools: torch.Tensor, rules: Rules = RULES) -> to
     return network(graph_of(points, tools, rules), history, action)
 
 
-def test_a_particle_is_the_first_of_its_own_neighbours():
+def test_a_particle_is_the_first_of_its_own_neighbors():
     line = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0.03, 0, 0], [0.5, 0, 0]])
     far = torch.full((1, 3), 9.0)
-    graph = graph_of(line, far, replace(RULES, neighbours=2, radius=0.08))
+    graph = graph_of(line, far, replace(RULES, neighbors=2, radius=0.08))
     assert pairs(graph) == {(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (1, 0), (2, 1)}, "receivers first; nearest is not mutual"
-    narrow = graph_of(line, far, replace(RULES, neighbours=3, radius=0.015))
+    narrow = graph_of(line, far, replace(RULES, neighbors=3, radius=0.015))
     assert pairs(narrow) == {(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (1, 0)}
 
 
 def test_tools_and_particles_feel_each_other_and_tools_do_not_feel_tools():
     points, tools = torch.tensor([[0.0, 0, 0], [0.3, 0, 0]]), torch.tensor([[0.02, 0, 0], [0.03, 0, 0]])
-    rules = replace(RULES, radius=0.05, neighbours=1)
+    rules = replace(RULES, radius=0.05, neighbors=1)
     loops = {(0, 0), (1, 1)}
     assert pairs(graph_of(points, tools, rules)) == loops | {(0, 2), (2, 0), (0, 3), (3, 0)}
     everything = pairs(graph_of(points, tools, replace(rules, connect_all=True)))
@@ -251,8 +251,8 @@ def test_presets_and_what_replaces_them():
         name: preset_name(GsDynamics(), name) for name in ("rope", "DLO1", "cloth", "package", "sloth", "zebra", "dinosaur", "blob")
     }
     assert list(named.values()) == ["rope", "rope", "cloth", "cloth", "animals", "animals", "animals", "animals"]
-    rules, recipe = resolve(GsDynamics(preset="cloth", noise=0.0, neighbours=9), "rope")
-    assert (rules.neighbours, rules.particles, recipe.noise, recipe.length_weight, recipe.batch) == (9, 150, 0.0, 0.1, 64)
+    rules, recipe = resolve(GsDynamics(preset="cloth", noise=0.0, neighbors=9), "rope")
+    assert (rules.neighbors, rules.particles, recipe.noise, recipe.length_weight, recipe.batch) == (9, 150, 0.0, 0.1, 64)
     assert resolve(GsDynamics(), "rope")[0].node_input == PRESETS["rope"].node_input == "short"
     assert [resolve(GsDynamics(tools=tools), "rope")[0].connect_all for tools in ("points", "centroids")] == [False, True]
     assert not resolve(GsDynamics(tools="centroids", connect_all=False), "rope")[0].connect_all

@@ -17,7 +17,7 @@ from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.errors import NumericalFailure
 
 FRAME = 1 / 30
-SMALL = SpringGaus(anchors=72, neighbours=12, full_neighbours=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)
+SMALL = SpringGaus(anchors=72, neighbors=12, full_neighbors=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)
 
 
 def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
@@ -28,7 +28,7 @@ def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
 
 
 def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGaus = SMALL, **changed) -> SpringGausModel:
-    graph = AnchorGraph.between(anchors, controllers, settings.neighbours, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, controllers, settings.neighbors, settings.link_reach, settings.link_count)
     world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
     return SpringGausModel.start(graph, settings, **world)
 
@@ -85,11 +85,11 @@ def test_the_order_of_anchors_and_yaw_change_nothing_else():
 
 
 def test_springs_are_directed():
-    """An anchor that is nobody's neighbour feels others and does not move them."""
+    """An anchor that is nobody's neighbor feels others and does not move them."""
     near = bar()[:24]
     lone = near.mean(axis=0, keepdims=True) + np.array([0, 0, 1.0])
     graph = AnchorGraph.between(np.concatenate([near, lone]), np.full((1, 3), 9.0), 4, 0.04, 50)
-    assert (graph.neighbours != 24).all()
+    assert (graph.neighbors != 24).all()
     physics = AnchorPhysics(frame_time=FRAME, gravity=0.0, ground=False)
     x = torch.tensor(graph.anchors, dtype=torch.float64)
     x[24, 2] += 0.01
@@ -174,7 +174,7 @@ def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
 
 
 def test_too_few_anchors_are_refused():
-    with pytest.raises(NumericalFailure, match=r"more anchors than neighbours \(20\) are required, and there are 3"):
+    with pytest.raises(NumericalFailure, match=r"more anchors than neighbors \(20\) are required, and there are 3"):
         AnchorGraph.between(bar()[:3], np.zeros((1, 3)), 20, 0.04, 50)
 
 

@@ -19,13 +19,13 @@ def pair(**settings) -> SpringGausModel:
     """Two anchors that feel each other, far from any hand and from the ground."""
     graph = AnchorGraph(
         anchors=np.array([[0, 0, 1], [REST, 0, 1]], dtype=np.float32),
-        neighbours=np.array([[1], [0]], dtype=np.int32),
+        neighbors=np.array([[1], [0]], dtype=np.int32),
         lengths=np.full((2, 1), REST, dtype=np.float32),
         link_starts=np.zeros(3, dtype=np.int32),
         links=np.zeros(0, dtype=np.int32),
         link_lengths=np.zeros(0, dtype=np.float32),
     )
-    chosen = SpringGaus(neighbours=1, full_neighbours=1, **settings)
+    chosen = SpringGaus(neighbors=1, full_neighbors=1, **settings)
     return SpringGausModel.start(graph, chosen, frame_time=STEP, up_sign=1.0, gravity=0.0, ground=False)
 
 

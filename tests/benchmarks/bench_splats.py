@@ -1,4 +1,4 @@
-"""Time and memory of the rasteriser: `python -m tests.benchmarks.bench_splats [--device cuda:0] [--repeats 9]`.
+"""Time and memory of the rasterizer: `python -m tests.benchmarks.bench_splats [--device cuda:0] [--repeats 9]`.
 
 A ball of splats, as a toy before a camera: 7 % of the picture, all splats in view, isotropic, harmonics of degree 3 as tensors that
 ask for gradients. Columns: medians over repeats of the forward pass and of both passes, and the growth of the peak memory. On a GPU
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.splats.rasterise import Backend, choose_backend, rasterise
+from neuspring.splats.rasterize import Backend, choose_backend, rasterize
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 from tests.benchmarks.memory import peak_mib, reset_peak
@@ -55,10 +55,10 @@ def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend:
     splats, view = ball(count, device), front(*size, device)
 
     def forward() -> None:
-        rasterise(*splats, view, degree=DEGREE, backend=backend)
+        rasterize(*splats, view, degree=DEGREE, backend=backend)
 
     def both() -> None:
-        drawn = rasterise(*splats, view, degree=DEGREE, backend=backend)
+        drawn = rasterize(*splats, view, degree=DEGREE, backend=backend)
         (drawn.rgb.sum() + drawn.alpha.sum() + drawn.depth.sum()).backward()
         for tensor in splats:
             tensor.grad = None

@@ -44,7 +44,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
     anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
     hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
     settings = SpringGaus()
-    graph = AnchorGraph.between(anchors, hands[0], settings.neighbours, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors, settings.link_reach, settings.link_count)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     return model, hands
 

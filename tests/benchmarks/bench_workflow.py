@@ -58,7 +58,7 @@ def intervals(records: list[JobRecord]) -> dict[str, list[tuple[float, float]]]:
     return {device: sorted(times) for device, times in held.items()}
 
 
-def utilisation(records: list[JobRecord]) -> float:
+def utilization(records: list[JobRecord]) -> float:
     """Held time over all time, from the first start to the last start of a job (what follows is the end of the queue)."""
     held = intervals(records)
     first = min(times[0][0] for times in held.values())
@@ -78,7 +78,7 @@ def main(jobs: int = 500, seconds: float = 4.0) -> None:
         wall, records = run(Path(folder) / "well", jobs, WELL.format(seconds=seconds))
         added = (wall * DEVICES - jobs * seconds) / jobs
         print(f"{jobs} jobs of {seconds} s on {DEVICES} devices: {wall:.1f} s, ideally {jobs * seconds / DEVICES:.1f} s")
-        print(f"added per job: {added:.2f} s ({added / 60:.1%} of a minute); devices held {utilisation(records):.1%} of the time")
+        print(f"added per job: {added:.2f} s ({added / 60:.1%} of a minute); devices held {utilization(records):.1%} of the time")
         wall, records = run(Path(folder) / "crash", jobs, CRASH.format(seconds=1))
         attempts = [attempt for record in records for attempt in record.attempts]
         crashed = sum(attempt.outcome == "transient" for attempt in attempts)

@@ -144,7 +144,7 @@ class Case:
         return self.capture.mask(self.camera, frame)
 
     def color(self, frame: int) -> np.ndarray:
-        return self.capture.colour(self.camera, frame)
+        return self.capture.color(self.camera, frame)
 
     @property
     def tasks(self) -> dict[str, range]:

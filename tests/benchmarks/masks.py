@@ -103,9 +103,7 @@ def _capture(folder: Path, settings: MarksSegmentation, correct: bool, pictures:
         if correct:
             frame = max(truth, key=lambda frame: float(carried.doubt[frame]))
             carried = carry_camera(capture, camera, [*marks, *corrections(marks, truth[frame], frame)], settings)
-        colors = [
-            capture.colour(camera, frame) if frame in truth else np.zeros((16, 16, 3)) for frame in range(capture.frame_count)
-        ]
+        colors = [capture.color(camera, frame) if frame in truth else np.zeros((16, 16, 3)) for frame in range(capture.frame_count)]
         _tell(f"{capture.description.name} {camera}", carried, truth, time.perf_counter() - began, Frames(colors), pictures)
 
 

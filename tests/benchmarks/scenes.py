@@ -13,23 +13,23 @@ from neuspring.twin.topology import uniform_topology
 HANDS = 8
 FRAME_TIME = 1 / 30
 CASES = {"a": (400, 67, 22), "b": (2000, 667, 31), "c": (2500, 667, 22)}
-"""Nodes, substeps, neighbours asked for (self included). The radius of the topology is never the limit."""
+"""Nodes, substeps, neighbors asked for (self included). The radius of the topology is never the limit."""
 SPACING, GAP = 0.005, 0.006
 """Between the nodes of a sheet and between its layers, m."""
 
 
-def box(nodes: int, substeps: int, neighbours: int, *, self_collision: bool = False) -> tuple[Twin, np.ndarray]:
+def box(nodes: int, substeps: int, neighbors: int, *, self_collision: bool = False) -> tuple[Twin, np.ndarray]:
     """A box of random points just above the ground, held by hands at its top, and the hands of one frame [2, C, 3]."""
     rng = np.random.default_rng(0)
     edge = 0.01 * nodes ** (1 / 3)
     points = rng.uniform(0, edge, (nodes, 3)) + np.array([0, 0, 0.001])
     hands = rng.uniform(0, edge, (HANDS, 3)) * [1, 1, 0] + [0, 0, edge + 0.005]
-    topology = uniform_topology(points, hands, 10 * edge, neighbours, 10 * edge, 20)
+    topology = uniform_topology(points, hands, 10 * edge, neighbors, 10 * edge, 20)
     simulation = Simulation(frame_time=FRAME_TIME, substeps=substeps, self_collision=self_collision)
     return stable_twin(topology, simulation, 0.005), np.stack([hands, hands + np.array([0, 0, 0.005])])
 
 
-def sheet(nodes: int, substeps: int, neighbours: int = 13) -> tuple[Twin, np.ndarray]:
+def sheet(nodes: int, substeps: int, neighbors: int = 13) -> tuple[Twin, np.ndarray]:
     """A square sheet of about `nodes` nodes, folded once, with self-collision, and the hands of one frame [2, C, 3].
 
     Springs and rest lengths are those of the flat sheet. The upper layer lies 6 mm above the lower one, nearer than the contact
@@ -42,7 +42,7 @@ def sheet(nodes: int, substeps: int, neighbours: int = 13) -> tuple[Twin, np.nda
     noise = np.random.default_rng(0).uniform(-4e-4, 4e-4, (columns * rows, 2))
     flat = np.column_stack([along.ravel(), across.ravel(), np.zeros(columns * rows)]) + np.pad(noise, ((0, 0), (0, 1)))
     edge = flat[-rows:][:HANDS] + np.array([SPACING, 0, 0])
-    topology = uniform_topology(flat, edge, 1.0, neighbours, 0.04, 20)
+    topology = uniform_topology(flat, edge, 1.0, neighbors, 0.04, 20)
     middle = SPACING * (columns - 1) / 2
     hands = folded(edge, middle)
     topology = replace(topology, nodes=folded(flat, middle), controllers=hands)

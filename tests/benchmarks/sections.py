@@ -56,7 +56,7 @@ def by_nodes(bench: Bench) -> list[Row]:
     return _scaling(bench, "nodes", [(f"{size:,} nodes", box(size, 20, 22)) for size in sizes])
 
 
-def by_neighbours(bench: Bench) -> list[Row]:
+def by_neighbors(bench: Bench) -> list[Row]:
     """More springs per node of a box of 2,000 nodes."""
     sizes = (8, 32) if bench.quick else (8, 16, 32, 64)
     scenes = [box(2000, 67, size) for size in sizes]
@@ -162,7 +162,7 @@ def start(bench: Bench) -> list[Row]:
 SECTIONS: dict[str, Callable[[Bench], list[Row]]] = {
     "frame": frames,
     "nodes": by_nodes,
-    "springs": by_neighbours,
+    "springs": by_neighbors,
     "substeps": by_substeps,
     "batch": by_batch,
     "topologies": by_topologies,

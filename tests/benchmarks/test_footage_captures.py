@@ -24,7 +24,7 @@ def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     capture = write_capture(FOOTAGE, tmp_path, case, FRAMES)
     about = capture.description
     assert (about.depth, about.up, about.category, about.name, about.masks) == ("none", "-z", "rope", case, True)
-    np.testing.assert_array_equal(capture.colour("0", 4), film(FOOTAGE, case, FRAMES)[4])
+    np.testing.assert_array_equal(capture.color("0", 4), film(FOOTAGE, case, FRAMES)[4])
     assert (capture.mask("0", 4) == 1).sum() > 3000
     Marks.load(capture.folder / MARKS).require(capture)
     found = check_layout(capture.folder)

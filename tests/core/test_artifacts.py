@@ -1,4 +1,4 @@
-"""Artefacts: what is saved is what is loaded, what is wrong is named, what is interrupted leaves the old file."""
+"""Artifacts: what is saved is what is loaded, what is wrong is named, what is interrupted leaves the old file."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def test_canonical_nodes() -> None:
 
 
 def rewrite(path: Path, **changes: Any) -> None:
-    """Change the meta text of a stored artefact."""
+    """Change the meta text of a stored artifact."""
     with np.load(path, allow_pickle=False) as stored:
         arrays = {key: stored[key] for key in stored.files}
     meta = json.loads(arrays["meta"].tobytes()) | changes

@@ -19,7 +19,7 @@ from tests.support.project import add_scenario, copy_project, copy_workflow, job
 
 PACKAGE = "synthetic_weird_package"
 PERCEPTION = {
-    "lift": {"controller_gaps": "rigid", "controller_share": 0.5, "least_controllers": 5, "neighbourhood": 0.03},
+    "lift": {"controller_gaps": "rigid", "controller_share": 0.5, "least_controllers": 5, "neighborhood": 0.03},
     "sample": {"voxel": 0.02},
 }
 SYNTHETIC = {
@@ -56,7 +56,7 @@ def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(perceived_
 
 def test_cameras_are_perceived_by_jobs_of_their_own_and_all_methods_share_one_appearance(project):
     jobs = plan(project, SYNTHETIC)
-    assert (jobs["synthesise"], jobs["segment"], jobs["track"], jobs["lift"], jobs["observe"]) == (1, 3, 3, 1, 1)
+    assert (jobs["synthesize"], jobs["segment"], jobs["track"], jobs["lift"], jobs["observe"]) == (1, 3, 3, 1, 1)
     jobs = plan(project, SYNTHETIC | {"methods": ["search_only", "baseline", "neuspring"], "seeds": [0, 1]})
     assert (jobs["appearance"], jobs["render"], jobs["score"]) == (2, 6, 6)
     # A run without images has no such steps.
@@ -125,7 +125,7 @@ def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tm
     assert "../../appearance-spring_gaus/0/appearance.json" in record["artifacts"]["records"]
     scores = pd.read_parquet(folder / "spring_gaus" / "0" / "scores.parquet")
     assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound", "psnr", "ssim", "iou"}
-    assert (folder / "spring_gaus" / "0" / "centres.npz").is_file()
+    assert (folder / "spring_gaus" / "0" / "centers.npz").is_file()
 
 
 @pytest.mark.slow

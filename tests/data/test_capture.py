@@ -36,12 +36,12 @@ def test_what_is_written_is_read(tmp_path, form):
     read = Capture.load(tmp_path)
     assert read.description == written.description
     rng = np.random.default_rng(0)
-    depth, colour, mask = (
+    depth, color, mask = (
         rng.integers(500, 900, (24, 32)),
         rng.integers(0, 256, (24, 32, 3), np.uint8),
         rng.integers(0, 3, (24, 32), np.uint8),
     )
-    np.testing.assert_array_equal(read.colour("0", 0), colour)
+    np.testing.assert_array_equal(read.color("0", 0), color)
     np.testing.assert_allclose(read.depth("0", 0), depth / 1000)
     np.testing.assert_array_equal(read.mask("0", 0), mask)
     np.testing.assert_array_equal(read.tracks(), tracks)
@@ -73,7 +73,7 @@ def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
     write(tmp_path, describe(cameras=(entry("left"), entry("right", 40, 20, missing=(2,)))))
     capture = Capture.load(tmp_path)
     assert list(capture.cameras) == ["left", "right"]
-    assert capture.colour("right", 1).shape == (20, 40, 3)
+    assert capture.color("right", 1).shape == (20, 40, 3)
     assert [capture.has("right", frame) for frame in range(FRAMES)] == [True, True, False, True, True]
 
 
@@ -147,10 +147,10 @@ def test_a_missing_image_says_how_to_declare_it(tmp_path):
     with pytest.raises(
         InputError, match=r"00003\.png: this image must exist; received no such file\. List the frame in cameras\.0\.missing"
     ):
-        Capture.load(tmp_path).colour("0", 3)
+        Capture.load(tmp_path).color("0", 3)
 
 
-def test_depth_of_another_size_than_colour_is_refused(tmp_path):
+def test_depth_of_another_size_than_color_is_refused(tmp_path):
     capture = write(tmp_path)
     cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((12, 16), np.uint16))
     with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to color"):
@@ -168,7 +168,7 @@ def test_damaged_files_and_unknown_labels_are_refused(tmp_path):
     capture = write(tmp_path)
     capture.path("color", "0", 2).write_bytes(b"no picture")
     with pytest.raises(InputError, match="must be a readable PNG"):
-        capture.colour("0", 2)
+        capture.color("0", 2)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 255, np.uint8))
     with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received 255"):
         capture.mask("0", 2)

@@ -73,7 +73,7 @@ def test_a_folder_of_color_becomes_a_capture_with_the_table_of_the_pose(tmp_path
     about = Capture.load(made.folder).description
     assert (about.depth, about.up, about.frame_count, about.provenance["table"]) == ("none", up, FRAMES, "z = 0 as given")
     assert not (made.folder / "depth").exists()
-    np.testing.assert_array_equal(made.colour("0", 2), seen(camera(), 2)[0])
+    np.testing.assert_array_equal(made.color("0", 2), seen(camera(), 2)[0])
     assert "depth: none, color alone" in report and f"poses: of poses.json, up {up}" in report
     assert any("the table is z = 0 as given, 0.6" in line for line in report)
     assert serious(check_layout(made.folder)) == []
@@ -88,7 +88,7 @@ def test_a_video_by_the_command(tmp_path, capsys):
     assert "depth: none, color alone" in capsys.readouterr().out
     made = Capture.load(tmp_path / "capture")
     assert made.description.frame_rate == pytest.approx(15, rel=0.01)
-    np.testing.assert_array_equal(made.colour("0", 3), seen(camera(), 3)[0])
+    np.testing.assert_array_equal(made.color("0", 3), seen(camera(), 3)[0])
 
 
 def test_a_board_gives_the_pose(tmp_path):

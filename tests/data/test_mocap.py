@@ -113,24 +113,24 @@ def test_the_beginning_can_be_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
 def test_ring_geometry(spacing: float, radius: float, ring: int) -> None:
-    centres, tangents = mocap.centreline(helix(), spacing)
+    centers, tangents = mocap.centerline(helix(), spacing)
     nodes = mocap.rings(helix(), spacing, radius, ring).reshape(-1, ring, 3)
-    offsets = nodes - centres[:, None]
+    offsets = nodes - centers[:, None]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), radius, rtol=0, atol=EDGE)
     np.testing.assert_allclose(np.einsum("rki,ri->rk", offsets, tangents), 0, atol=EDGE)
-    np.testing.assert_allclose(nodes.mean(axis=1), centres, atol=EDGE)
-    neighbour = np.linalg.norm(offsets - np.roll(offsets, 1, axis=1), axis=2)
-    np.testing.assert_allclose(neighbour, 2 * radius * np.sin(np.pi / ring), atol=EDGE)
-    np.testing.assert_allclose(centres[[0, -1]], helix()[[0, -1]], atol=EDGE)
-    step = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    np.testing.assert_allclose(nodes.mean(axis=1), centers, atol=EDGE)
+    neighbor = np.linalg.norm(offsets - np.roll(offsets, 1, axis=1), axis=2)
+    np.testing.assert_allclose(neighbor, 2 * radius * np.sin(np.pi / ring), atol=EDGE)
+    np.testing.assert_allclose(centers[[0, -1]], helix()[[0, -1]], atol=EDGE)
+    step = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     np.testing.assert_allclose(step, step.mean(), rtol=SPLINE)
     # Dividing the arc evenly moves the spacing by at most half a step over all rings.
     assert abs(step.mean() - spacing) <= spacing / (2 * len(step)) + SPLINE * spacing
 
 
-def test_markers_lie_on_the_centreline() -> None:
-    centres, _ = mocap.centreline(helix(), 0.0005)
-    assert cKDTree(centres).query(helix())[0].max() <= 0.00026  # half the spacing
+def test_markers_lie_on_the_centerline() -> None:
+    centers, _ = mocap.centerline(helix(), 0.0005)
+    assert cKDTree(centers).query(helix())[0].max() <= 0.00026  # half the spacing
 
 
 def assert_no_twist(nodes: np.ndarray, ring: int) -> None:
@@ -221,9 +221,9 @@ def test_released_recordings() -> None:
 
 def test_a_given_number_of_rings_spaces_them_equally_from_end_to_end() -> None:
     nodes = mocap.rings(helix(), 0.012, 0.006, 3, number=9).reshape(-1, 3, 3)
-    centres = nodes.mean(axis=1)
-    assert len(centres) == 9
-    np.testing.assert_allclose(centres[[0, -1]], helix()[[0, -1]], atol=1e-9)
+    centers = nodes.mean(axis=1)
+    assert len(centers) == 9
+    np.testing.assert_allclose(centers[[0, -1]], helix()[[0, -1]], atol=1e-9)
     # Chords of equal arcs of a helix are equal; 2 % allows for the spline and the arc's integration.
-    chords = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    chords = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     np.testing.assert_allclose(chords, chords.mean(), rtol=0.02)

@@ -216,7 +216,7 @@ def test_inconsistent_arrays_are_refused(tmp_path: Path, data: bytes, reason: st
         load_pickle(write(tmp_path, data))
 
 
-def test_bool_bytes_are_normalised(tmp_path: Path) -> None:
+def test_bool_bytes_are_normalized(tmp_path: Path) -> None:
     data = _state(code="b1", dtype_state=(3, "|", None, None, None, -1, -1, 0), state=(1, (3,), ..., False, b"\x00\x01\xff"))
     assert load_pickle(write(tmp_path, data)).view(np.uint8).tolist() == [0, 1, 1]
 

@@ -301,8 +301,8 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ("{model: spring_gauss, description: x}", "model: must be one of spring_gaus"),
         ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
         (
-            "{model: spring_gaus, settings: {full_neighbours: 30}, description: x}",
-            "method bad, settings: .*full_neighbours: at most",
+            "{model: spring_gaus, settings: {full_neighbors: 30}, description: x}",
+            "method bad, settings: .*full_neighbors: at most",
         ),
         ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
         ("{model: gs_dynamics, settings: {min_visible: 5000}, description: x}", "method bad, settings: .*min_visible: at most"),

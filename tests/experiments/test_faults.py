@@ -32,7 +32,7 @@ from neuspring.experiments.jobs import faults
         (1, ["OSError: [Errno 28] No space left on device"], "permanent", "no space left on the disk"),
         (2, ["error: must be writable; received Read-only file system."], "permanent", faults.READ_ONLY.cause),
         (1, ["OSError: [Errno 116] Stale file handle"], "transient", "the storage failed"),
-        (2, ["neuspring: error: x.npz: must be an artefact."], "permanent", "bad input"),
+        (2, ["neuspring: error: x.npz: must be an artifact."], "permanent", "bad input"),
         (1, ["Traceback", "AssertionError"], "permanent", "the program failed"),
     ],
 )  # fmt: skip

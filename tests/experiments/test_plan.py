@@ -249,7 +249,7 @@ def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
     [
         ("category=ropes", "category 'ropes' matches none of the configuration's; received rope"),
         ("method=neuspring", "method 'neuspring' matches none"),
-        ("colour=red", "terms scenario="),
+        ("color=red", "terms scenario="),
         ("seed", "terms scenario="),
     ],
 )

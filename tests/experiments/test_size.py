@@ -121,13 +121,13 @@ def test_the_settings_foretell_springs_and_substeps_of_the_start_of_a_search(nam
 
 @given(
     nodes=st.integers(100, 20_000),
-    neighbours=st.integers(10, 50),
+    neighbors=st.integers(10, 50),
     radius=st.floats(0.01, 0.05),
     stiffness=st.floats(1e2, 1e5),
     spacing=st.floats(0.003, 0.03),
 )
-def test_twice_the_nodes_are_twice_the_springs_and_a_stiffer_start_has_more_substeps(nodes, neighbours, radius, stiffness, spacing):
-    start = {"object_neighbours": neighbours, "object_radius": radius, "stiffness": stiffness}
+def test_twice_the_nodes_are_twice_the_springs_and_a_stiffer_start_has_more_substeps(nodes, neighbors, radius, stiffness, spacing):
+    start = {"object_neighbors": neighbors, "object_radius": radius, "stiffness": stiffness}
     search = small.released(start=start)
     stiffer = dataclasses.replace(search, start=dataclasses.replace(search.start, stiffness=min(4 * stiffness, 1e5)))
     simulation = config.Simulation(max_substeps=10**9)

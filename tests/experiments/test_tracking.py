@@ -80,7 +80,7 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("{}")
     samples: list[list[float | None]] = [[0.5, 90.0, 400.0, 50.0, 900.0], [2.6, 110.0, 500.0, None, None]]
-    used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilisation": 50.0}
+    used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilization": 50.0}
     first = Attempt(started="2026-11-21T09:00:00+00:00", outcome="transient", peak_memory_mb=9999.0)
     write_job(results, "search/rope/uniform/0", first, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", **used))
     for name in ("fit/rope/owner/0", "appearance/rope/appearance/0", "score/rope/ours/0", "render/rope/ours/0"):

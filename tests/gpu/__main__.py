@@ -1,7 +1,7 @@
 """All checks and measurements of a machine with a GPU: `python -m tests.gpu [--device cuda:0] [--again] [--parts tests,fit]`.
 
-Parts: the simulator, the rasteriser, skinning, Spring-Gaus, a small search and a small fit against the CPU; the tests marked
-`cuda`; the benchmark; gsplat against our rasteriser where it is installed. Everything lands in results/gpu; gpu.json there holds it
+Parts: the simulator, the rasterizer, skinning, Spring-Gaus, a small search and a small fit against the CPU; the tests marked
+`cuda`; the benchmark; gsplat against our rasterizer where it is installed. Everything lands in results/gpu; gpu.json there holds it
 all. `--device cpu` compares the CPU with itself, in results/gpu/cpu: it tests this command where there is no GPU.
 
 Exit status: 0 where all is well, 1 where a part failed, 2 where there is no GPU.

@@ -28,7 +28,7 @@ from neuspring.baselines.spring_gaus.solver import AnchorSolver
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.device import resolve_device
 from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
-from neuspring.splats.rasterise import choose_backend, rasterise
+from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 from neuspring.twin.fit import fit
@@ -107,7 +107,7 @@ def _frame_gradient(c: Clip, device: str) -> np.ndarray:
     return array(torch.autograd.grad(loss(k, after), log_stiffness)[0])
 
 
-def rasteriser(device: str) -> dict[str, Any]:
+def rasterizer(device: str) -> dict[str, Any]:
     """The golden pictures and their gradients; pictures on the pixels that no threshold decides."""
     found = []
     for case in ("r03_overlap6", "r06_sh3", "r09_dense400"):
@@ -121,7 +121,7 @@ def rasteriser(device: str) -> dict[str, Any]:
 
 def _picture(case: str, device: str) -> dict[str, np.ndarray]:
     golden = golden_splats.Golden(case, torch.float32, device)
-    picture = rasterise(*golden.inputs.values(), golden.view, **golden.options)
+    picture = rasterize(*golden.inputs.values(), golden.view, **golden.options)
     loss = golden.loss("B", picture.rgb, picture.alpha, picture.depth)
     gradients = torch.autograd.grad(loss, list(golden.inputs.values()))
     stable = golden.values["stable"]
@@ -154,9 +154,9 @@ def spring_gaus(device: str) -> dict[str, Any]:
     anchors = lattice * 0.02 + np.random.default_rng(0).uniform(-0.002, 0.002, lattice.shape) + [0, 0, 0.05]
     hands = (anchors[:3] + 0.004)[None] + 0.01 * np.arange(12)[:, None, None] * np.array([0.3, 0.2, 1.0])
     settings = SpringGaus(
-        anchors=72, neighbours=12, full_neighbours=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0
+        anchors=72, neighbors=12, full_neighbors=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0
     )
-    graph = AnchorGraph.between(anchors, hands[0], settings.neighbours, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors, settings.link_reach, settings.link_count)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     (received, reason), (wanted, _) = (roll_out_anchors(model, hands, where) for where in (device, "cpu"))
     assert not reason, reason
@@ -223,7 +223,7 @@ def tiny_fit(device: str) -> dict[str, Any]:
 
 
 def gsplat(device: str) -> dict[str, Any]:
-    """gsplat against our rasteriser, on the same device: pictures, gradients, and times of both passes."""
+    """gsplat against our rasterizer, on the same device: pictures, gradients, and times of both passes."""
     if not device.startswith("cuda"):
         return {ABSENT: f"gsplat needs CUDA, the device is {device}"}
     if importlib.util.find_spec("gsplat") is None:
@@ -234,7 +234,7 @@ def gsplat(device: str) -> dict[str, Any]:
     splats = [tensor.detach().to(device) for tensor in random_splats(4, 200, torch.float32)]
     splats[3] = splats[3].clamp(max=0.95)
     splats = [tensor.requires_grad_() for tensor in splats]
-    pictures = [rasterise(*splats, view, backend=backend) for backend in ("gsplat", "warp")]
+    pictures = [rasterize(*splats, view, backend=backend) for backend in ("gsplat", "warp")]
     gradients = [torch.autograd.grad(p.rgb.sum() + p.alpha.sum(), splats) for p in pictures]
     found = []
     for name in ("rgb", "alpha"):
@@ -247,7 +247,7 @@ def gsplat(device: str) -> dict[str, Any]:
     def both_passes(backend: str) -> float:
         torch.cuda.synchronize()
         start = time.perf_counter()
-        rasterise(*splats, view, backend=backend).rgb.sum().backward()
+        rasterize(*splats, view, backend=backend).rgb.sum().backward()
         torch.cuda.synchronize()
         return 1e3 * (time.perf_counter() - start)
 
@@ -257,7 +257,7 @@ def gsplat(device: str) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[str], dict[str, Any]]] = {
     "simulator": simulator,
-    "rasteriser": rasteriser,
+    "rasterizer": rasterizer,
     "skinning": skinning,
     "spring_gaus": spring_gaus,
     "search": tiny_search,

@@ -13,7 +13,7 @@ from typing import Any
 
 from tests.gpu.chain import ROOT, Part
 
-PARITY = {"simulator": 60, "rasteriser": 45, "skinning": 60, "spring_gaus": 45, "search": 60, "fit": 60}
+PARITY = {"simulator": 60, "rasterizer": 45, "skinning": 60, "spring_gaus": 45, "search": 60, "fit": 60}
 """Time limits of the comparisons with the CPU, s."""
 TESTS, GSPLAT, BENCH = "tests", "gsplat", "bench"
 NAMES = (*PARITY, TESTS, BENCH, GSPLAT)

@@ -22,7 +22,7 @@ from tests.support.filmed import film
 
 ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)
 TINY = Synthetic(size="tiny", frames=6, cameras=2)
-SETTINGS = Lift(neighbourhood=0.03, controller_gaps="rigid", controller_share=0.5, least_controllers=3)
+SETTINGS = Lift(neighborhood=0.03, controller_gaps="rigid", controller_share=0.5, least_controllers=3)
 
 
 def create(folder, settings: Synthetic = TINY) -> Capture:

@@ -16,7 +16,7 @@ from neuspring.perception.controllers import choose_controllers, fill_rigidly, h
 from neuspring.perception.results import Masks, PixelTracks
 from tests.support.captures import FRAMES, describe, entry
 
-SETTINGS = Lift(neighbourhood=0.03, outlier_neighbours=460.0, least_neighbours=3, least_controllers=3, controllers=4)
+SETTINGS = Lift(neighborhood=0.03, outlier_neighbors=460.0, least_neighbors=3, least_controllers=3, controllers=4)
 
 NEAR = np.zeros((1, 3))
 """An object's cloud, for hands whose distance from it does not matter."""
@@ -57,7 +57,7 @@ def test_points_lie_where_the_camera_saw_them(scene):
     np.testing.assert_allclose(lifted.object_points[0].min(axis=0), camera.lift(np.array([4.0, 15.0]), np.array(0.8)), atol=1e-6)
     moved = lifted.object_points[-1] - lifted.object_points[0]
     np.testing.assert_allclose(moved, np.tile([2 * 0.8 / 40, 0, 0], (100, 1)), atol=1e-6)
-    np.testing.assert_allclose(lifted.object_colours, 40 / 255, atol=1e-6)
+    np.testing.assert_allclose(lifted.object_colors, 40 / 255, atol=1e-6)
     assert lifted.controller_points.shape == (FRAMES, 4, 3)
     assert len(lifted.cloud) == 100
 
@@ -140,7 +140,7 @@ def test_few_neighbors_are_not_enough():
     points = np.stack([grid(2), grid(2)])
     seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((4, 3)))
     assert not lifting.agreeing_motion(seen, Lift()).any()
-    assert lifting.agreeing_motion(seen, Lift(least_neighbours=4))[0].all()
+    assert lifting.agreeing_motion(seen, Lift(least_neighbors=4))[0].all()
 
 
 def test_depth_at_an_edge_comes_from_the_same_mask():

@@ -135,10 +135,10 @@ def lifted(points: np.ndarray = BOX) -> LiftedTracks:
         object_points=np.repeat(points[None], FRAMES, axis=0),
         object_visibility=np.ones((FRAMES, count), bool),
         object_motion_valid=np.ones((FRAMES, count), bool),
-        object_colours=np.zeros((count, 3)),
+        object_colors=np.zeros((count, 3)),
         controller_points=np.zeros((FRAMES, 1, 3)),
         cloud=points,
-        cloud_colours=np.zeros((count, 3)),
+        cloud_colors=np.zeros((count, 3)),
         backend="x",
     )
 

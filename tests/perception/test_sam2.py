@@ -122,7 +122,7 @@ def capture(tmp_path_factory):
 def test_sam2_carries_boxes_through_the_video(capture):
     torch.manual_seed(0)
     model, processor = video_models()
-    images = [capture.colour("0", frame) for frame in range(FRAMES) if capture.has("0", frame)]
+    images = [capture.color("0", frame) for frame in range(FRAMES) if capture.has("0", frame)]
     detections = [Detection((30.0, 20.0, 90.0, 70.0), "toy", 0.9), Detection((60.0, 5.0, 100.0, 40.0), "hand", 0.8)]
     masks = segment_sam2.propagate(images, detections, Models(None, None, model, processor), "cpu")
     assert len(masks) == FRAMES - 1
@@ -163,7 +163,7 @@ def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path):
     torch.manual_seed(0)
     model, processor = detector_models(tmp_path)
     settings = GroundedSam2(box_threshold=0.001, text_threshold=0.001)
-    detections = segment_sam2.detect(capture.colour("0", 0), "toy", settings, Models(model, processor, None, None), "cpu")
+    detections = segment_sam2.detect(capture.color("0", 0), "toy", settings, Models(model, processor, None, None), "cpu")
     assert detections
     assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
     assert all(len(d.box) == 4 and np.isfinite(d.box).all() for d in detections)

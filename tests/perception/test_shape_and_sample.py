@@ -14,7 +14,7 @@ from neuspring.data.capture import OBJECT, CameraEntry, Writer
 from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, Part, Renderer
-from neuspring.data.synthetic.sensor import quantised
+from neuspring.data.synthetic.sensor import quantized
 from neuspring.perception import shape_mesh, shape_prior
 from neuspring.perception.assemble import assemble
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
@@ -47,7 +47,7 @@ def film(folder, cameras: int, with_hand: bool = False):
     for name, camera in writer.capture.cameras.items():
         view = renderer.render(camera)
         for frame in range(FRAMES):
-            writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
+            writer.frame(name, frame, view.color, quantized(view.depth, 0.001), view.label)
         y, x = np.nonzero(view.label == OBJECT)
         cloud.append(camera.lift(np.stack([x, y], axis=1).astype(float), view.depth[y, x].astype(float)))
         masks[name] = Masks(labels=np.repeat(view.label[None], FRAMES, axis=0), backend="given")
@@ -132,10 +132,10 @@ def tracked(points: np.ndarray) -> LiftedTracks:
         object_points=np.repeat(points[None], 3, axis=0),
         object_visibility=np.ones((3, count), bool),
         object_motion_valid=np.ones((3, count), bool),
-        object_colours=np.zeros((count, 3)),
+        object_colors=np.zeros((count, 3)),
         controller_points=np.zeros((3, 1, 3)),
         cloud=points,
-        cloud_colours=np.zeros((count, 3)),
+        cloud_colors=np.zeros((count, 3)),
         backend="x",
     )
 

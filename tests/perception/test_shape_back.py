@@ -11,7 +11,7 @@ from neuspring.data.capture import OBJECT, CameraEntry, Writer
 from neuspring.data.synthetic.implicit import capsule, sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import Part, Renderer
-from neuspring.data.synthetic.sensor import quantised
+from neuspring.data.synthetic.sensor import quantized
 from neuspring.perception.figures import lifted_figure
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
@@ -47,7 +47,7 @@ def film(folder, body, box, eyes=(EYE,)):
     for name, camera in writer.capture.cameras.items():
         view = renderer.render(camera)
         for frame in range(FRAMES):
-            writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
+            writer.frame(name, frame, view.color, quantized(view.depth, 0.001), view.label)
         y, x = np.nonzero(view.label == OBJECT)
         cloud.append(camera.lift(np.stack([x, y], axis=1).astype(float), view.depth[y, x].astype(float)))
         masks[name] = Masks(labels=np.repeat(view.label[None], FRAMES, axis=0), backend="given")
@@ -150,10 +150,10 @@ def test_record_and_picture_say_what_is_invented(tmp_path):
             object_points=np.repeat(cloud[None, :50], 2, axis=0),
             object_visibility=np.ones((2, 50), bool),
             object_motion_valid=np.ones((2, 50), bool),
-            object_colours=np.zeros((50, 3)),
+            object_colors=np.zeros((50, 3)),
             controller_points=np.zeros((2, 1, 3)),
             cloud=cloud,
-            cloud_colours=np.zeros((len(cloud), 3)),
+            cloud_colors=np.zeros((len(cloud), 3)),
             backend="x",
         )
         pictures.append(cv2.imread(str(lifted_figure(lifted, shown, tmp_path / "lifted.png"))).astype(int))

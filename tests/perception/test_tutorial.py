@@ -55,7 +55,7 @@ def camera_files(folder: Path) -> Capture:
         (folder / "FILES" / kind).mkdir(parents=True)
     for frame in range(filmed.frame_count):
         depth = np.round(1000 * filmed.depth("0", frame)).astype(np.uint16)
-        for kind, image in (("color", filmed.colour("0", frame)[..., ::-1]), ("depth", depth)):
+        for kind, image in (("color", filmed.color("0", frame)[..., ::-1]), ("depth", depth)):
             assert cv2.imwrite(str(folder / "FILES" / kind / f"{frame:06d}.png"), image)
     k = filmed.cameras["0"].intrinsics
     named = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}

@@ -12,7 +12,7 @@ import pytest
 from neuspring.physics.contact import APPROACH
 from tests.support.scenes import ENGINES, Engine, no_hands, scene
 
-# Rounding of float64 accumulated over up to 10^4 substeps at metres and metres per second.
+# Rounding of float64 accumulated over up to 10^4 substeps at meters and meters per second.
 ROUNDING = 1e-10
 # Error ratio when the substep halves: 2 for first order; the next order contributes about dt / T, 2 % here.
 HALVING = (1.95, 2.05)
@@ -48,8 +48,8 @@ def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: 
         n = frame * substeps
         speed = [0.7 * powers[n - 1], 0, 2.0 * powers[n - 1] + gravity * partial[n - 1]]
         np.testing.assert_allclose(v[frame, 0], speed, atol=ROUNDING)
-        travelled = dt * np.array([0.7 * partial[n - 1], 0, 2.0 * partial[n - 1] + gravity * partial[:n].sum()])
-        np.testing.assert_allclose(x[frame, 0], np.array([0.1, 0, 3.0]) + travelled, atol=ROUNDING)
+        traveled = dt * np.array([0.7 * partial[n - 1], 0, 2.0 * partial[n - 1] + gravity * partial[:n].sum()])
+        np.testing.assert_allclose(x[frame, 0], np.array([0.1, 0, 3.0]) + traveled, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("drag", [0.0, 3.0])
@@ -257,7 +257,7 @@ def test_momentum_and_angular_momentum(engine: Engine, dashpot: float) -> None:
 
 
 def test_a_damped_net_comes_to_rest_in_its_frame(engine: Engine) -> None:
-    """Kinetic energy about the centre of mass and spring energy decay from frame to frame."""
+    """Kinetic energy about the center of mass and spring energy decay from frame to frame."""
     body, x0, v0, hands = net(3.0, 40)
     x, v = engine(body, x0, v0, hands)
     i, j = body.springs.T

@@ -59,7 +59,7 @@ def expected_lists(x: np.ndarray) -> list[list[int]]:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("capacity", [1, 2, 5, 500])
 def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -> None:
-    """Every list holds the first `capacity` partners in node order, whatever its neighbours' lists hold."""
+    """Every list holds the first `capacity` partners in node order, whatever its neighbors' lists hold."""
     x = clump(7, 4)
     partners, overflow = lists(x, capacity, device=device)
     wanted = expected_lists(x)

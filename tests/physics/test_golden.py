@@ -82,7 +82,7 @@ def rollout(
 
 
 @cache
-def optimised_frames(name: str, device: str, dtype: torch.dtype, restart: bool, threads: bool | None = None) -> list[Frame]:
+def optimized_frames(name: str, device: str, dtype: torch.dtype, restart: bool, threads: bool | None = None) -> list[Frame]:
     """Every frame as in the released first-order stage: state detached between frames, gradient of the frame's loss."""
     c, solver = clip(name), solver_of(name, device, dtype, True, device != "cpu" if threads is None else threads)
     frames = []
@@ -158,7 +158,7 @@ def test_a_thread_per_node_gives_what_one_thread_gives(name: str) -> None:
     positions = (rollout(name, "cpu", torch.float32, True, name not in DRAWN, threads) for threads in (None, True))
     for a, b in zip(*positions, strict=True):
         np.testing.assert_array_equal(a, b)
-    frames = (optimised_frames(name, "cpu", torch.float32, True, threads) for threads in (None, True))
+    frames = (optimized_frames(name, "cpu", torch.float32, True, threads) for threads in (None, True))
     for one, many in zip(*frames, strict=True):
         np.testing.assert_array_equal(one.losses, many.losses)
         if name in DRAWN:
@@ -166,20 +166,20 @@ def test_a_thread_per_node_gives_what_one_thread_gives(name: str) -> None:
             np.testing.assert_array_equal(one.grad_collide, many.grad_collide)
     if name not in DRAWN:
         # Impulses add to both nodes of a pair, in any order.
-        check_frames(clip(name), optimised_frames(name, "cpu", torch.float32, True, True), range(QUIET_FRAME, QUIET_FRAME + 1))
+        check_frames(clip(name), optimized_frames(name, "cpu", torch.float32, True, True), range(QUIET_FRAME, QUIET_FRAME + 1))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", DRAWN)
 def test_losses_and_gradients_of_restarted_frames(name: str, dtype: torch.dtype, device: str) -> None:
-    check_frames(clip(name), optimised_frames(name, device, dtype, True), clip(name).frames)
+    check_frames(clip(name), optimized_frames(name, device, dtype, True), clip(name).frames)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_losses_and_gradients_of_the_quiet_cloth_frame(device: str) -> None:
     name = "cloth_selfcollision"
-    check_frames(clip(name), optimised_frames(name, device, torch.float32, True), range(QUIET_FRAME, QUIET_FRAME + 1))
+    check_frames(clip(name), optimized_frames(name, device, torch.float32, True), range(QUIET_FRAME, QUIET_FRAME + 1))
 
 
 def check_frames(c: Clip, frames: list[Frame], numbers: range) -> None:
@@ -209,7 +209,7 @@ def test_contact_gradients_are_compared() -> None:
 @pytest.mark.parametrize("name", DRAWN)
 def test_losses_along_the_rollout(name: str, device: str) -> None:
     """Without restarts, as the released stages run: state carried on and detached."""
-    c, frames = clip(name), optimised_frames(name, device, torch.float32, False)
+    c, frames = clip(name), optimized_frames(name, device, torch.float32, False)
     np.testing.assert_allclose([frame.losses[3] for frame in frames], c.losses[:, 3], rtol=CLIP_LOSS)
     for k, frame in zip(c.frames, frames, strict=True):
         assert cosine(frame.grad_log_stiffness, c.grad_log_stiffness[k - 1]) > COSINE, k
@@ -220,7 +220,7 @@ def test_clamped_springs_get_no_gradient() -> None:
     c = clip("plush_drop_clamped")
     beyond = c.stiffness > c.stiffness_range[1]
     assert 0 < beyond.sum() < len(beyond)
-    for k, frame in zip(c.frames, optimised_frames(c.name, "cpu", torch.float32, True), strict=True):
+    for k, frame in zip(c.frames, optimized_frames(c.name, "cpu", torch.float32, True), strict=True):
         assert not frame.grad_log_stiffness[beyond].any()
         assert not c.grad_log_stiffness[k - 1][beyond].any()
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("viser", reason="the extra [play] is not installed")
 
-from neuspring.core.artifacts import SplatCentres
+from neuspring.core.artifacts import SplatCenters
 from neuspring.play.dress import UNIT, Dress, covariances
 from neuspring.play.results import find
 from neuspring.play.serve import start
@@ -103,7 +103,7 @@ def test_frames_may_be_shown_in_any_order_and_hidden_splats_cost_nothing(scenari
 def test_a_model_with_splats_of_its_own_moves_them_itself(scenario, server):
     splats, run = dressed(scenario), find([scenario]).runs[0]
     positions = splats.means[None] + np.arange(8)[:, None, None] * np.array([0.01, 0, 0])
-    dress = Dress(server.scene, "own", splats, run.trajectory.positions[0], SplatCentres(positions=positions))
+    dress = Dress(server.scene, "own", splats, run.trajectory.positions[0], SplatCenters(positions=positions))
     assert np.array_equal(dress.placed(run.trajectory.positions[3], 3)[0], positions[3].astype(np.float32))
 
 

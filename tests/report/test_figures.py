@@ -206,7 +206,7 @@ def test_every_shape_has_two_views_at_one_scale(path):
 
 
 @pytest.mark.parametrize("values", [5e3, 0.0, 1e-30, 1e5])
-def test_equal_stiffness_is_one_bar_and_one_colour(tmp_path, values):
+def test_equal_stiffness_is_one_bar_and_one_color(tmp_path, values):
     twin = with_stiffness(truth(), values)
     assert check_pictures(figures.run_figures(observed(), None, {}, "m", tmp_path, twin=twin, searched=values)) == {
         "topology.png",
@@ -219,7 +219,7 @@ def test_equal_stiffness_is_one_bar_and_one_colour(tmp_path, values):
     assert counts.max() == counts.sum() == len(shown)
 
 
-def test_the_colour_range_holds_most_springs_and_not_the_outliers():
+def test_the_color_range_holds_most_springs_and_not_the_outliers():
     stiffness = np.concatenate([np.geomspace(1e3, 1e4, 1000), [0.0, 1e-9]])
     low, high = figures_twin.stiffness_limits(stiffness)
     assert 900 < low < 1100 and 9000 < high <= 1e4
@@ -227,7 +227,7 @@ def test_the_colour_range_holds_most_springs_and_not_the_outliers():
     assert counts.sum() == len(stiffness)
 
 
-def test_springs_are_coloured_by_their_own_stiffness():
+def test_springs_are_colored_by_their_own_stiffness():
     twin = regional(2)
     ends = np.concatenate([twin.topology.nodes, twin.topology.controllers])[twin.topology.springs]
     law = np.poly1d([1e4, 1e3])
@@ -252,12 +252,12 @@ def test_a_twin_without_object_springs_has_no_stiffness_picture(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 10, 14])
-def test_regions_have_colours_and_lines_of_their_own(count):
+def test_regions_have_colors_and_lines_of_their_own(count):
     figure = figures_twin.topology_figure(regional(count), "m")
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert sum(name.startswith("region ") for name in names) == (count if count > 1 else 0)
     assert any("between regions" in name for name in names) == (count > 1)
-    assert len(np.unique(figures_twin.region_colours(count), axis=0)) == count
+    assert len(np.unique(figures_twin.region_colors(count), axis=0)) == count
     plt.close(figure)
 
 
@@ -291,7 +291,7 @@ def test_the_loss_of_a_baseline_has_no_unit_that_it_may_not_have():
 
 
 def chamfer(values: dict[tuple[str, str, int], float], **options) -> Collected:
-    """Future Chamfer distances in metres, and reconstruction ones half as large."""
+    """Future Chamfer distances in meters, and reconstruction ones half as large."""
     found = collected(values, **options)
     future = found.scores.assign(metric="chamfer")
     past = future.assign(task="reconstruction", value=future["value"] / 2)

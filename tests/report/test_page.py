@@ -225,7 +225,7 @@ def test_all_of_the_papers_scenarios_are_answered(tmp_path):
     assert "The data are PhysTwin's: phystwin (22 scenarios)." in section(page, "verdict")
     assert re.search(r"\d+ of 48 cells within the interval or better, \d+ worse, \d+ open", section(page, "verdict"))
     text = section(page, "studies")
-    # In words, not in colour alone.
+    # In words, not in color alone.
     assert "✓ within" in text or "▲ better" in text or "▼ worse" in text
     assert "paper 0.041 ○ not run" in text
 
@@ -304,7 +304,7 @@ def test_how_pictures_were_scored_is_said(small):
     for method in ("baseline", "neuspring"):
         report_tree.write_run(small, seen, method, 0, {"images.png": b""}, images=facts, notes=["fit: 1 epoch rolled back"])
     text = section(report(small), "scores")
-    assert "Cameras scored: 0; masks: given; rasteriser: warp" in text
+    assert "Cameras scored: 0; masks: given; rasterizer: warp" in text
     assert "LPIPS not computed: no AlexNet weights" in text
     assert "2 runs with notes rope / baseline / seed 0: fit: 1 epoch rolled back" in text
 

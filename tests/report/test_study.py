@@ -87,7 +87,7 @@ def test_the_papers_values_keep_their_digits():
         ({"reference": "table9"}, "reference: must be null or one of table1_comparison"),
         ({"rows": {"a": "x", "b": "x"}, "baseline": "a", "reference": None}, "methods must differ"),
         ({"rows": {"w/o TP": "x", "NeuSprint": "y"}, "baseline": "w/o TP"}, "also has"),
-        ({"colour": "red"}, "colour: unknown key"),
+        ({"color": "red"}, "color: unknown key"),
     ],
 )
 def test_a_wrong_study_is_refused(change, message):

@@ -99,7 +99,7 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
 def test_pictures_have_a_table_of_their_own():
     text = tables.summary_text(with_images(), "x")
     assert "Of 2 scenarios 1 have scores of pictures." in text
-    assert "Cameras scored: 0; masks: given; rasteriser: warp; none of the released evaluation's quirks." in text
+    assert "Cameras scored: 0; masks: given; rasterizer: warp; none of the released evaluation's quirks." in text
     (row,) = [line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line and "0.0500" in line]
     assert "0.9500 (0.9500)" in row
     assert "Part of the surface that no camera sees in frame 0: a 25%." in text

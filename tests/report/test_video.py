@@ -1,4 +1,4 @@
-"""Videos are read back: pictures, size, rate, colours; what is refused."""
+"""Videos are read back: pictures, size, rate, colors; what is refused."""
 
 import struct
 from pathlib import Path
@@ -18,7 +18,7 @@ def write_video(path: Path, frames, rate: float, quality: int = 20) -> None:
 
 
 def moving_square(height: int = 48, width: int = 64, count: int = 12) -> list[np.ndarray]:
-    """A square that moves to the right on a coloured ramp."""
+    """A square that moves to the right on a colored ramp."""
     ramp = np.linspace(40, 200, width)[None, :, None] * np.array([1.0, 0.6, 0.3])
     frames = []
     for k in range(count):
@@ -50,16 +50,16 @@ def test_a_video_is_read_back(tmp_path):
     assert [entry.name for entry in path.parent.iterdir()] == ["square.mp4"]
 
 
-def test_colours_are_kept(tmp_path):
-    """A wrong matrix or range shifts saturated colours by ten levels and more."""
-    colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (200, 30, 120)]
-    frames = [np.full((32, 32, 3), colour, np.uint8) for colour in colours]
-    write_video(tmp_path / "colours.mp4", frames, 5, quality=4)
-    with av.open(tmp_path / "colours.mp4") as container:
+def test_colors_are_kept(tmp_path):
+    """A wrong matrix or range shifts saturated colors by ten levels and more."""
+    colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (200, 30, 120)]
+    frames = [np.full((32, 32, 3), color, np.uint8) for color in colors]
+    write_video(tmp_path / "colors.mp4", frames, 5, quality=4)
+    with av.open(tmp_path / "colors.mp4") as container:
         stored = list(container.decode(video=0))
-    for frame, colour in zip(stored, colours, strict=True):
+    for frame, color in zip(stored, colors, strict=True):
         assert (frame.colorspace, frame.color_range) == (1, 1)
-        assert np.abs(frame.to_ndarray(format="rgb24").astype(int) - colour).max() <= 4
+        assert np.abs(frame.to_ndarray(format="rgb24").astype(int) - color).max() <= 4
 
 
 @pytest.mark.parametrize("rate", [1, 12.5, 29.97, 60, 119.88])

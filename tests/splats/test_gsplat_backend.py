@@ -13,7 +13,7 @@ from neuspring.splats import harmonics
 from neuspring.splats.blend import blend
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.project import boxes, project, radii
-from neuspring.splats.rasterise import _gsplat_fault, choose_backend, rasterise
+from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize
 from neuspring.splats.tiles import tiles
 from neuspring.splats.view import LIMITS, Limits, View
 from tests.support.random_splats import random_splats, small_view
@@ -33,7 +33,7 @@ def rasterization(
     visible = touching.nonzero().squeeze(1)
     index = ellipses.index[visible]
     flat = means.new_zeros(len(means), 2).index_put((ellipses.index,), ellipses.means)[None]
-    shade = colors[index] if sh_degree is None else harmonics.colours(colors[index], means[index] - view.position, sh_degree)
+    shade = colors[index] if sh_degree is None else harmonics.colors(colors[index], means[index] - view.position, sh_degree)
     features = torch.cat([shade, ellipses.depths[visible, None]], dim=1)
     lists = tiles(ellipses.depths[visible].detach(), rectangles[visible], view)
     total, left = blend(lists, view, limits, flat[0, index], ellipses.conics[visible], opacities[index], features)
@@ -57,7 +57,7 @@ def test_pictures_and_gradients_are_handed_on(stand_in, degree):
     if degree is not None:
         splats[4] = torch.rand(50, 9, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     options = {"degree": degree, "background": (0.1, 0.2, 0.3)}
-    ours, theirs = (rasterise(*splats, small_view(), **options, backend=name) for name in ("warp", "gsplat"))
+    ours, theirs = (rasterize(*splats, small_view(), **options, backend=name) for name in ("warp", "gsplat"))
     assert (ours.backend, theirs.backend) == ("warp", "gsplat")
     for name in ("rgb", "alpha", "depth"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-5)
@@ -71,7 +71,7 @@ def test_density_adapts_alike(stand_in):
     changes = []
     for backend in ("warp", "gsplat"):
         splats = [tensor.detach().requires_grad_() for tensor in random_splats(4, 50, torch.float32)]
-        picture = rasterise(*splats, small_view(), backend=backend)
+        picture = rasterize(*splats, small_view(), backend=backend)
         picture.rgb.sum().backward()
         statistics = Statistics.empty(splats[0])
         statistics.add(picture, 37, 29)
@@ -93,7 +93,7 @@ def test_density_adapts_alike(stand_in):
 def test_thresholds_that_gsplat_would_not_keep_are_refused(stand_in):
     splats = random_splats(0, 4, torch.float32)
     with pytest.raises(InputError, match="gsplat keeps its own thresholds"):
-        rasterise(*splats, small_view(), limits=Limits(alpha_max=0.9), backend="gsplat")
+        rasterize(*splats, small_view(), limits=Limits(alpha_max=0.9), backend="gsplat")
 
 
 @pytest.mark.cuda
@@ -105,6 +105,6 @@ def test_gsplat_draws_what_we_draw():
     view = View(view.world_to_camera.float().cuda(), view.intrinsics.float().cuda(), view.width, view.height)
     # gsplat's clamp of coverage is 0.99.
     splats[3] = splats[3].clamp(max=0.95)
-    ours, theirs = (rasterise(*splats, view, limits=LIMITS, backend=name) for name in ("warp", "gsplat"))
+    ours, theirs = (rasterize(*splats, view, limits=LIMITS, backend=name) for name in ("warp", "gsplat"))
     assert (ours.rgb - theirs.rgb).abs().mean() < 1e-4
     assert (ours.alpha - theirs.alpha).abs().mean() < 1e-4

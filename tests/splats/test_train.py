@@ -56,7 +56,7 @@ def shot_of(splats: Splats, view: View, name: str = "0", hands: np.ndarray | Non
 def quality(splats: Splats, shot: Shot) -> float:
     with torch.no_grad():
         rendered = Gaussians.of(splats).draw(shot.view)
-    return float(psnr((rendered.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.colour.permute(2, 0, 1)))
+    return float(psnr((rendered.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.color.permute(2, 0, 1)))
 
 
 @functools.cache
@@ -67,7 +67,7 @@ def recovered() -> tuple[Splats, list[Shot], Shot]:
     points = truth.means + rng.normal(0, 0.002, truth.means.shape)
     start = first_splats(points, rng.uniform(0.3, 0.7, (len(points), 3)), FAST, 0.002)
     # No part of the loss may ask for hard edges, which the truth does not have.
-    settings = dataclasses.replace(FAST, mask=0.0, position_rate=1e-3, scale_rate=0.01, opacity_rate=0.05, colour_rate=0.02)
+    settings = dataclasses.replace(FAST, mask=0.0, position_rate=1e-3, scale_rate=0.01, opacity_rate=0.05, color_rate=0.02)
     return train(start, shots, settings, 0, "warp").splats, shots, shot_of(truth, view_from(HELD_OUT))
 
 
@@ -195,7 +195,7 @@ def test_the_first_splats_follow_the_points():
     points, colors = rng.uniform(0, 0.1, (500, 3)), rng.uniform(0, 1, (500, 3))
     every = first_splats(points, colors, Appearance(), 0.002)
     assert np.allclose(every.means, points)
-    shown_colors = harmonics.colours(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
+    shown_colors = harmonics.colors(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
     assert np.allclose(shown_colors, colors, atol=1e-5)
     fewer = first_splats(points, colors, Appearance(spacing=10), 0.002)
     assert 60 < len(fewer.means) <= 216

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neuspring.config.images import ImageQuirks, LpipsWeights
-from neuspring.core.artifacts import SplatCentres
+from neuspring.core.artifacts import SplatCenters
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import HANDS, Capture
@@ -158,18 +158,18 @@ def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_p
 def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
     rollout = scene.roll(0 * STEP, "own")
     splats = Splats.load(scene.appearance.with_name("splats.ply"))
-    path = rollout.with_name("centres.npz")
-    SplatCentres(positions=splats.means + np.arange(FRAMES)[:, None, None] * STEP).save(path)
+    path = rollout.with_name("centers.npz")
+    SplatCenters(positions=splats.means + np.arange(FRAMES)[:, None, None] * STEP).save(path)
     before = StageRecord.load(rollout)
-    files = {"trajectory": rollout.with_name("trajectory.npz"), "centres": path}
+    files = {"trajectory": rollout.with_name("trajectory.npz"), "centers": path}
     Recorder("rollout", rollout).save(files)
     record, drawn = scene.render(rollout, settings())
     # The nodes stand still, the splats do not; all of them are drawn, also faint ones.
     assert record.facts["splats"] == len(splats.means)
     assert mean(drawn, "iou", FRAMES - 1) > 0.85
-    SplatCentres(positions=splats.means[None, 1:]).save(path)
+    SplatCenters(positions=splats.means[None, 1:]).save(path)
     Recorder("rollout", rollout).save(files)
-    with pytest.raises(InputError, match="one centre for each of"):
+    with pytest.raises(InputError, match="one center for each of"):
         scene.render(rollout, settings())
     before.save(rollout)
 
@@ -183,7 +183,7 @@ def test_pictures_of_any_camera_and_frame(scene, tmp_path):
     black = cv2.imread(str(draw.run(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
     assert white.shape == (SIZE[1], SIZE[0], 4)
     assert np.array_equal(white[..., 3], black[..., 3])
-    # Over a background c the colour is colour over black + (1 - coverage) c.
+    # Over a background c the color is color over black + (1 - coverage) c.
     assert np.abs(white[..., :3].astype(int) - black[..., :3] - (255 - black[..., 3:].astype(int))).max() <= 2
     with pytest.raises(InputError, match="must be a camera of"):
         draw.run(*common, "7", None, "black", settings(), "cpu", tmp_path)

@@ -16,7 +16,7 @@ from neuspring.config.baselines import Baselines
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.config.images import Appearance, Images
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.core.artifacts import Observations, SplatCentres, Trajectory
+from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.scores import metrics
@@ -26,7 +26,7 @@ from tests.support import small
 from tests.support.filmed import FRAMES, film
 from tests.support.pictured import Scene, pictured
 
-POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbours=8, full_neighbours=6, bound_anchors=6)
+POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbors=8, full_neighbors=6, bound_anchors=6)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
 NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002, particles=20)
 
@@ -122,10 +122,10 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
     train.run(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", out, pictures)
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
-    lonely = settings(spring_gaus=replace(POINTS, neighbours=500))
+    lonely = settings(spring_gaus=replace(POINTS, neighbors=500))
     run = run_all(seen, "spring_gaus", lonely)
     record = json.loads(run.read_text())
-    assert record["status"] == "failed" and "more anchors than neighbours (500) are required" in record["reason"]
+    assert record["status"] == "failed" and "more anchors than neighbors (500) are required" in record["reason"]
     assert set(pd.read_parquet(run.with_name(record["held_file"]))["task"]) == {"reconstruction", "future"}
 
 
@@ -164,15 +164,15 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     assert {"masks0", "appearance", "observations"} <= set(trained.inputs)
     predict.run(seen, "spring_gaus", out / "train.json", filmed.appearance, "cpu", out / "rollout.json")
     record = StageRecord.load(out / "rollout.json")
-    centres = SplatCentres.load(record.file("centres", out / "rollout.json")).positions
+    centers = SplatCenters.load(record.file("centers", out / "rollout.json")).positions
     trajectory = Trajectory.load(record.file("trajectory", out / "rollout.json"))
-    assert len(centres) == len(trajectory.positions) == FRAMES
+    assert len(centers) == len(trajectory.positions) == FRAMES
     # Structure points begin where they are; splats, bound by absolute positions, already shrink towards their anchors.
     np.testing.assert_allclose(trajectory.positions[0], Observations.load(seen).nodes, atol=1e-6)
     assert record.facts["frame0_shift"] > 0
-    assert record.facts["centres_chamfer_reconstruction"] > 0
+    assert record.facts["centers_chamfer_reconstruction"] > 0
     drawn, _ = filmed.render(out / "rollout.json", pictured())
-    assert drawn.status == "ok" and drawn.facts["splats"] == centres.shape[1]
+    assert drawn.status == "ok" and drawn.facts["splats"] == centers.shape[1]
     run = out / "run.json"
     records = {"train": out / "train.json", "rollout": out / "rollout.json", "render": out / "render.json"}
     score.run(seen, records | {"appearance": filmed.appearance}, "spring_gaus", {}, 0, run)

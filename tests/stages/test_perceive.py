@@ -150,7 +150,7 @@ def test_every_camera_s_records_are_required(tmp_path, whole):
 
 def test_too_few_controllers_say_what_to_change(tmp_path, whole):
     _, _, folder = whole
-    settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighbourhood=0.02, least_controllers=3000)))
+    settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighborhood=0.02, least_controllers=3000)))
     records = [[folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")]
     with pytest.raises(InputError, match=r"at least 3000 points of the hands.*perception\.lift has controller_gaps"):
         lift.run(whole[0].folder, *records, settings, tmp_path / "lifted.json")

@@ -12,7 +12,7 @@ VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
 
 def trace(*rows: tuple[str, float, float, float, float, float]) -> pd.DataFrame:
     """Rows of stage, cost, and the normalized variables."""
-    return pd.DataFrame(rows, columns=["stage", "cost", *(f"normalised.{name}" for name in VARIABLES)])
+    return pd.DataFrame(rows, columns=["stage", "cost", *(f"normalized.{name}" for name in VARIABLES)])
 
 
 def test_variables_at_the_ends_of_their_ranges_are_named():

@@ -201,7 +201,7 @@ def test_the_same_results_have_the_same_key(finished, tmp_path):
     assert first["run_key"] == second["run_key"]
 
 
-def test_a_missing_or_changed_artefact_is_an_error_that_says_what_to_do(finished, tmp_path):
+def test_a_missing_or_changed_artifact_is_an_error_that_says_what_to_do(finished, tmp_path):
     twin = tmp_path / "twin.npz"
     _, run, _ = finished
     record = tmp_path / "fit.json"

@@ -14,7 +14,7 @@ from neuspring.data.synthetic.hands import SKIN
 from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import Part, Renderer
-from neuspring.data.synthetic.sensor import quantised
+from neuspring.data.synthetic.sensor import quantized
 from tests.support.phystwin_case import dump, write_json
 
 FRAMES = 6
@@ -74,7 +74,7 @@ def film(
             entry, pose = upright[name]
             if frame not in entry.missing:
                 view = renderer.render(type(camera)(name, camera.width, camera.height, camera.intrinsics, pose))
-                writer.frame(name, frame, view.colour, quantised(view.depth, 0.001), view.label)
+                writer.frame(name, frame, view.color, quantized(view.depth, 0.001), view.label)
     annotated = vertices[:: len(vertices) // 20]
     return writer.finish((annotated + np.arange(FRAMES)[:, None, None] * STEP) @ turn[:3, :3].T)
 
@@ -99,7 +99,7 @@ def write_raw(capture: Capture, case: Path) -> Path:
         for frame in range(capture.frame_count):
             for kind in ("color", "depth"):
                 (case / kind / name).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(case / "color" / name / f"{frame}.png"), capture.colour(name, frame)[..., ::-1])
+            cv2.imwrite(str(case / "color" / name / f"{frame}.png"), capture.color(name, frame)[..., ::-1])
             np.save(case / "depth" / name / f"{frame}.npy", np.round(1000 * capture.depth(name, frame)).astype(np.uint16))
             for detection, label in (("0", OBJECT), ("1", HANDS)):
                 path = case / "mask" / name / detection / f"{frame}.png"

@@ -15,7 +15,7 @@ SETTINGS = Config(
     scenarios=("film",),
     perception=Perception(
         track=PointTracking(opencv=OpenCvTracking(points=400)),
-        lift=Lift(neighbourhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
+        lift=Lift(neighborhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
         sample=Sampling(voxel=0.015),
     ),
 )

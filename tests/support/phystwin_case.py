@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 WIDTH, HEIGHT = 64, 48
-OBJECT_RADIUS, OBJECT_NEIGHBOURS = 0.025, 10
-CONTROLLER_RADIUS, CONTROLLER_NEIGHBOURS = 0.06, 10
+OBJECT_RADIUS, OBJECT_NEIGHBORS = 0.025, 10
+CONTROLLER_RADIUS, CONTROLLER_NEIGHBORS = 0.06, 10
 
 
 def dump(path: Path, value: Any, protocol: int = 4) -> None:
@@ -95,13 +95,13 @@ def write_results(folder: Path) -> None:
     motion = data["controller_points"][:, 0] - data["controller_points"][0, 0]
     dump(root / "experiments" / name / "inference.pkl", (rest + motion[:, None]).astype(np.float32))
     hands = data["controller_points"][0].astype(np.float32)
-    topology = uniform_topology(rest, hands, OBJECT_RADIUS, OBJECT_NEIGHBOURS, CONTROLLER_RADIUS, CONTROLLER_NEIGHBOURS)
+    topology = uniform_topology(rest, hands, OBJECT_RADIUS, OBJECT_NEIGHBORS, CONTROLLER_RADIUS, CONTROLLER_NEIGHBORS)
     parameters = {
         "global_spring_Y": np.float64(3e4),
         "object_radius": np.float64(OBJECT_RADIUS),
-        "object_max_neighbours": OBJECT_NEIGHBOURS,
+        "object_max_neighbours": OBJECT_NEIGHBORS,
         "controller_radius": np.float64(CONTROLLER_RADIUS),
-        "controller_max_neighbours": CONTROLLER_NEIGHBOURS,
+        "controller_max_neighbours": CONTROLLER_NEIGHBORS,
         "collide_elas": np.float32(0.5),
         "collide_fric": np.float32(0.3),
         "collide_object_elas": np.float32(0.7),
@@ -128,8 +128,8 @@ def write_raw_frame(folder: Path, *, mirrored: bool) -> None:
     row, column = pixels // WIDTH, pixels % WIDTH
     depth = rng.integers(300, 480, (HEIGHT, WIDTH)).astype(np.uint16)
     z = depth[row, column] / 1000
-    centre = WIDTH - intrinsics[0, 2] if mirrored else intrinsics[0, 2]
-    lifted = np.stack([z * (column - centre) / 60, z * (row - intrinsics[1, 2]) / 60, z], axis=1) + pose[:3, 3]
+    center = WIDTH - intrinsics[0, 2] if mirrored else intrinsics[0, 2]
+    lifted = np.stack([z * (column - center) / 60, z * (row - intrinsics[1, 2]) / 60, z], axis=1) + pose[:3, 3]
     data = pickle.loads((folder / "final_data.pkl").read_bytes())
     points = np.unique(lifted, axis=0)[: data["object_points"].shape[1]]
     data["object_points"][0] = points

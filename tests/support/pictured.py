@@ -14,7 +14,7 @@ from neuspring.stages import appearance, render
 from tests.support.filmed import FRAMES
 from tests.support.perceived import SETTINGS, perceived
 
-IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, colour_rate=0.02, opacity_rate=0.05))
+IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, color_rate=0.02, opacity_rate=0.05))
 
 
 def pictured(**changes: object) -> Config:

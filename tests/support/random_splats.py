@@ -7,7 +7,7 @@ from neuspring.splats.view import View
 
 
 def random_splats(seed: int, count: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    """Means, quaternions, scales, opacities and colors, as `rasterise` takes them, before `small_view`."""
+    """Means, quaternions, scales, opacities and colors, as `rasterize` takes them, before `small_view`."""
     rng = np.random.default_rng(seed)
     arrays = [
         rng.uniform([-0.6, -0.5, 0.4], [0.6, 0.5, 2.0], (count, 3)),

@@ -1,6 +1,6 @@
 """A small case with everything that PhysTwin released about it, in its layout, made by other code than that which is checked:
 
-prediction by the float64 reference simulation, pictures by the rasteriser's specification, deprojection written out.
+prediction by the float64 reference simulation, pictures by the rasterizer's specification, deprojection written out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from neuspring.data.unpickle import load_pickle
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
 from neuspring.scores.released.findings import Published
-from neuspring.splats import reference as rasteriser
+from neuspring.splats import reference as rasterizer
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
@@ -29,7 +29,7 @@ from neuspring.twin.topology import uniform_topology
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-CENTRES = ((37.0, 24.0), (35.5, 25.0), (30.5, 23.0))
+CENTERS = ((37.0, 24.0), (35.5, 25.0), (30.5, 23.0))
 """Principal points of the three cameras."""
 FRAMES, POINTS = 6, 40
 TRAIN_END = int(0.7 * FRAMES)
@@ -67,7 +67,7 @@ def poses() -> list[np.ndarray]:
 
 def intrinsics(camera: int) -> np.ndarray:
     """K of a camera."""
-    cx, cy = CENTRES[camera]
+    cx, cy = CENTERS[camera]
     return np.array([[FOCAL, 0.0, cx], [0.0, FOCAL, cy], [0.0, 0.0, 1.0]])
 
 
@@ -98,8 +98,8 @@ def write_raw(case: Released, mirrored: bool) -> None:
         case.first_depth(str(camera)).parent.mkdir(parents=True)
         np.save(case.first_depth(str(camera)), depth)
         z = depth[row, column] / 1000
-        centre = WIDTH - CENTRES[camera][0] if mirrored else CENTRES[camera][0]
-        local = np.stack([z * (column - centre) / FOCAL, z * (row - CENTRES[camera][1]) / FOCAL, z], axis=1)
+        center = WIDTH - CENTERS[camera][0] if mirrored else CENTERS[camera][0]
+        local = np.stack([z * (column - center) / FOCAL, z * (row - CENTERS[camera][1]) / FOCAL, z], axis=1)
         lifted.append((local @ pose[:3, :3].T + pose[:3, 3])[visible & (z > 0)])
     choice = rng.choice(sum(map(len, lifted)), POINTS, replace=False)
     rest = np.unique(np.concatenate(lifted)[choice], axis=0)
@@ -141,7 +141,7 @@ def write_parameters(case: Released, **changes: Any) -> None:
 def write_checkpoint(case: Released, nodes: np.ndarray, hands: np.ndarray, self_collision: bool) -> Twin:
     """best_199.pth, scalars beyond their clamps among it; the twin, whose scalars are clamped."""
     p = parameters()
-    sizes = [p[f"{who}_{what}"] for who in ("object", "controller") for what in ("radius", "max_neighbours")]
+    sizes = [p[f"{who}_{what}"] for who in ("object", "controller") for what in ("radius", "max_neighbors")]
     topology = uniform_topology(nodes, hands, *sizes)
     stiffness = np.random.default_rng(3).uniform(1e3, 5e3, len(topology.springs)).astype(np.float32)
     stiffness[0] = 1.2e5
@@ -178,9 +178,9 @@ def write_pictures(case: Released, nodes: np.ndarray) -> None:
     """One splat per node, and what cameras and evaluation saw: the moved splats, other colors in part, masks shifted."""
     rng = np.random.default_rng(4)
     path = case.root / "gaussian_output" / case.name / SPLATS
-    colours = rng.uniform(0.2, 0.9, (len(nodes), 3)).astype(np.float32)
+    colors = rng.uniform(0.2, 0.9, (len(nodes), 3)).astype(np.float32)
     harmonics = np.zeros((len(nodes), 16, 3), np.float32)
-    harmonics[:, 0] = (colours - 0.5) / C0
+    harmonics[:, 0] = (colors - 0.5) / C0
     opacity = np.where(np.arange(len(nodes)) % 9 == 0, -3.0, 2.0).astype(np.float32)
     turned = np.tile(np.array([[1, 0, 0, 0]], np.float32), (len(nodes), 1))
     scales = np.full((len(nodes), 1), np.log(0.006), np.float32)
@@ -208,12 +208,12 @@ def drawn(case: Released) -> list[np.ndarray]:
     opaque = splats.opacity_logits > np.log(0.1 / 0.9)
     view = View(torch.tensor(np.linalg.inv(poses()[0])), torch.tensor(intrinsics(1)), WIDTH, HEIGHT)
     positions = positions_of(case)
-    colours = torch.tensor(0.5 + C0 * splats.harmonics[opaque, 0], dtype=torch.float64).clamp_min(0)
+    colors = torch.tensor(0.5 + C0 * splats.harmonics[opaque, 0], dtype=torch.float64).clamp_min(0)
     opacity = torch.sigmoid(torch.tensor(splats.opacity_logits[opaque], dtype=torch.float64))
     scales = torch.exp(torch.tensor(splats.log_scales[opaque], dtype=torch.float64)).expand(-1, 3)
     skin, pictures = Skin(positions[0], released_degeneracy=True), []
     for means, turned in skin.carry(positions, torch.tensor(splats.means[opaque]), torch.tensor(splats.quaternions[opaque])):
-        rgb, alpha, _ = rasteriser.rasterise(means.double(), turned.double(), scales, opacity, colours, view)
+        rgb, alpha, _ = rasterizer.rasterize(means.double(), turned.double(), scales, opacity, colors, view)
         picture = torch.cat([rgb, alpha[..., None]], dim=2).clamp(0, 1)
         pictures.append((255 * picture + 0.5).floor().to(torch.uint8).numpy())
     return pictures
@@ -248,7 +248,7 @@ def picture_scores(case: Released) -> dict[str, list[float]]:
     """PSNR and IoU per frame."""
     scores: dict[str, list[float]] = {"psnr": [], "iou": []}
     for t, rgba in enumerate(drawn(case)):
-        observed = cv2.imread(str(case.colours / f"{t}.png"))[..., ::-1] / 255
+        observed = cv2.imread(str(case.colors / f"{t}.png"))[..., ::-1] / 255
         mask, human = (cv2.imread(str(f / f"{t}.png"), cv2.IMREAD_GRAYSCALE) / 255 for f in (case.object_masks, case.human_masks))
         shown = (1 - human)[..., None]
         error = observed * mask[..., None] * shown - rgba[..., :3] / 255 * shown

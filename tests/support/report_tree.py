@@ -153,7 +153,7 @@ def attempt(start: float, seconds: float, **changes: Any) -> Attempt:
     failed = changes.get("outcome", "ok") not in ("ok", "running")
     values: dict[str, Any] = {
         **{"started": stamp.isoformat(), "seconds": seconds, "waited": 2.0, "outcome": "ok", "host": "server", "exit": int(failed)},
-        **{"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "peak_gpu_memory_mb": 5000.0, "gpu_utilisation": 83.0},
+        **{"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "peak_gpu_memory_mb": 5000.0, "gpu_utilization": 83.0},
         **{"cause": "out of GPU memory" if failed else "", "message": "CUDA error: out of memory" if failed else ""},
         "cpu_seconds": 1.1 * seconds,
     }

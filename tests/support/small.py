@@ -74,7 +74,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 
 def start_values() -> dict[str, float]:
     """Physical values near the truth of the default scene, stiffness too low."""
-    own = {"object_radius": 0.045, "object_neighbours": 18.0, "stiffness": 6e3, "drag": 1.0, "dashpot": 20.0}
+    own = {"object_radius": 0.045, "object_neighbors": 18.0, "stiffness": 6e3, "drag": 1.0, "dashpot": 20.0}
     search = released(start=own)
     return {name: float(value) for name, value in config.plain(search.start).items() if name not in search.absent}
 

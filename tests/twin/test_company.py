@@ -25,7 +25,7 @@ def several() -> list[FitProblem]:
     """Springs and fields, topologies and substeps of their own, in step and out of step."""
     values = small.start_values()
     base = small.fit_problem()
-    coarse = small.fit_problem(values=values | {"object_neighbours": 7.0, "stiffness": 2e4})
+    coarse = small.fit_problem(values=values | {"object_neighbors": 7.0, "stiffness": 2e4})
     return [
         base,
         replace(base, fit=replace(base.fit, learning_rate=2e-2)),

@@ -15,7 +15,7 @@ from tests.support import small
 EXACT = 1e-12
 """Absolute, for values of order 1 in float64: the same sums in another order."""
 STEPS = 1e-8
-"""Absolute, for weights of order 1 after optimiser steps in float64: Adam divides by gradients, which magnifies rounding."""
+"""Absolute, for weights of order 1 after optimizer steps in float64: Adam divides by gradients, which magnifies rounding."""
 SMALL = {"channels": 3, "hidden": 8, "bands": 2}
 FOURIER = ("feature", "coordinates", "both", "none")
 
@@ -32,11 +32,11 @@ def field_of(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **se
 
 def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
     """A few steps towards `target` [S, outputs]."""
-    optimiser = torch.optim.Adam(field.parameters(), lr=1e-2)
+    optimizer = torch.optim.Adam(field.parameters(), lr=1e-2)
     for _ in range(steps):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         (field() - target).square().mean().backward()
-        optimiser.step()
+        optimizer.step()
 
 
 # The start ------------------------------------------------------------------------------------------------------------
@@ -220,11 +220,11 @@ def test_texels_in_use_take_the_same_steps_as_full_planes():
     full.requires_grad_()
     target = torch.randn(len(at), 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for parameter, features in ((planes.texels, planes), (full, lambda: sample(full, at))):
-        optimiser = torch.optim.AdamW([parameter], lr=1e-2, weight_decay=0.0)
+        optimizer = torch.optim.AdamW([parameter], lr=1e-2, weight_decay=0.0)
         for _ in range(3):
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             (features() - target).square().mean().backward()
-            optimiser.step()
+            optimizer.step()
     active = np.unique(bilinear(at, resolution)[0])
     flat, start = (values.detach().permute(0, 2, 3, 1).reshape(-1, 4) for values in (full, first))
     assert 0 < len(active) == len(planes.texels) < 3 * resolution**2
@@ -235,7 +235,7 @@ def test_texels_in_use_take_the_same_steps_as_full_planes():
 
 
 def test_roughness_by_hand():
-    """N = 2, one point inside: all four texels of each plane are in use, so each plane has four pairs of neighbours."""
+    """N = 2, one point inside: all four texels of each plane are in use, so each plane has four pairs of neighbors."""
     planes, full = dense(np.zeros((1, 3)), 2, 2, 1.0)
     squares = []
     for plane in full:
@@ -245,7 +245,7 @@ def test_roughness_by_hand():
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])
-def test_roughness_counts_neighbours_in_use_and_no_others(count):
+def test_roughness_counts_neighbors_in_use_and_no_others(count):
     """Neither across the end of a row nor from one plane to the next, nor texels that no point reads."""
     at, resolution = scattered()[:count], 5
     planes, full = dense(at, resolution, 2, 1.0)

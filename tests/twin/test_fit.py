@@ -81,7 +81,7 @@ def test_the_whole_horizon_gradient_moves_stiffness_towards_the_truth():
 
 
 GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0, checkpoint_every=1)}
-REGULARISED = {"kind": "field", "fit": field_fit(epochs=3, field=replace(FIELD, weight_decay=1e-3, plane_smoothness=1e-3))}
+REGULARIZED = {"kind": "field", "fit": field_fit(epochs=3, field=replace(FIELD, weight_decay=1e-3, plane_smoothness=1e-3))}
 EVERYTHING = {
     "kind": "field",
     "fit": field_fit(
@@ -118,7 +118,7 @@ LIMITED = {
         ({}, 3),
         (GROWING, 8),
         (GROWING, 10),
-        (REGULARISED, 3),
+        (REGULARIZED, 3),
         (EVERYTHING, 2),
         (EVERYTHING, 4),
         (LIMITED, 3),
@@ -210,7 +210,7 @@ def test_gradient_clipping_limits_the_step():
     for limit in (0.0, 1e-9):
         run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, clip_gradient_norm=limit, betas=(0.0, 0.0))))
         run.epoch()
-        runs[limit] = np.linalg.norm(adam_arrays(run.optimiser)["0.exp_avg"])
+        runs[limit] = np.linalg.norm(adam_arrays(run.optimizer)["0.exp_avg"])
     assert runs[1e-9] <= 1.01e-9 < runs[0.0]
 
 
@@ -408,7 +408,7 @@ def test_schedules_set_the_rates_that_their_formulas_say(schedule, warmup):
         # Rollbacks halve every rate.
         for halved in (1.0, 0.25):
             run.start_epoch(epoch, halved)
-            rates = [group["lr"] for group in run.optimiser.param_groups]
+            rates = [group["lr"] for group in run.optimizer.param_groups]
             assert rates == pytest.approx([halved * factor * rate for rate in (0.1, 0.2, 0.3)], rel=RATE)
 
 

@@ -97,7 +97,7 @@ def test_gradients_are_those_of_the_loss_in_its_unit():
     for unit in ("meter", "spacing"):
         run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, loss_unit=unit, betas=(0.0, 0.0), horizon=0)))
         row = run.epoch()
-        first[unit] = (adam_arrays(run.optimiser)["0.exp_avg"], row["loss"])
+        first[unit] = (adam_arrays(run.optimizer)["0.exp_avg"], row["loss"])
     spacing = topology_spacing(small.fit_problem().twin.topology)
     np.testing.assert_allclose(
         first["spacing"][0], first["meter"][0] / spacing**2, rtol=SINGLE, atol=SINGLE * np.abs(first["spacing"][0]).max()

@@ -126,7 +126,7 @@ def test_steps_of_a_polish_cost_the_mean_over_the_recordings():
     trace = traced(problem)
     rows = trace[trace["stage"] == POLISH]
     assert len(rows) == 4
-    population = rows[[f"normalised.{name}" for name in problem.variables]].to_numpy()
+    population = rows[[f"normalized.{name}" for name in problem.variables]].to_numpy()
     apart = [
         module._evaluate(each, population, loss, 0, 0, map)
         for each in (replace(problem, pool=()), replace(problem, leave_out=True))

@@ -129,12 +129,12 @@ def test_what_made_a_topology_is_read_from_its_springs():
     nodes = grid((0.3, 0.2, 0.06), 0.02)
     labels = (nodes[:, 0] > 0).astype(np.int32)
     topology = piecewise_topology(nodes, hands_of((0.3, 0, 0)), labels, [0.05, 0.035], [12, 40], 0.06, 9)
-    radii, neighbours = asked(topology)
+    radii, neighbors = asked(topology)
     reach, held = held_by_hands(topology)
     # By both: in region 0 the count limits, in region 1 the radius.
-    assert neighbours[0] == 12
+    assert neighbors[0] == 12
     assert 0.033 < radii[1] <= 0.035
-    again = piecewise_topology(nodes, topology.controllers, labels, radii, neighbours, reach, held)
+    again = piecewise_topology(nodes, topology.controllers, labels, radii, neighbors, reach, held)
     assert {frozenset(pair) for pair in again.springs.tolist()} == {frozenset(pair) for pair in topology.springs.tolist()}
 
 

@@ -32,9 +32,9 @@ from tests.support.searches import assert_same_trace, budget
 RELEASED = {
     "stiffness": 0.3,
     "object_radius": 0.25,
-    "object_neighbours": 0.5,
+    "object_neighbors": 0.5,
     "controller_radius": 3 / 7,
-    "controller_neighbours": 4 / 7,
+    "controller_neighbors": 4 / 7,
     "ground_elasticity": 0.5,
     "ground_friction": 0.15,
     "contact_elasticity": 0.7,
@@ -47,9 +47,9 @@ RELEASED = {
 RELEASED_RANGES = {
     "stiffness": (0.0, 1e5),
     "object_radius": (0.01, 0.05),
-    "object_neighbours": (10, 50),
+    "object_neighbors": (10, 50),
     "controller_radius": (0.01, 0.08),
-    "controller_neighbours": (10, 80),
+    "controller_neighbors": (10, 80),
     "ground_elasticity": (0.0, 1.0),
     "ground_friction": (0.0, 2.0),
     "contact_elasticity": (0.0, 1.0),
@@ -89,7 +89,7 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     problem = plain(clusters=clusters)
     assert len(problem.variables) == 2 * clusters + 10
     regional = [name for name in problem.variables if "." in name]
-    assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbours") for region in range(clusters)]
+    assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbors") for region in range(clusters)]
     # Every region starts where the uniform search does.
     start = dict(zip(problem.variables, problem.encode(), strict=True))
     assert start == pytest.approx({name: RELEASED[name.partition(".")[0]] for name in start}, rel=CODING)
@@ -129,10 +129,10 @@ def test_the_logarithmic_scale_of_stiffness():
 
 
 @given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
-def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalised, scale):
+def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalized, scale):
     for clusters in (1, 3):
         problem = plain(clusters=clusters, ranges={"stiffness": [1.0, 1e5]}, scales={"stiffness": scale})
-        for name, value in problem.decode(np.array(normalised[: 2 * clusters + 10])).items():
+        for name, value in problem.decode(np.array(normalized[: 2 * clusters + 10])).items():
             base = name.partition(".")[0]
             low, high = getattr(problem.search.ranges, base)
             assert low * (1 - CODING) <= value <= high * (1 + CODING)
@@ -205,7 +205,7 @@ def test_fixed_variables_keep_their_start():
     assert (result.trace["drag"] == 0).all()
     assert (result.trace["object_radius"] == 2.5 * problem.spacing).all()
     assert result.twin.material.drag == 0
-    assert not {"normalised.drag", "normalised.object_radius"} & set(result.trace)
+    assert not {"normalized.drag", "normalized.object_radius"} & set(result.trace)
 
 
 def test_a_fixed_radius_is_that_of_every_region():
@@ -219,11 +219,11 @@ def test_the_released_row_is_the_search_as_it_was(clusters):
     """Bit for bit: the linear formula on the released ranges, and CMA-ES from the released start, told the same costs."""
     trace = search(small.search_problem(search=small.released(rollouts=24), clusters=clusters), seed=3).trace
     ranges = RELEASED_RANGES
-    names = [n for n in trace if n.removeprefix("normalised.") != n]
-    start = [RELEASED[n.removeprefix("normalised.").partition(".")[0]] for n in names]
-    for name in (n.removeprefix("normalised.") for n in names):
+    names = [n for n in trace if n.removeprefix("normalized.") != n]
+    start = [RELEASED[n.removeprefix("normalized.").partition(".")[0]] for n in names]
+    for name in (n.removeprefix("normalized.") for n in names):
         low, high = ranges[name.partition(".")[0]]
-        value = low + trace[f"normalised.{name}"] * (high - low)
+        value = low + trace[f"normalized.{name}"] * (high - low)
         whole = name.partition(".")[0] in module.INTEGERS
         np.testing.assert_array_equal(trace[name], value.astype(int) if whole else value)
     options = {"bounds": [0, 1], "seed": 4, "verbose": -9, "tolfun": 0, "tolx": 0}
@@ -240,7 +240,7 @@ def test_the_released_row_is_the_search_as_it_was(clusters):
 
 def test_equal_regions_are_the_uniform_candidate():
     values = small.start_values()
-    regional = {f"{name}.{region}": values[name] for name in ("object_radius", "object_neighbours") for region in range(3)}
+    regional = {f"{name}.{region}": values[name] for name in ("object_radius", "object_neighbors") for region in range(3)}
     uniform, pieces = candidate(small.search_problem(), values), candidate(small.search_problem(clusters=3), values | regional)
     np.testing.assert_array_equal(pieces.topology.springs, uniform.topology.springs)
     assert pieces.simulation == uniform.simulation
@@ -249,7 +249,7 @@ def test_equal_regions_are_the_uniform_candidate():
 
 def test_a_region_s_values_reach_its_own_nodes():
     values = small.start_values()
-    regional = {"object_radius.0": 0.03, "object_radius.1": 0.045, "object_neighbours.0": 5.0, "object_neighbours.1": 18.0}
+    regional = {"object_radius.0": 0.03, "object_radius.1": 0.045, "object_neighbors.0": 5.0, "object_neighbors.1": 18.0}
     problem = small.search_problem(clusters=2)
     topology = candidate(problem, values | regional).topology
     inner = topology.springs[: topology.object_spring_count]
@@ -267,7 +267,7 @@ def test_regions_and_candidates_are_made_on_the_rest_shape():
     problem = small.search_problem(replace(seen, rest_shape=shape), clusters=3)
     np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3, config.Clusters()))
     assert (problem.labels != small.search_problem(clusters=3).labels).any()
-    regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbours") for r in range(3)}
+    regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbors") for r in range(3)}
     topology = candidate(problem, small.start_values() | regional).topology
     np.testing.assert_array_equal(topology.nodes, seen.nodes)
     np.testing.assert_allclose(topology.rest_lengths, distances(shape, topology.springs), rtol=FLOAT32_LENGTHS)
@@ -278,7 +278,7 @@ def loosely(**changes: object) -> SearchProblem:
     return small.search_problem(search=small.released(ranges={"object_radius": [0.001, 0.05]}, **changes))
 
 
-def test_isolated_nodes_are_repaired_penalised_or_left():
+def test_isolated_nodes_are_repaired_penalized_or_left():
     values = small.start_values() | {"object_radius": 0.005}
     count = len(small.observations().nodes)
     left = candidate(loosely(isolated_nodes="allow"), values)
@@ -286,11 +286,11 @@ def test_isolated_nodes_are_repaired_penalised_or_left():
     assert 0 < len(alone) < count
     assert left.topology.object_spring_count == 0
     with pytest.raises(NumericalFailure, match=f"{len(alone)} nodes have no spring, the first is node {alone[0]}"):
-        candidate(loosely(isolated_nodes="penalise"), values)
+        candidate(loosely(isolated_nodes="penalize"), values)
     mended = candidate(loosely(isolated_nodes="repair"), values)
     assert len(isolated(count, mended.topology.springs)) == 0
     # Nothing is isolated: the three are the same.
-    whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "penalise", "allow")]
+    whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "penalize", "allow")]
     for other in whole[1:]:
         np.testing.assert_array_equal(other.topology.springs, whole[0].topology.springs)
 
@@ -302,10 +302,10 @@ def test_allow_is_the_released_topology():
     np.testing.assert_array_equal(topology.springs, released.springs)
 
 
-def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
+def test_a_candidate_with_isolated_nodes_is_penalized_not_fatal():
     """Radii around the distance of the rope's rings: some candidates leave nodes alone."""
     ranges, start = {"object_radius": [0.001, 0.03]}, {"object_radius": 0.012}
-    settings = small.released(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalise")
+    settings = small.released(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalize")
     trace = search(small.search_problem(search=settings), seed=0).trace
     refused = trace[trace["reason"].str.contains("nodes have no spring")]
     assert 0 < len(refused) < len(trace)
@@ -316,10 +316,10 @@ def test_a_candidate_with_isolated_nodes_is_penalised_not_fatal():
 # The search -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_truth_costs_less_than_its_neighbours():
+def test_the_truth_costs_less_than_its_neighbors():
     problem = small.search_problem()
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbours": 12.0}
+    values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbors": 12.0}
     values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
     twins = [candidate(problem, values | {"stiffness": s}) for s in (2e3, 1.2e4, 9e4)]
     by_stiffness = [outcome.cost for outcome in judge(problem, twins, loss)]
@@ -337,7 +337,7 @@ def test_the_best_evaluated_candidate_wins_within_the_budget():
 
 
 def test_seeds_decide_the_candidates():
-    columns = [f"normalised.{name}" for name in RELEASED]
+    columns = [f"normalized.{name}" for name in RELEASED]
     runs = [search(small.search_problem(), seed).trace[columns].to_numpy() for seed in (0, 0, 1)]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
@@ -422,14 +422,14 @@ def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best(
     np.testing.assert_array_equal(trace["cost"][:15], uniform["cost"])
     for name in RELEASED:
         regional = name in module.REGIONAL
-        for column in [f"normalised.{name}.{region}" for region in range(3)] if regional else [f"normalised.{name}"]:
-            np.testing.assert_array_equal(trace[column][:15], uniform[f"normalised.{name}"])
-    radii = trace[[f"normalised.object_radius.{region}" for region in range(3)]][15:]
+        for column in [f"normalized.{name}.{region}" for region in range(3)] if regional else [f"normalized.{name}"]:
+            np.testing.assert_array_equal(trace[column][:15], uniform[f"normalized.{name}"])
+    radii = trace[[f"normalized.object_radius.{region}" for region in range(3)]][15:]
     assert (radii.nunique(axis=1) == 3).all()
     # 12 candidates for 16 variables, drawn around the best of the uniform ones: their mean is within four standard errors.
     start = uniform.loc[uniform["cost"].idxmin()]
     sigma = config.Search().freed_sigma
-    names = [column for column in trace if column.startswith("normalised.")]
+    names = [column for column in trace if column.startswith("normalized.")]
     inside = [n for n in names if 0.2 < start[re.sub(r"\.\d$", "", n)] < 0.8]  # away from the bounds, where steps are folded back
     assert len(inside) > 8
     for name in inside:
@@ -456,7 +456,7 @@ def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_
     assert "other inputs or settings" in capsys.readouterr().out
     assert (other.attempts, other.cost) == (1, first.cost)
     table = pd.read_parquet(record)
-    table.loc[0, "normalised.drag"] += 0.01
+    table.loc[0, "normalized.drag"] += 0.01
     table.to_parquet(record)
     forged = search(small.search_problem(), seed=0, record=record, key="two")
     assert "does not replay" in capsys.readouterr().out
@@ -467,7 +467,7 @@ def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys)
     record = tmp_path / "trace.parquet"
     whole = search(budget(15), seed=0, record=record, key="k")
     table = pd.read_parquet(record)
-    table.loc[12, "normalised.drag"] += 0.01
+    table.loc[12, "normalized.drag"] += 0.01
     table.to_parquet(record)
     mended = search(budget(15), seed=0, record=record, key="k")
     assert "continues afresh from rollout 11" in capsys.readouterr().out
@@ -529,14 +529,14 @@ def test_released_quirks_of_the_search():
     assert result.trace["drag"].mod(1).ne(0).any()
 
 
-def test_an_unstable_candidate_is_penalised_not_fatal():
+def test_an_unstable_candidate_is_penalized_not_fatal():
     needed = search(small.search_problem(simulation=config.Simulation(safety=1.0)), seed=0).trace["substeps"]
     # Enough substeps for the softer half of the first candidates only.
     problem = small.search_problem(simulation=config.Simulation(substeps=int(needed.median())))
     result = search(problem, seed=0)
-    penalised = result.trace[result.trace["cost"] == PENALTY]
-    assert 0 < len(penalised) < len(result.trace)
-    assert penalised["reason"].str.startswith("unstable").all()
+    penalized = result.trace[result.trace["cost"] == PENALTY]
+    assert 0 < len(penalized) < len(result.trace)
+    assert penalized["reason"].str.startswith("unstable").all()
 
 
 # Company --------------------------------------------------------------------------------------------------------------
@@ -646,7 +646,7 @@ def test_threads_of_a_search_have_none_of_torch(monkeypatch):
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     """Some diverge, some are unstable, some have isolated nodes, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
-    settings = small.released(rollouts=22, isolated_nodes="penalise", start={"object_radius": 0.0145, "stiffness": 3e4})
+    settings = small.released(rollouts=22, isolated_nodes="penalize", start={"object_radius": 0.0145, "stiffness": 3e4})
     chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
     check = stability.check
 

@@ -41,9 +41,9 @@ def undirected(springs: np.ndarray) -> set[tuple[int, int]]:
     return set(pairs)
 
 
-def same(nodes: np.ndarray, radius: float, neighbours: int) -> np.ndarray:
-    """Object springs with one radius and neighbour count."""
-    return object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbours))
+def same(nodes: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
+    """Object springs with one radius and neighbor count."""
+    return object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbors))
 
 
 def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
@@ -89,12 +89,12 @@ def test_golden_springs_have_the_released_order_of_ends(name: str) -> None:
 # Rules ----------------------------------------------------------------------------------------------------------------
 
 
-def brute(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> set[tuple[int, int]]:
+def brute(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> set[tuple[int, int]]:
     """The definition: i asks for its nearest, itself included, closer than its radius; the union of all answers."""
     pairs = set()
     for i, node in enumerate(nodes):
         distance = np.linalg.norm(nodes - node, axis=1)
-        for j in np.argsort(distance, kind="stable")[: neighbours[i]]:
+        for j in np.argsort(distance, kind="stable")[: neighbors[i]]:
             if j != i and MIN_LENGTH < distance[j] < radius[i]:
                 pairs.add((min(i, int(j)), max(i, int(j))))
     return pairs
@@ -105,8 +105,8 @@ def brute(nodes: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> set[
 def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: int) -> None:
     """Also with a radius and a count of its own for every node, as piecewise topologies have."""
     rng, nodes = np.random.default_rng(seed), cloud(seed, count)
-    radius, neighbours = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
-    assert undirected(object_springs(nodes, radius, neighbours)) == brute(nodes, radius, neighbours)
+    radius, neighbors = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
+    assert undirected(object_springs(nodes, radius, neighbors)) == brute(nodes, radius, neighbors)
 
 
 @settings(max_examples=40, deadline=None)
@@ -118,16 +118,16 @@ def test_the_set_does_not_depend_on_node_order(seed: int) -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=seeds, neighbours=st.integers(1, 9))
-def test_every_spring_is_asked_for_by_an_end_and_counts_are_capped(seed: int, neighbours: int) -> None:
-    """A node asks for at most neighbours - 1 others; it may have more springs, because others ask for it."""
+@given(seed=seeds, neighbors=st.integers(1, 9))
+def test_every_spring_is_asked_for_by_an_end_and_counts_are_capped(seed: int, neighbors: int) -> None:
+    """A node asks for at most neighbors - 1 others; it may have more springs, because others ask for it."""
     nodes, radius = cloud(seed), 0.5
-    springs = same(nodes, radius, neighbours)
-    assert len(springs) <= len(nodes) * (neighbours - 1)
+    springs = same(nodes, radius, neighbors)
+    assert len(springs) <= len(nodes) * (neighbors - 1)
     distance = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)
     rank = distance.argsort(axis=1).argsort(axis=1)
     for i, j in springs:
-        assert min(rank[i, j], rank[j, i]) < neighbours
+        assert min(rank[i, j], rank[j, i]) < neighbors
         assert distance[i, j] < radius
 
 
@@ -148,7 +148,7 @@ def test_the_radius_is_strict() -> None:
 
 
 def test_springs_must_be_longer_than_the_minimum() -> None:
-    """Nearly coincident nodes get no spring between them, and the node itself uses up one of its neighbours."""
+    """Nearly coincident nodes get no spring between them, and the node itself uses up one of its neighbors."""
     nodes = np.array([[0.0, 0, 0], [MIN_LENGTH / 2, 0, 0], [0.3, 0, 0]])
     assert undirected(same(nodes, 1.0, 3)) == {(0, 2), (1, 2)}
     assert undirected(same(nodes, 1.0, 1)) == set()
@@ -245,7 +245,7 @@ def test_a_connectivity_graph_keeps_regions_from_jumping_over_a_gap() -> None:
 
 
 @pytest.mark.parametrize(("count", "settings"), [(5, Clusters()), (2, Clusters(connectivity=4))])
-def test_more_regions_or_neighbours_than_nodes_are_refused(count: int, settings: Clusters) -> None:
+def test_more_regions_or_neighbors_than_nodes_are_refused(count: int, settings: Clusters) -> None:
     with pytest.raises(InputError, match=r"search\.clusters: .* need at least 5 nodes; received 4 nodes"):
         regions(cloud(0, 4), count, settings)
     regions(cloud(0, 5), count, settings)
@@ -301,8 +301,8 @@ def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
     nodes, nobody = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]), np.array([[0.0, 9, 0]])
     labels = np.array([0, 0, 1, 1], np.int32)
 
-    def springs(radius: list[float], neighbours: list[int]) -> set[tuple[int, int]]:
-        return undirected(piecewise_topology(nodes, nobody, labels, radius, neighbours, 0.1, 1).springs)
+    def springs(radius: list[float], neighbors: list[int]) -> set[tuple[int, int]]:
+        return undirected(piecewise_topology(nodes, nobody, labels, radius, neighbors, 0.1, 1).springs)
 
     assert springs([0.15, 0.01], [5, 5]) == {(0, 1), (1, 2)}, "the left region asks"
     assert springs([0.01, 0.15], [5, 5]) == {(1, 2), (2, 3)}, "the right region asks"

@@ -28,15 +28,15 @@ CANDIDATES = (
     {"object_radius": 0.045, "stiffness": 1.2e4, "drag": 6.0, "contact_distance": 0.03},
     {
         "object_radius": 0.04,
-        "object_neighbours": 16.0,
+        "object_neighbors": 16.0,
         "stiffness": 3e4,
         "dashpot": 60.0,
         "ground_elasticity": 0.9,
         "contact_elasticity": 0.2,
     },
-    {"object_neighbours": 10.0, "controller_neighbours": 12.0, "controller_radius": 0.03, "contact_distance": 0.012},
+    {"object_neighbors": 10.0, "controller_neighbors": 12.0, "controller_radius": 0.03, "contact_distance": 0.012},
     {"object_radius": 0.02, "stiffness": 9e4, "contact_distance": 0.0135, "contact_elasticity": 0.1},
-    {"stiffness": 6e2, "drag": 15.0, "object_neighbours": 14.0},
+    {"stiffness": 6e2, "drag": 15.0, "object_neighbors": 14.0},
 )
 
 

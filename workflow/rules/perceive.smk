@@ -1,5 +1,5 @@
 # From raw video to observations, in parallel over the cameras of a scenario.
-rule synthesise:
+rule synthesize:
     output:
         capture=f"{RESULTS}/{{scenario}}/capture/capture.json",
         truth=f"{RESULTS}/{{scenario}}/capture_truth.npz",

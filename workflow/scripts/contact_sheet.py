@@ -25,7 +25,7 @@ def strip(capture: Capture) -> np.ndarray:
     """Three frames of the first camera side by side, under the scene's name."""
     camera = next(iter(capture.cameras))
     frames = [0, capture.frame_count // 2, capture.frame_count - 1]
-    images = [cv2.resize(capture.colour(camera, frame), SIZE, interpolation=cv2.INTER_AREA) for frame in frames]
+    images = [cv2.resize(capture.color(camera, frame), SIZE, interpolation=cv2.INTER_AREA) for frame in frames]
     head = np.full((LABEL, 3 * SIZE[0], 3), 255, np.uint8)
     name = f"{capture.description.name.removeprefix('synthetic_')} ({capture.frame_count} frames)"
     cv2.putText(head, name, (4, LABEL - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (30, 30, 30), 1, cv2.LINE_AA)

@@ -77,7 +77,7 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Run:
-    """One fit, or the evaluation of the truth or of a constant stiffness. Noise in metres."""
+    """One fit, or the evaluation of the truth or of a constant stiffness. Noise in meters."""
 
     scene: str
     noise: float

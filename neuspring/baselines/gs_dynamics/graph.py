@@ -37,7 +37,7 @@ def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules
     # Not by products of matrices: a particle's distance from itself must be 0.
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     distances = distances.masked_fill(~used[:, None, :], torch.inf)
-    distance, near = distances.topk(min(rules.neighbours, points.shape[1]), dim=2, largest=False)
+    distance, near = distances.topk(min(rules.neighbors, points.shape[1]), dim=2, largest=False)
     window, receiver, slot = ((distance < rules.radius) & used[:, :, None]).nonzero(as_tuple=True)
     receivers, senders = number[window, receiver], number[window, near[window, receiver, slot]]
     tool_distances = torch.cdist(points, tools, compute_mode="donot_use_mm_for_euclid_dist")

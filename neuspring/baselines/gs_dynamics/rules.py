@@ -15,7 +15,7 @@ class Preset:
     """Settings that differ between kinds of objects. Meanings as in GsDynamics."""
 
     radius: float
-    neighbours: int
+    neighbors: int
     particles: int
     noise: float
     length_weight: float
@@ -46,7 +46,7 @@ class Rules:
     """How graphs are made and what the network sees. A rollout needs these and the weights. Meanings as in GsDynamics."""
 
     radius: float
-    neighbours: int
+    neighbors: int
     particles: int
     coverage: float
     connect_all: bool

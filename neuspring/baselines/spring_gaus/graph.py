@@ -23,7 +23,7 @@ class AnchorGraph(Artifact):
 
     kind: ClassVar[str] = "anchor_graph"
     anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
-    neighbours: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
+    neighbors: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
     lengths: np.ndarray = array("N,K", np.float32, "m", "their distances in frame 0, the rest lengths")
     link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
     links: np.ndarray = array("M", np.int32, "1", "controller of each link")
@@ -33,22 +33,22 @@ class AnchorGraph(Artifact):
         anchors = len(self.anchors)
         if len(self.link_starts) != anchors + 1:
             raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
-        if self.neighbours.size and not 0 <= self.neighbours.min() <= self.neighbours.max() < anchors:
-            raise InputError("spring_gaus.neighbours", f"indices must lie in [0, {anchors})", int(self.neighbours.max()))
+        if self.neighbors.size and not 0 <= self.neighbors.min() <= self.neighbors.max() < anchors:
+            raise InputError("spring_gaus.neighbors", f"indices must lie in [0, {anchors})", int(self.neighbors.max()))
         if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
             raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
 
     @classmethod
-    def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbours: int, reach: float, link_count: int) -> AnchorGraph:
+    def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbors: int, reach: float, link_count: int) -> AnchorGraph:
         """The graph of anchors [N, 3] and controllers [C, 3] of frame 0, m.
 
         Each controller is linked to its at most `link_count` nearest anchors within `reach`, m. Raises NumericalFailure if there
         are too few anchors, or two at one place.
         """
-        if len(anchors) <= neighbours:
-            raise NumericalFailure(f"more anchors than neighbours ({neighbours}) are required, and there are {len(anchors)}")
+        if len(anchors) <= neighbors:
+            raise NumericalFailure(f"more anchors than neighbors ({neighbors}) are required, and there are {len(anchors)}")
         tree = cKDTree(anchors)
-        distance, index = tree.query(anchors, k=neighbours + 1)
+        distance, index = tree.query(anchors, k=neighbors + 1)
         if distance[:, 1].min() <= 0:
             raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
         link_distance, near = tree.query(controllers, k=min(link_count, len(anchors)), distance_upper_bound=reach)
@@ -59,7 +59,7 @@ class AnchorGraph(Artifact):
         return AnchorGraph(
             anchors=anchors,
             # The nearest is the anchor itself: distances of others are positive.
-            neighbours=index[:, 1:],
+            neighbors=index[:, 1:],
             lengths=distance[:, 1:],
             link_starts=np.searchsorted(anchor[order], np.arange(len(anchors) + 1)),
             links=controller[order],

@@ -49,7 +49,7 @@ def kernels(real: Any) -> Kernels:
 
     @wp.struct
     class Model:
-        neighbours: wp.array2d(dtype=wp.int32)
+        neighbors: wp.array2d(dtype=wp.int32)
         lengths: wp.array2d(dtype=real)
         link_starts: wp.array(dtype=wp.int32)
         links: wp.array(dtype=wp.int32)
@@ -68,8 +68,8 @@ def kernels(real: Any) -> Kernels:
         at = state.x[slot, i]
         speed = state.v[slot, i]
         force = vec3(zero, zero, model.gravity)
-        for r in range(model.neighbours.shape[1]):
-            j = model.neighbours[i, r]
+        for r in range(model.neighbors.shape[1]):
+            j = model.neighbors[i, r]
             rest = model.lengths[i, r]
             offset = state.x[slot, j] - at
             length = wp.length(offset)
@@ -109,8 +109,8 @@ def kernels(real: Any) -> Kernels:
         c = by * model.substep
         damping = zero
         hard = zero
-        for r in range(model.neighbours.shape[1]):
-            j = model.neighbours[i, r]
+        for r in range(model.neighbors.shape[1]):
+            j = model.neighbors[i, r]
             rest = model.lengths[i, r]
             offset = state.x[slot, j] - at
             length = wp.max(wp.length(offset), floor)

@@ -27,7 +27,7 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
     velocity: np.ndarray = array("3", np.float32, "m/s", "of all anchors in frame 0")
     substeps: int
     """Per frame."""
-    full_neighbours: int
+    full_neighbors: int
     bound_anchors: int
     negative_damping: bool
 
@@ -50,7 +50,7 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
             ground=ground,
             exponent=settings.exponent,
             link_stiffness=settings.link_stiffness,
-            full_neighbours=settings.full_neighbours,
+            full_neighbors=settings.full_neighbors,
             bound_anchors=settings.bound_anchors,
             negative_damping=settings.negative_damping,
         )
@@ -64,7 +64,7 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
         theta = tensors["theta"]
         return AnchorParameters(
             stiffness=10 ** tensors["kappa"],
-            soft=soft_vector(tensors["soft"], self.neighbours.shape[1], self.full_neighbours),
+            soft=soft_vector(tensors["soft"], self.neighbors.shape[1], self.full_neighbors),
             damping=torch.log(theta if self.negative_damping else theta.clamp(min=1.0)),
             friction=(1.2 * torch.sigmoid(tensors["rho"]) - 0.1).clamp(0.0, 1.0),
         )
@@ -73,9 +73,9 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
 TRAINED = ("kappa", "soft", "theta", "rho", "velocity")
 
 
-def soft_vector(s: torch.Tensor, neighbours: int, full: int) -> torch.Tensor:
+def soft_vector(s: torch.Tensor, neighbors: int, full: int) -> torch.Tensor:
     """eta [K] by rank r: 1 below n_c = `full`, then clamp(2 - exp(softplus(s))^((r - n_c) / (K - n_c)), 0, 1), s [1]."""
-    rank = torch.arange(neighbours, device=s.device, dtype=s.dtype)
-    exponent = (rank - full) / max(neighbours - full, 1)
+    rank = torch.arange(neighbors, device=s.device, dtype=s.dtype)
+    exponent = (rank - full) / max(neighbors - full, 1)
     eta = (2 - torch.exp(torch.nn.functional.softplus(s) * exponent)).clamp(0.0, 1.0)
     return torch.where(rank < full, torch.ones_like(eta), eta)

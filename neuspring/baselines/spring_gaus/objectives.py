@@ -11,7 +11,7 @@ import torch
 from neuspring.baselines.spring_gaus.graph import Binding
 from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
 from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterise import Backend, rasterise
+from neuspring.splats.rasterize import Backend, rasterize
 from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
@@ -60,7 +60,7 @@ class Silhouettes:
         """Coverage [H, W] of the splats in a view: their picture in white on black."""
         splats, means = self.splats, self.follower(anchors)
         white = torch.ones_like(means)
-        return rasterise(means, splats.quaternions, splats.scales, splats.opacities, white, view, backend=self.backend).alpha
+        return rasterize(means, splats.quaternions, splats.scales, splats.opacities, white, view, backend=self.backend).alpha
 
 
 @dataclass(frozen=True, eq=False)

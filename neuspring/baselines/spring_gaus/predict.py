@@ -32,8 +32,8 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
     return torch.stack(states), ""
 
 
-def predict(model: SpringGausModel, observations: Observations, centres: np.ndarray | None, device: str) -> Prediction:
-    """Both outputs in all frames. `centres` [G, 3], m, are those of the splats in frame 0 (None: the model has no splats)."""
+def predict(model: SpringGausModel, observations: Observations, centers: np.ndarray | None, device: str) -> Prediction:
+    """Both outputs in all frames. `centers` [G, 3], m, are those of the splats in frame 0 (None: the model has no splats)."""
     anchors, reason = roll_out(model, observations.controller_points, device)
     nodes = torch.tensor(observations.nodes, device=device)
     follow = Follower(Binding.of(observations.nodes, model.anchors, model.bound_anchors), device)
@@ -42,19 +42,19 @@ def predict(model: SpringGausModel, observations: Observations, centres: np.ndar
     diverged = len(anchors) if reason else None
     trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
     facts = {"anchors": len(model.anchors), "substeps": model.substeps}
-    if centres is None:
+    if centers is None:
         return Prediction(trajectory, facts)
-    follow = Follower(Binding.of(centres, model.anchors, model.bound_anchors), device)
+    follow = Follower(Binding.of(centers, model.anchors, model.bound_anchors), device)
     # Frame by frame, because all frames of hundreds of thousands of splats may not fit on the device.
     moved = np.stack([follow(frame).cpu().numpy() for frame in anchors])
-    return Prediction(trajectory, facts | contraction(centres, moved[0]), moved)
+    return Prediction(trajectory, facts | contraction(centers, moved[0]), moved)
 
 
-def contraction(centres: np.ndarray, bound: np.ndarray) -> dict[str, float]:
+def contraction(centers: np.ndarray, bound: np.ndarray) -> dict[str, float]:
     """How binding by absolute positions changes centers [G, 3], m, in frame 0: mean shift, m, and ratio of sizes.
 
     The size is the root mean square distance from the mean.
     """
-    before, after = (float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) for points in (centres, bound))
-    shift = float(np.linalg.norm(bound - centres, axis=1).mean())
+    before, after = (float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) for points in (centers, bound))
+    shift = float(np.linalg.norm(bound - centers, axis=1).mean())
     return {"frame0_shift": shift, "frame0_size_ratio": after / before if before else 1.0}

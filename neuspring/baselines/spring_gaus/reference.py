@@ -19,15 +19,15 @@ def substep(
     step: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end. Equations as in `kernels`."""
-    neighbours = torch.tensor(graph.neighbours, device=x.device).long()
+    neighbors = torch.tensor(graph.neighbors, device=x.device).long()
     rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
-    offset = x[neighbours] - x[:, None]
+    offset = x[neighbors] - x[:, None]
     length = offset.norm(dim=2)
     n = offset / length.clamp(min=MIN_LENGTH)[..., None]
     stretch = length - rest
     stiff = parameters.stiffness[:, None] / rest * parameters.soft * stretch
     pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
-    closing = ((v[neighbours] - v[:, None]) * n).sum(dim=2)
+    closing = ((v[neighbors] - v[:, None]) * n).sum(dim=2)
     force = ((pull + parameters.damping / rest * closing)[..., None] * n).sum(dim=1)
     anchor = torch.tensor(graph.link_anchors, device=x.device).long()
     reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]

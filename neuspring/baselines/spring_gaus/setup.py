@@ -25,7 +25,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.results import masks_of_cameras
 from neuspring.splats.draw import view_of
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterise import Backend, choose_backend
+from neuspring.splats.rasterize import Backend, choose_backend
 from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
@@ -68,7 +68,7 @@ def problem(
     cloud = seen.splats.means if seen and own.supervision == "masks" else observations.nodes
     anchors = choose_anchors(cloud, own.anchors, CELLS, np.random.default_rng(seed))
     hands = observations.controller_points[: scenario.train_end]
-    graph = AnchorGraph.between(anchors, hands[0], own.neighbours, own.link_reach, own.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], own.neighbors, own.link_reach, own.link_count)
     up = 1.0 if scenario.up == "+z" else -1.0
     world = {"frame_time": 1 / scenario.frame_rate, "up_sign": up, "gravity": settings.simulation.gravity}
     start = SpringGausModel.start(graph, own, ground=scenario.ground, **world)

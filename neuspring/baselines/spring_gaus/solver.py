@@ -65,7 +65,7 @@ class AnchorSolver:
         self._real = real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
         self._kernels = kernels(real)
         vec3 = wp.types.vector(3, real)
-        self.count, ranks = graph.neighbours.shape
+        self.count, ranks = graph.neighbors.shape
         controllers = int(graph.links.max(initial=-1)) + 1
         self._buffers: dict[str, torch.Tensor] = {}
         self._state, self._adjoint, self._model = self._kernels.State(), self._kernels.State(), self._kernels.Model()
@@ -76,7 +76,7 @@ class AnchorSolver:
                 setattr(struct, name, self._allocate(prefix + name, (size,), real))
         for name in ("begin", "end"):
             setattr(self._model, name, self._allocate(name, (controllers, 3), vec3))
-        for name in ("neighbours", "lengths", "link_starts", "links", "link_lengths"):
+        for name in ("neighbors", "lengths", "link_starts", "links", "link_lengths"):
             values = getattr(graph, name)
             kind = wp.int32 if values.dtype.kind == "i" else real
             setattr(self._model, name, wp.array(values, dtype=kind, device=device))

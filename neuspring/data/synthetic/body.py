@@ -22,7 +22,7 @@ class Surface:
     """[V, k] nodes that a vertex follows."""
     weights: np.ndarray
     """[V, k] their weights, sum 1."""
-    colours: np.ndarray
+    colors: np.ndarray
     """[V, 3] linear RGB in [0, 1], before the fine texture."""
 
     def follow(self, positions: np.ndarray) -> np.ndarray:

@@ -175,17 +175,17 @@ def damp_deformation(
     if inverse_mass[i] == 0.0:
         return
     m = sums[0]
-    centre = wp.vec3(sums[1], sums[2], sums[3]) / m
+    center = wp.vec3(sums[1], sums[2], sums[3]) / m
     mean = wp.vec3(sums[4], sums[5], sums[6]) / m
-    spin = wp.vec3(sums[7], sums[8], sums[9]) - m * wp.cross(centre, mean)
-    xx = sums[10] - m * centre[0] * centre[0]
-    yy = sums[11] - m * centre[1] * centre[1]
-    zz = sums[12] - m * centre[2] * centre[2]
-    xy = sums[13] - m * centre[0] * centre[1]
-    xz = sums[14] - m * centre[0] * centre[2]
-    yz = sums[15] - m * centre[1] * centre[2]
+    spin = wp.vec3(sums[7], sums[8], sums[9]) - m * wp.cross(center, mean)
+    xx = sums[10] - m * center[0] * center[0]
+    yy = sums[11] - m * center[1] * center[1]
+    zz = sums[12] - m * center[2] * center[2]
+    xy = sums[13] - m * center[0] * center[1]
+    xz = sums[14] - m * center[0] * center[2]
+    yz = sums[15] - m * center[1] * center[2]
     # A straight rope has no moment of inertia about itself.
     least = 1.0e-3 * (xx + yy + zz)
     inertia = wp.mat33(yy + zz + least, -xy, -xz, -xy, xx + zz + least, -yz, -xz, -yz, xx + yy + least)
-    rigid = mean + wp.cross(wp.inverse(inertia) * spin, position[i] - centre)
+    rigid = mean + wp.cross(wp.inverse(inertia) * spin, position[i] - center)
     velocity[i] = velocity[i] - (velocity[i] - rigid) * (rate * dt) - velocity[i] * (drag * dt)

@@ -34,10 +34,10 @@ def stable_moduli(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tupl
     return 4.0 / 3.0 * mu, first + 5.0 / 6.0 * mu
 
 
-def build(body: Body, fists: int, moduli: Moduli = stable_moduli, dashpots: bool = True, coloured: bool = False) -> newton.Model:
+def build(body: Body, fists: int, moduli: Moduli = stable_moduli, dashpots: bool = True, colored: bool = False) -> newton.Model:
     """The engine's model of a body, a table and kinematic fists.
 
-    `dashpots`: a spring of no stiffness on every edge of a solid, whose damping the caller sets. `coloured`: nodes in groups that
+    `dashpots`: a spring of no stiffness on every edge of a solid, whose damping the caller sets. `colored`: nodes in groups that
     do not meet, for solvers that move one node after the other.
     """
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
@@ -51,7 +51,7 @@ def build(body: Body, fists: int, moduli: Moduli = stable_moduli, dashpots: bool
     for _ in range(fists):
         link = builder.add_body(is_kinematic=True, mass=1.0)
         builder.add_shape_sphere(link, radius=FIST_RADIUS, cfg=shape)
-    if coloured:
+    if colored:
         builder.color(include_bending=body.is_sheet)
     model = builder.finalize(device="cpu")
     if body.self_contact:

@@ -47,8 +47,8 @@ def _checks(size: float, first: tuple[float, ...], second: tuple[float, ...]) ->
     return paint
 
 
-def _stripes(size: float, colours: tuple[tuple[float, ...], ...]) -> Pattern:
-    return lambda p: np.array(colours)[np.floor(p[:, 1] / size).astype(int) % len(colours)]
+def _stripes(size: float, colors: tuple[tuple[float, ...], ...]) -> Pattern:
+    return lambda p: np.array(colors)[np.floor(p[:, 1] / size).astype(int) % len(colors)]
 
 
 def _dots(size: float, ground: tuple[float, ...], dot: tuple[float, ...]) -> Pattern:
@@ -117,7 +117,7 @@ ROPE_MODULUS = 1.5e5
 
 def rope(name: str, spacing: float, skin_spacing: float) -> Body:
     """A rope along x on the table, with knots."""
-    length, knots, colour = ROPES[name]
+    length, knots, color = ROPES[name]
     along = np.linspace(-length / 2, length / 2, round(length / spacing) + 1)
     knot = _knots(along, knots)
     nodes, tetrahedra = rod(length, ROPE_RADIUS + (KNOT_RADIUS - ROPE_RADIUS) * knot, 8)
@@ -130,7 +130,7 @@ def rope(name: str, spacing: float, skin_spacing: float) -> Body:
         strand = (p[:, 0] * 60.0 + turn) % 1.0 < 0.5
         # Every seventh turn carries a colored thread, so that one place differs from the next.
         thread = ((p[:, 0] * 60.0 + turn) // 1.0) % 7 == 0
-        shade = np.where(strand[:, None], 0.55, 1.0) * np.array(colour)
+        shade = np.where(strand[:, None], 0.55, 1.0) * np.array(color)
         return np.asarray(np.where(thread[:, None], shade * [0.9, 0.35, 0.3], shade))
 
     return Body(
@@ -161,20 +161,20 @@ def package(spacing: float, skin_spacing: float) -> Body:
     size = np.array(PACKAGE)
     cells = np.maximum(np.round(size / spacing).astype(int), 4)
     nodes, tetrahedra = block(-size / 2, size / 2, cells.tolist())
-    centres = nodes[tetrahedra].mean(axis=1)
-    outer = (size / 2 - np.abs(centres) < size / cells).any(axis=1)
+    centers = nodes[tetrahedra].mean(axis=1)
+    outer = (size / 2 - np.abs(centers) < size / cells).any(axis=1)
     nodes[:, 2] += size[2] / 2 + 0.0045
 
     def paint(p: np.ndarray) -> np.ndarray:
-        colours = np.tile([0.55, 0.38, 0.2], (len(p), 1))
-        colours[np.abs(p[:, 1]) < 0.009] = [0.7, 0.6, 0.42]
+        colors = np.tile([0.55, 0.38, 0.2], (len(p), 1))
+        colors[np.abs(p[:, 1]) < 0.009] = [0.7, 0.6, 0.42]
         label = (np.abs(p[:, 0] - 0.03) < 0.04) & (np.abs(p[:, 1]) < 0.04) & (p[:, 2] > size[2] / 2)
-        colours[label] = [0.85, 0.85, 0.82]
+        colors[label] = [0.85, 0.85, 0.82]
         bars = label & (np.abs(p[:, 1]) < 0.022) & (np.floor(p[:, 0] / 0.004).astype(int) % 3 == 0)
-        colours[bars] = [0.08, 0.08, 0.1]
+        colors[bars] = [0.08, 0.08, 0.1]
         print_ = (np.abs(p[:, 0] + 0.05) < 0.022) & (np.abs(p[:, 2] - 0.05) < 0.022)
-        colours[print_ & (np.abs(p[:, 1]) > 0.02)] = [0.5, 0.1, 0.08]
-        return colours
+        colors[print_ & (np.abs(p[:, 1]) > 0.02)] = [0.5, 0.1, 0.08]
+        return colors
 
     return Body(
         nodes=nodes,
@@ -218,5 +218,5 @@ def skin_of(nodes: np.ndarray, faces: np.ndarray, spacing: float, paint: Pattern
         faces=inverse.ravel()[all_faces],
         nodes=np.repeat(faces, len(inner), axis=0)[first],
         weights=np.tile(weights, (len(faces), 1))[first],
-        colours=paint(rest).astype(float),
+        colors=paint(rest).astype(float),
     )

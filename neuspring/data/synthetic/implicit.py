@@ -15,14 +15,14 @@ from warp.geometry import IsoSurfaceMarchingCubes
 Sdf = Callable[[np.ndarray], np.ndarray]
 
 
-def sphere(centre: Sequence[float], radius: float) -> Sdf:
+def sphere(center: Sequence[float], radius: float) -> Sdf:
     """|p - c| - r."""
-    return lambda p: np.linalg.norm(p - np.asarray(centre), axis=-1) - radius
+    return lambda p: np.linalg.norm(p - np.asarray(center), axis=-1) - radius
 
 
-def ellipsoid(centre: Sequence[float], radii: Sequence[float]) -> Sdf:
+def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Sdf:
     """k0 (k0 - 1) / k1 with k0 = |q / r|, k1 = |q / r^2|, q = p - c: first-order exact at the surface."""
-    middle, half = np.asarray(centre, float), np.asarray(radii, float)
+    middle, half = np.asarray(center, float), np.asarray(radii, float)
 
     def distance(p: np.ndarray) -> np.ndarray:
         q = (p - middle) / half
@@ -44,9 +44,9 @@ def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Sdf:
     return distance
 
 
-def box(centre: Sequence[float], half: Sequence[float]) -> Sdf:
+def box(center: Sequence[float], half: Sequence[float]) -> Sdf:
     """An axis-aligned box of half extents `half`."""
-    middle, extent = np.asarray(centre, float), np.asarray(half, float)
+    middle, extent = np.asarray(center, float), np.asarray(half, float)
 
     def distance(p: np.ndarray) -> np.ndarray:
         q = np.abs(p - middle) - extent
@@ -85,6 +85,6 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    centres = corners.mean(axis=1)
-    outward = (gradient(sdf, centres) * normals).sum(axis=-1).mean() > 0
+    centers = corners.mean(axis=1)
+    outward = (gradient(sdf, centers) * normals).sum(axis=-1).mean() > 0
     return vertices, faces if outward else faces[:, ::-1].copy()

@@ -21,7 +21,7 @@ from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, certify,
 from neuspring.data.synthetic.hands import SKIN, Hand, place
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
 from neuspring.data.synthetic.scenes import SCENES
-from neuspring.data.synthetic.sensor import measured, quantised
+from neuspring.data.synthetic.sensor import measured, quantized
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.data.synthetic.vbd import VertexBlockDescent
 
@@ -191,7 +191,7 @@ def _film(
     meshes = [hand.mesh(1.5 * size.skin) for hand in hands]
     placed = [place(vertices, hand.poses(times)) for hand, (vertices, _) in zip(hands, meshes, strict=True)]
     skin = body.surface
-    parts = [Part(skin.rest, skin.faces, skin.colours, OBJECT, GRAINS.get(row.category, PLUSH_GRAIN))]
+    parts = [Part(skin.rest, skin.faces, skin.colors, OBJECT, GRAINS.get(row.category, PLUSH_GRAIN))]
     parts += [Part(vertices, faces, np.tile(SKIN, (len(vertices), 1)), HAND, HAND_GRAIN) for vertices, faces in meshes]
     renderer = Renderer(parts)
     surfaces = skin.follow(clip.positions)
@@ -202,10 +202,10 @@ def _film(
             view = renderer.render(camera)
             rng = np.random.default_rng([settings.seed, index, frame, *row.scenario.encode()])
             if settings.sensor == "clean":
-                depth = quantised(view.depth, DEPTH_UNIT)
+                depth = quantized(view.depth, DEPTH_UNIT)
             else:
                 depth = measured(view.depth, view.slope, DEPTH_UNIT, rng)
-            writer.frame(camera.name, frame, view.colour, depth, view.label)
+            writer.frame(camera.name, frame, view.color, depth, view.label)
         report.update(frame + 1)
 
 

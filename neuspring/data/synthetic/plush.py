@@ -83,8 +83,8 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
     nodes, tetrahedra = fill(shape, low, high, spacing)
     vertices, faces = surface(shape, low, high, skin_spacing)
     element, weights = embed(vertices, nodes, tetrahedra)
-    centres = nodes[tetrahedra].mean(axis=1)
-    nearest = np.stack([part(centres) for part in parts.values()]).argmin(axis=0)
+    centers = nodes[tetrahedra].mean(axis=1)
+    nearest = np.stack([part(centers) for part in parts.values()]).argmin(axis=0)
     of_part = [next((f for start, f in factors.items() if name.startswith(start)), 1.0) for name in parts]
     lift = np.array([0.0, 0.0, CLEARANCE - nodes[:, 2].min()])
     skin = boundary(tetrahedra)
@@ -95,7 +95,7 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
             faces=faces,
             nodes=tetrahedra[element],
             weights=weights,
-            colours=paint(vertices, parts),
+            colors=paint(vertices, parts),
         ),
         radius=RADIUS,
         tetrahedra=tetrahedra,
@@ -110,47 +110,47 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
 
 
 def _paint_sloth(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
-    colours = np.tile([0.38, 0.26, 0.15], (len(points), 1))
+    colors = np.tile([0.38, 0.26, 0.15], (len(points), 1))
     face = np.linalg.norm((points - [0.135, 0, 0.068]) / [0.03, 0.04, 0.032], axis=1) < 1.0
-    colours[face] = [0.8, 0.68, 0.48]
-    colours[parts["snout"](points) < 0.002] = [0.12, 0.07, 0.05]
+    colors[face] = [0.8, 0.68, 0.48]
+    colors[parts["snout"](points) < 0.002] = [0.12, 0.07, 0.05]
     for side in (1, -1):
         eye = np.linalg.norm(points - [0.132, 0.022 * side, 0.08], axis=1)
-        colours[eye < 0.012] = [0.2, 0.12, 0.08]
-        colours[eye < 0.006] = [0.01, 0.01, 0.01]
+        colors[eye < 0.012] = [0.2, 0.12, 0.08]
+        colors[eye < 0.006] = [0.01, 0.01, 0.01]
     tips = (np.abs(points[:, 1]) > 0.115) | ((points[:, 0] < -0.1) & (np.abs(points[:, 1]) > 0.075))
-    colours[tips] = [0.62, 0.5, 0.36]
+    colors[tips] = [0.62, 0.5, 0.36]
     # Rings of darker fur on the limbs and a stripe along the back give trackers something to hold.
     rings = (np.sin(points @ np.array([90.0, 130.0, 40.0])) > 0.55) & ~face
-    colours[rings] *= 0.55
-    return colours
+    colors[rings] *= 0.55
+    return colors
 
 
 def _paint_zebra(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
     wave = points[:, 0] * 230.0 + 3.0 * np.sin(points[:, 2] * 60.0) + 1.5 * np.sin(points[:, 1] * 70.0)
     legs = np.min([parts[name](points) for name in parts if name.startswith("leg")], axis=0) < 0.004
     wave = np.where(legs & (points[:, 2] < 0.07), points[:, 2] * 260.0, wave)
-    colours = np.where(np.sin(wave)[:, None] > 0.1, [0.85, 0.83, 0.78], [0.05, 0.05, 0.06])
-    colours[parts["snout"](points) < 0.0] = [0.1, 0.09, 0.1]
+    colors = np.where(np.sin(wave)[:, None] > 0.1, [0.85, 0.83, 0.78], [0.05, 0.05, 0.06])
+    colors[parts["snout"](points) < 0.0] = [0.1, 0.09, 0.1]
     mane = (np.abs(points[:, 1]) < 0.008) & (points[:, 2] > 0.13) & (points[:, 0] < 0.1)
-    colours[mane] = [0.03, 0.03, 0.03]
+    colors[mane] = [0.03, 0.03, 0.03]
     for side in (1, -1):
-        colours[np.linalg.norm(points - [0.128, 0.026 * side, 0.172], axis=1) < 0.007] = [0.3, 0.16, 0.05]
-    return colours
+        colors[np.linalg.norm(points - [0.128, 0.026 * side, 0.172], axis=1) < 0.007] = [0.3, 0.16, 0.05]
+    return colors
 
 
 def _paint_dinosaur(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
-    colours = np.tile([0.16, 0.42, 0.2], (len(points), 1))
+    colors = np.tile([0.16, 0.42, 0.2], (len(points), 1))
     belly = np.linalg.norm((points - [0.05, 0, 0.075]) / [0.03, 0.036, 0.055], axis=1) < 1.0
-    colours[belly] = [0.75, 0.72, 0.42]
+    colors[belly] = [0.75, 0.72, 0.42]
     cell = np.floor(points / 0.018).astype(int)
     speckled = ((cell * [7, 13, 29]).sum(axis=1) % 5 == 0) & ~belly
-    colours[speckled] = [0.08, 0.24, 0.12]
+    colors[speckled] = [0.08, 0.24, 0.12]
     for name in parts:
         if name.startswith("spike"):
-            colours[parts[name](points) < 0.003] = [0.75, 0.35, 0.08]
+            colors[parts[name](points) < 0.003] = [0.75, 0.35, 0.08]
     for side in (1, -1):
         eye = np.linalg.norm(points - [0.095, 0.024 * side, 0.19], axis=1)
-        colours[eye < 0.01] = [0.85, 0.85, 0.8]
-        colours[eye < 0.006] = [0.01, 0.01, 0.01]
-    return colours
+        colors[eye < 0.01] = [0.85, 0.85, 0.8]
+        colors[eye < 0.006] = [0.01, 0.01, 0.01]
+    return colors

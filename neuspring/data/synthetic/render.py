@@ -34,7 +34,7 @@ class Part:
     """[V, 3], m."""
     faces: np.ndarray
     """[F, 3]."""
-    colours: np.ndarray
+    colors: np.ndarray
     """[V, 3] linear RGB."""
     label: int
     grain: tuple[float, float]
@@ -45,7 +45,7 @@ class Part:
 class View:
     """What one camera sees in one frame."""
 
-    colour: np.ndarray
+    color: np.ndarray
     """[H, W, 3] uint8 RGB."""
     depth: np.ndarray
     """[H, W] m along the optical axis; 0 where nothing is seen."""
@@ -66,7 +66,7 @@ class Renderer:
         for part in parts:
             grains[part.label] = part.grain
         self._rest: wp.array = wp.array(np.concatenate([part.rest for part in parts]), dtype=wp.vec3, device="cpu")
-        self._colours: wp.array = wp.array(np.concatenate([part.colours for part in parts]), dtype=wp.vec3, device="cpu")
+        self._colors: wp.array = wp.array(np.concatenate([part.colors for part in parts]), dtype=wp.vec3, device="cpu")
         self._indices: wp.array = wp.array(self._faces.ravel(), dtype=wp.int32, device="cpu")
         self._labels: wp.array = wp.array(labels, dtype=wp.int32, device="cpu")
         self._grains: wp.array = wp.array(grains, dtype=wp.vec2, device="cpu")
@@ -95,14 +95,14 @@ class Renderer:
         """What `camera` sees now."""
         assert self._mesh is not None, "move() comes first"
         size = (camera.height, camera.width)
-        colour = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
+        color = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
         depth, slope = (wp.zeros(size, dtype=wp.float32, device="cpu") for _ in range(2))
         label = wp.zeros(size, dtype=wp.uint8, device="cpu")
         k = camera.intrinsics
         arguments = [
-            *(self._mesh.id, self._normals, self._rest, self._colours, self._indices, self._labels, self._grains),
+            *(self._mesh.id, self._normals, self._rest, self._colors, self._indices, self._labels, self._grains),
             *(wp.transform_from_matrix(wp.mat44(camera.camera_to_world)), wp.vec2(k[0, 0], k[1, 1]), wp.vec2(k[0, 2], k[1, 2])),
-            *(self._offsets, wp.vec3(*LIGHT), GAMMA, FARTHEST, colour, depth, label, slope),
+            *(self._offsets, wp.vec3(*LIGHT), GAMMA, FARTHEST, color, depth, label, slope),
         ]
         wp.launch(cast, size, arguments, device="cpu")
-        return View(colour.numpy(), depth.numpy(), label.numpy(), slope.numpy())
+        return View(color.numpy(), depth.numpy(), label.numpy(), slope.numpy())

@@ -25,18 +25,18 @@ def cast(
     mesh: wp.uint64,
     normals: wp.array[wp.vec3],
     rest: wp.array[wp.vec3],
-    colours: wp.array[wp.vec3],
+    colors: wp.array[wp.vec3],
     indices: wp.array[int],
     labels: wp.array[int],
     grains: wp.array[wp.vec2],
     pose: wp.transform,
     focal: wp.vec2,
-    centre: wp.vec2,
+    center: wp.vec2,
     offsets: wp.array[wp.vec2],
     light: wp.vec3,
     gamma: float,
     farthest: float,
-    colour: wp.array3d[wp.uint8],
+    color: wp.array3d[wp.uint8],
     depth: wp.array2d[float],
     label: wp.array2d[wp.uint8],
     slope: wp.array2d[float],
@@ -47,8 +47,8 @@ def cast(
     state = wp.uint32(7)
     total = wp.vec3(0.0)
     for s in range(offsets.shape[0]):
-        u = (float(x) + offsets[s][0] - centre[0]) / focal[0]
-        v = (float(y) + offsets[s][1] - centre[1]) / focal[1]
+        u = (float(x) + offsets[s][0] - center[0]) / focal[0]
+        v = (float(y) + offsets[s][1] - center[1]) / focal[1]
         ray = wp.normalize(wp.vec3(u, v, 1.0))
         axial = ray[2]
         ray = wp.transform_vector(pose, ray)
@@ -69,7 +69,7 @@ def cast(
             if wp.dot(normal, ray) > 0.0:
                 normal = -normal
             place = rest[a] * hit.u + rest[b] * hit.v + rest[c] * w
-            base = colours[a] * hit.u + colours[b] * hit.v + colours[c] * w
+            base = colors[a] * hit.u + colors[b] * hit.v + colors[c] * w
             seen = labels[hit.face]
             texture = grains[seen]
             shade = base * grain(place, texture[0], texture[1], state)
@@ -90,4 +90,4 @@ def cast(
             label[y, x] = wp.uint8(seen)
             slope[y, x] = wp.abs(wp.dot(normal, ray))
     for k in range(3):
-        colour[y, x, k] = wp.uint8(wp.clamp(wp.pow(wp.max(total[k], 0.0), gamma) * 255.0 + 0.5, 0.0, 255.0))
+        color[y, x, k] = wp.uint8(wp.clamp(wp.pow(wp.max(total[k], 0.0), gamma) * 255.0 + 0.5, 0.0, 255.0))

@@ -34,9 +34,9 @@ def measured(depth: np.ndarray, slope: np.ndarray, unit: float, rng: np.random.G
     lost |= slope < GRAZING
     blobs = cv2.GaussianBlur(rng.normal(size=depth.shape), (0, 0), HOLE_SIZE)
     lost |= blobs > np.quantile(blobs, 1.0 - HOLES)
-    return quantised(np.where(lost | (depth <= 0), 0.0, depth + noise), unit)
+    return quantized(np.where(lost | (depth <= 0), 0.0, depth + noise), unit)
 
 
-def quantised(depth: np.ndarray, unit: float) -> np.ndarray:
+def quantized(depth: np.ndarray, unit: float) -> np.ndarray:
     """Depth, m, as uint16 in units of `unit` m."""
     return np.clip(np.round(depth / unit), 0, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -73,7 +73,7 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
     def corner(index: np.ndarray) -> np.ndarray:
         return _flat_index(index, corners)
 
-    def centre(index: np.ndarray) -> np.ndarray:
+    def center(index: np.ndarray) -> np.ndarray:
         return len(nodes) - int(np.prod(cells)) + _flat_index(index, cells)
 
     elements = []
@@ -84,7 +84,7 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
         base = cell + step
         ring = [corner(base), corner(base + right), corner(base + right + up), corner(base + up)]
         for k in range(4):
-            elements.append(np.stack([centre(cell), centre(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
+            elements.append(np.stack([center(cell), center(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
     return nodes, oriented(nodes, np.concatenate(elements))
 
 

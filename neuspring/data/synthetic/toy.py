@@ -33,7 +33,7 @@ class Shape:
     interior: np.ndarray
     hands: np.ndarray
     radius: float
-    neighbours: int
+    neighbors: int
     stiffness: float
     """Mean true stiffness, N."""
     along: np.ndarray
@@ -44,10 +44,10 @@ def rope() -> Shape:
     """A rope of 0.6 m on the ground, four nodes per ring every 2 cm, held at one end."""
     angle = np.arange(4) * np.pi / 2 + np.pi / 4
     ring = 0.008 * np.stack([np.zeros(4), np.cos(angle), np.sin(angle)], axis=1)
-    centre = np.stack([np.linspace(0, 0.6, 31), np.zeros(31), np.full(31, 0.008)], axis=1)
-    nodes = (centre[:, None] + ring).reshape(-1, 3)
+    center = np.stack([np.linspace(0, 0.6, 31), np.zeros(31), np.full(31, 0.008)], axis=1)
+    nodes = (center[:, None] + ring).reshape(-1, 3)
     top = ring[:, 2] > 0
-    upper = np.tile(top, len(centre))
+    upper = np.tile(top, len(center))
     hands = np.array([[0.0, 0.0, 0.012], [0.01, 0.006, 0.008], [0.01, -0.006, 0.008]])
     return Shape(nodes[upper], nodes[~upper], np.zeros((0, 3)), hands, 0.05, 18, 1.2e4, np.array([1.0, 0.0, 0.0]))
 
@@ -138,7 +138,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
 
 def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twin:
     nodes = np.concatenate([shape.tracked, shape.surface, shape.interior])
-    topology = uniform_topology(nodes, shape.hands, shape.radius, shape.neighbours, 0.03, 12)
+    topology = uniform_topology(nodes, shape.hands, shape.radius, shape.neighbors, 0.03, 12)
     count = len(topology.springs)
     material = Material(
         stiffness=true_stiffness(field, shape, topology),

@@ -24,7 +24,7 @@ class VertexBlockDescent(FiniteElements):
     def _build(self, fists: int) -> newton.Model:
         assert not fists, "the held-out engine has no fists"
         assert not self.body.is_sheet, "the held-out engine has no sheets"
-        model = build(self.body, 0, lame, dashpots=False, coloured=True)
+        model = build(self.body, 0, lame, dashpots=False, colored=True)
         model.soft_contact_mu = self.body.friction
         return model
 

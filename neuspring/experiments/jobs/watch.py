@@ -51,7 +51,7 @@ class Watch:
             "samples": self._rows,
             "device_names": self._names,
             "peak_gpu_memory_mb": max(memory) if memory else None,
-            "gpu_utilisation": round(sum(shares) / len(shares), 1) if shares else None,
+            "gpu_utilization": round(sum(shares) / len(shares), 1) if shares else None,
         }
 
     def _sample(self) -> None:

@@ -120,7 +120,7 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
             totals = {
                 "peak_memory_mb": attempt.peak_memory_mb,
                 "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
-                "mean_gpu_percent": attempt.gpu_utilisation,
+                "mean_gpu_percent": attempt.gpu_utilization,
             }
             for what, value in totals.items():
                 if value is not None:

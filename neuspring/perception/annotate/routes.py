@@ -53,7 +53,7 @@ def state(desk: Desk) -> dict[str, Any]:
 
 def color(desk: Desk, camera: str, frame: str) -> bytes:
     """A frame as JPEG."""
-    return pictures.frame_jpeg(desk.capture.colour(*desk.frame(unquote(camera), frame)))
+    return pictures.frame_jpeg(desk.capture.color(*desk.frame(unquote(camera), frame)))
 
 
 def overlay(desk: Desk, source: str, camera: str, frame: str) -> bytes:

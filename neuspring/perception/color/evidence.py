@@ -74,7 +74,7 @@ def lift_color(
     guess = depths_of(image, {"hand_tilt": settings.hand_tilt, "hand_size": 0.0}, capture.train_end, first.up)
     y, x = np.nonzero(first.filled)
     cloud_pixels = np.stack([x, y], axis=1)
-    colors = capture.colour(name, 0) / 255.0
+    colors = capture.color(name, 0) / 255.0
     place_rows = np.round(places).astype(int)
     facts = {
         "object_tracks": float(own.sum()),
@@ -92,10 +92,10 @@ def lift_color(
         object_points=points,
         object_visibility=known,
         object_motion_valid=np.zeros_like(known),
-        object_colours=colors[place_rows[:, 1], place_rows[:, 0]],
+        object_colors=colors[place_rows[:, 1], place_rows[:, 0]],
         controller_points=place(image, grip_points, guess),
         cloud=first.points(cloud_pixels),
-        cloud_colours=colors[y, x],
+        cloud_colors=colors[y, x],
         backend=f"color alone, {first.kind}",
         facts=facts,
     )

@@ -160,7 +160,7 @@ def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -
     """Gray image [H, W] uint8 of the hands alone."""
     if not capture.has(camera, frame):
         return np.full(labels.shape[1:], GRAY, np.uint8)
-    gray = cv2.cvtColor(np.ascontiguousarray(capture.colour(camera, frame)), cv2.COLOR_RGB2GRAY)
+    gray = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY)
     return np.where(labels[frame] == HANDS, gray, GRAY).astype(np.uint8)
 
 

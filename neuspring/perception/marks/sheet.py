@@ -54,7 +54,7 @@ def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
 
 
 def _tile(capture: Capture, camera: str, carried: Carried, frame: int, why: str) -> np.ndarray:
-    image = overlay(np.ascontiguousarray(capture.colour(camera, frame)), carried.labels[frame])
+    image = overlay(np.ascontiguousarray(capture.color(camera, frame)), carried.labels[frame])
     height, width = image.shape[:2]
     if width > WIDTH:
         image = cv2.resize(image, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)

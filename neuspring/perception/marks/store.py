@@ -50,7 +50,7 @@ class Film:
 
     def color(self, frame: int, /) -> np.ndarray:
         """RGB [H, W, 3] uint8."""
-        return self.capture.colour(self.camera, self.frames[frame])
+        return self.capture.color(self.camera, self.frames[frame])
 
     def depth(self, frame: int, /) -> np.ndarray | None:
         """Depth [H, W] float32, m, 0 where nothing was measured; None: the camera has no depth."""

@@ -44,7 +44,7 @@ def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], ar
         len(shots) + 1, columns, figsize=(2.9 * columns, 2.9 * height / width * (len(shots) + 1) + 0.9), layout="constrained"
     )
     for row, shot in zip(axes, shots, strict=False):
-        seen, known = shot.colour.cpu().numpy(), shot.known.cpu().numpy()[..., None]
+        seen, known = shot.color.cpu().numpy(), shot.known.cpu().numpy()[..., None]
         splats = drawn[shot.name][..., :3] / 255
         quality = float(psnr(*(torch.tensor(p, dtype=torch.float32).permute(2, 0, 1) for p in (splats * known, seen))))
         titles = (f"camera {shot.name}: frame 0, masked", f"splats ({quality:.1f} dB)", f"difference, 0 to {WORST:g}")

@@ -42,7 +42,7 @@ KEY, HISTOGRAM = 2.8, 3.3
 """Widths of the legend beside the views, and of the histogram, inches."""
 
 
-def region_colours(count: int) -> np.ndarray:
+def region_colors(count: int) -> np.ndarray:
     """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
     if count <= len(PALETTE):
         return to_rgba_array(PALETTE[:count])
@@ -95,7 +95,7 @@ def _draw_nodes(axis: Axes, view: View, topology: Topology) -> None:
     """Nodes in the color of their region, near ones in front, and controllers."""
     flat, order = view.project(topology.nodes), np.argsort(view.depth(topology.nodes))
     names, region = np.unique(topology.labels, return_inverse=True)
-    colors, size = region_colours(len(names)), point_size(len(flat))
+    colors, size = region_colors(len(names)), point_size(len(flat))
     axis.scatter(flat[order, 0], flat[order, 1], s=size, c=colors[region[order]], linewidths=0, zorder=2)
     degree = np.bincount(topology.springs.ravel(), minlength=len(flat))[: len(flat)]
     for index, name in enumerate(names):

@@ -14,7 +14,7 @@ from neuspring.report.page.words import duration, hours, memory
 from neuspring.scores.metrics import DASH
 
 ORDER = (
-    *("capture", "synthesise", "segment", "track", "lift", "judge", "observe", "search", "fits", "fit", "rollout"),
+    *("capture", "synthesize", "segment", "track", "lift", "judge", "observe", "search", "fits", "fit", "rollout"),
     *("train", "predict", "transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
 )
 """Rules in the order of the workflow."""
@@ -126,7 +126,7 @@ def _cost(name: str, jobs: Sequence[JobRecord]) -> list[Cell]:
     on_gpu, waited = _gpu_seconds(jobs), sum(a.waited for a in attempts)
     peak = max((a.peak_memory_mb for a in attempts), default=0.0)
     gpu_peak = max((a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None), default=None)
-    used = [(a.gpu_utilisation, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilisation is not None and a.seconds > 0]
+    used = [(a.gpu_utilization, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilization is not None and a.seconds > 0]
     weight = sum(weight for _, weight in used)
     use = sum(percent * weight for percent, weight in used) / weight if weight else None
     return [

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Twin
-from neuspring.report.figures.twin import COLORS, CONTROLLER, region_colours, stiffness_limits
+from neuspring.report.figures.twin import COLORS, CONTROLLER, region_colors, stiffness_limits
 from neuspring.report.figures.views import place, sample
 from neuspring.report.paper.look import finer
 from neuspring.report.paper.scene import Scene, Take, faded, over_white
@@ -29,7 +29,7 @@ from neuspring.report.paper.sheet import TEXT, color_bar, points_across
 from neuspring.splats.draw import picture, view_of
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.rasterize import choose_backend
 
 Quantity = Literal["stiffness", "region"]
 TITLE, GAP, BAR, EDGE = 0.22, 0.05, 0.75, 0.03
@@ -78,7 +78,7 @@ class Body:
         if quantity == "stiffness":
             return self._of_stiffness(node_stiffness(twin))
         names, region = np.unique(twin.topology.labels, return_inverse=True)
-        return np.asarray(region_colours(len(names))[region])
+        return np.asarray(region_colors(len(names))[region])
 
     def spring_colors(self, take: Take, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""
@@ -179,7 +179,7 @@ def _regions(figure: Figure, body: Body, left: float, middle: float) -> None:
     """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
     count = max(len(np.unique(_twin(take).topology.labels)) for take in body.takes)
     width, height = figure.get_size_inches()
-    dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colours(count)]
+    dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     if count > 1 and body.style == "springs":
         dots.append(Line2D([], [], color=CROSSING, linewidth=1.0))

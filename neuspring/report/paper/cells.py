@@ -20,7 +20,7 @@ from neuspring.report.paper.sheet import points_across
 from neuspring.scores.images import psnr
 from neuspring.scores.pictures import Pair
 from neuspring.splats.draw import COVERED, picture, view_of
-from neuspring.splats.rasterise import choose_backend
+from neuspring.splats.rasterize import choose_backend
 
 Style = Literal["splats", "nodes"]
 Error = Literal["color", "distance", "none"]

@@ -89,7 +89,7 @@ class Scene:
         """RGB [H, W, 3] uint8 of the whole picture; None: there is none."""
         if self.capture is None or not self.capture.has(self.camera.name, frame):
             return None
-        return self.capture.colour(self.camera.name, frame)
+        return self.capture.color(self.camera.name, frame)
 
     def mask(self, frame: int) -> np.ndarray | None:
         """Labels [H, W] of the whole picture; None: there are none."""

@@ -63,7 +63,7 @@ def write(table: pd.DataFrame, folder: Path) -> str:
             "# Perception against the truth",
             "",
             f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.",
-            "Lifted: of the same points in the world; trusted: of those that move as their neighbours do, which losses use.",
+            "Lifted: of the same points in the world; trusted: of those that move as their neighbors do, which losses use.",
             "",
             *markdown(header, lines),
             "",

@@ -81,7 +81,7 @@ def deprojection(case: Released, observations: Observations, _: Tools) -> list[F
 def renderer(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
     """Check 5: the released splats, moved by the released prediction, drawn and scored as released."""
     calibration = (case.folder / phystwin.METADATA, case.folder / CALIBRATION)
-    require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colours, *calibration)
+    require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colors, *calibration)
     rows = frame_scores(case, observations, tools.lpips, tools.device)
     scores = metrics.score_images(rows, observations.scenario, observations.scenario.frame_count, "released", 0)
     missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
@@ -114,7 +114,7 @@ def _scores(
     case: Released, camera: Camera, frame: int, rendered: np.ndarray, lpips: Lpips | str, images: Images
 ) -> dict[str, float]:
     name, quirks = f"{frame}.png", images.released_quirks
-    observed = read_picture(case.colours / name, camera)
+    observed = read_picture(case.colors / name, camera)
     mask = read_picture(case.object_masks / name, camera, gray=True)
     human = read_picture(case.human_masks / name, camera, gray=True)
     pair = Pair.of(observed, rendered, mask, human, 1 if quirks.any_alpha else COVERED)

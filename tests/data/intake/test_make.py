@@ -37,7 +37,7 @@ def test_folders_of_one_camera_become_a_capture(tmp_path):
     about = Capture.load(capture.folder).description
     assert (about.frame_count, about.frame_rate, about.up, about.depth_unit, about.masks) == (6, 15.0, "+z", 0.001, False)
     assert capture.train_end == 4
-    np.testing.assert_array_equal(capture.colour("0", 2), seen(camera(), 4)[0])
+    np.testing.assert_array_equal(capture.color("0", 2), seen(camera(), 4)[0])
     np.testing.assert_allclose(capture.depth("0", 2), counts(seen(camera(), 4)[1]) / 1000)
     assert capture.cameras["0"].camera_to_world[2, 3] == pytest.approx(camera().camera_to_world[2, 3], abs=5e-4)
     assert serious(check_layout(capture.folder)) == []
@@ -59,7 +59,7 @@ def test_a_color_video_and_a_depth_video_become_a_capture(tmp_path):
     )
     assert capture.description.frame_rate == pytest.approx(15, rel=0.01)
     assert any("as the video says" in line for line in report)
-    np.testing.assert_array_equal(capture.colour("0", 3), pictures[3][0])
+    np.testing.assert_array_equal(capture.color("0", 3), pictures[3][0])
     np.testing.assert_allclose(capture.depth("0", 3), counts(pictures[3][1]) / 1000)
 
 
@@ -198,7 +198,7 @@ def test_a_realsense_recording_says_all_but_the_category(tmp_path, monkeypatch, 
     assert main(stand_in(monkeypatch, tmp_path, intrinsics=ABOUT, order=order, repeated=True)) == 0
     capture = Capture.load(tmp_path / "capture")
     assert (capture.frame_count, capture.description.frame_rate, capture.description.depth_unit) == (FRAMES, 30.0, 0.0001)
-    np.testing.assert_array_equal(capture.colour("0", 4), seen(camera(), 4)[0])
+    np.testing.assert_array_equal(capture.color("0", 4), seen(camera(), 4)[0])
     np.testing.assert_allclose(capture.depth("0", 4), seen(camera(), 4)[1], atol=6e-5)
     assert "as the source says" in capsys.readouterr().out
 

@@ -27,7 +27,7 @@ def test_the_commands_of_the_page(tmp_path, monkeypatch, capsys):
     for frame in range(original.frame_count):
         # The numbers of the page's window; depth as npy of counts, to show that kinds may differ.
         name = f"{250 + frame:06d}"
-        cv2.imwrite(str(tmp_path / "FILES" / "color" / f"{name}.jpg"), original.colour("0", frame)[..., ::-1])
+        cv2.imwrite(str(tmp_path / "FILES" / "color" / f"{name}.jpg"), original.color("0", frame)[..., ::-1])
         counts = cv2.imread(str(original.path("depth", "0", frame)), cv2.IMREAD_UNCHANGED)
         np.save(tmp_path / "FILES" / "depth" / f"{name}.npy", counts)
     write_json(tmp_path / "FILES" / "intrinsics.json", {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]})

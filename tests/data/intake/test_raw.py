@@ -22,7 +22,7 @@ def test_a_case_keeps_masks_tracks_and_split(case, tmp_path):
     capture = Capture.load(output)
     assert (capture.description.up, capture.train_end, capture.description.frame_rate) == ("-z", 4, 30.0)
     np.testing.assert_array_equal(capture.mask("0", 3), original.mask("0", 3))
-    np.testing.assert_array_equal(capture.colour("0", 3), original.colour("0", 3))
+    np.testing.assert_array_equal(capture.color("0", 3), original.color("0", 3))
     np.testing.assert_allclose(capture.tracks(), original.tracks(), atol=2e-6)
 
 

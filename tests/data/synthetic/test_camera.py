@@ -7,7 +7,7 @@ from neuspring.data.capture import Camera
 from neuspring.data.synthetic.implicit import sphere, surface
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
-from neuspring.data.synthetic.sensor import measured, quantised
+from neuspring.data.synthetic.sensor import measured, quantized
 from tests.support.captures import K
 
 
@@ -63,7 +63,7 @@ def test_texture_sticks_to_the_material():
         renderer.move([vertices + shift])
         of = camera(np.array([0.6, 0.0, 0.5]) + shift - [0, 0, 0.3], shift)
         view = renderer.render(of)
-        pictures.append(np.where((view.label == OBJECT)[..., None], view.colour, 0).astype(int))
+        pictures.append(np.where((view.label == OBJECT)[..., None], view.color, 0).astype(int))
     # Light comes from far, so a ball seen the same way looks the same wherever it is.
     # Rounding moves a pixel now and then to the other side of a shadow's edge.
     assert np.abs(pictures[0] - pictures[1]).mean() < 0.05
@@ -97,4 +97,4 @@ def test_edges_and_grazing_surfaces_lose_depth_and_nothing_stays_nothing():
 
 
 def test_depth_is_stored_in_its_unit():
-    np.testing.assert_array_equal(quantised(np.array([0.0, 0.5004, 0.5006, 100.0]), 0.001), [0, 500, 501, 65535])
+    np.testing.assert_array_equal(quantized(np.array([0.0, 0.5004, 0.5006, 100.0]), 0.001), [0, 500, 501, 65535])

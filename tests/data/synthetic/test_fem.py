@@ -22,7 +22,7 @@ def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, fricti
     nodes, tetrahedra = block((-0.06, -0.015, height), (0.06, 0.015, height + 0.03), cells)
     skin = boundary(tetrahedra)
     surface = Surface(
-        rest=nodes, faces=skin, nodes=np.arange(len(nodes))[:, None], weights=np.ones((len(nodes), 1)), colours=nodes * 0
+        rest=nodes, faces=skin, nodes=np.arange(len(nodes))[:, None], weights=np.ones((len(nodes), 1)), colors=nodes * 0
     )
     count = len(tetrahedra)
     return Body(
@@ -71,8 +71,8 @@ def test_free_vibration_keeps_its_energy():
     start = body.nodes.copy()
     start[:, 0] *= 1.02
     clip = FiniteElements(body, (), 31, RATE, NO_DAMPING, start=start).run()
-    centred = clip.positions - clip.positions.mean(axis=1, keepdims=True)
-    length = np.ptp(centred[..., 0], axis=1)
+    centerd = clip.positions - clip.positions.mean(axis=1, keepdims=True)
+    length = np.ptp(centerd[..., 0], axis=1)
     assert length[:10].max() == pytest.approx(0.1224, rel=2e-3)
     assert length[20:].max() == pytest.approx(length[:10].max(), rel=5e-3)
     assert length[20:].min() == pytest.approx(length[:10].min(), rel=5e-3)

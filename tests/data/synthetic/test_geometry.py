@@ -108,7 +108,7 @@ def test_goods_show_where_their_material_is(body):
     np.testing.assert_allclose(body.surface.follow(body.nodes), body.surface.rest, atol=1e-7)
     material = body.membrane if body.is_sheet else body.youngs_modulus
     assert material.max() > 2 * material.min()
-    assert ((body.surface.colours >= 0) & (body.surface.colours <= 1)).all()
+    assert ((body.surface.colors >= 0) & (body.surface.colors <= 1)).all()
     np.testing.assert_allclose(body.surface.weights.sum(axis=1), 1.0)
 
 

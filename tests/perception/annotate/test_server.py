@@ -61,7 +61,7 @@ def test_the_state_describes_the_capture(client, capture):
 
 def test_frames_come_as_they_are(client, capture):
     shown = client.image("/api/color/0/3")[..., ::-1].astype(int)
-    assert np.abs(shown - capture.colour("0", 3)).mean() < 2.0  # JPEG
+    assert np.abs(shown - capture.color("0", 3)).mean() < 2.0  # JPEG
     assert client.raw("GET", "/api/color/0/4")[0] == 404
 
 

@@ -42,7 +42,7 @@ class Film:
     def has(self, camera: str, frame: int) -> bool:
         return True
 
-    def colour(self, camera: str, frame: int) -> np.ndarray:
+    def color(self, camera: str, frame: int) -> np.ndarray:
         return self.colors[frame]
 
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
-from neuspring.report.figures.twin import CONTROLLER, region_colours
+from neuspring.report.figures.twin import CONTROLLER, region_colors
 from neuspring.report.paper.body import CROSSING, Body, body_figure, node_stiffness
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, painter
@@ -74,10 +74,10 @@ def test_a_node_has_the_mean_of_its_springs(plain):
 def test_regions_have_a_color_each_and_springs_between_them_are_dark(plain):
     scene, takes = uneven(plain)
     body, labels = Body(scene, takes, 0, ("region",)), takes[0].twin.topology.labels
-    assert np.array_equal(body.node_colors(takes[0], "region"), region_colours(3)[labels])
+    assert np.array_equal(body.node_colors(takes[0], "region"), region_colors(3)[labels])
     ends = labels[takes[0].twin.topology.springs[: takes[0].twin.topology.object_spring_count]]
     colors, same = body.spring_colors(takes[0], "region"), ends[:, 0] == ends[:, 1]
-    assert np.array_equal(colors[same], region_colours(3)[ends[same, 0]])
+    assert np.array_equal(colors[same], region_colors(3)[ends[same, 0]])
     assert (~same).any() and (colors[~same] == CROSSING).all()
 
 
@@ -107,5 +107,5 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
     Body(scene, takes, 4, ("region",), style="splats").paint(axis, takes[0], "region")
     shown = np.asarray(axis.images[0].get_array())
     opaque = np.unique(shown.reshape(-1, 3), axis=0).astype(float) / 255
-    for color in region_colours(3)[:, :3]:
+    for color in region_colors(3)[:, :3]:
         assert np.abs(opaque - color).max(axis=1).min() < 0.05

@@ -235,8 +235,8 @@ def test_the_data_say_which_principal_point_they_were_lifted_with(tmp_path, mirr
 def test_conventions_that_coincide_cannot_be_told_apart(case, published):
     path = case.folder / "metadata.json"
     text = path.read_text()
-    for centre in ("37.0", "35.5", "30.5"):
-        text = text.replace(centre, "32.0")
+    for center in ("37.0", "35.5", "30.5"):
+        text = text.replace(center, "32.0")
     path.write_text(text)
     lifted = [
         gated_lift(c, visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name), c))
@@ -342,7 +342,7 @@ def test_lpips_is_taken_as_released(case):
     table = frame_scores(case, read_observations(case), metric, "cpu")
     score = table[(table["metric"] == "lpips") & (table["frame"] == 2)]["value"].item()
     rgba = drawn(case)[2]
-    observed = cv2.imread(str(case.colours / "2.png"))[..., ::-1]
+    observed = cv2.imread(str(case.colors / "2.png"))[..., ::-1]
     mask, human = (cv2.imread(str(f / "2.png"), cv2.IMREAD_GRAYSCALE) / 255 for f in (case.object_masks, case.human_masks))
     pair = [
         torch.tensor(p * (1 - human)[..., None] / 255).permute(2, 0, 1).float() for p in (observed * mask[..., None], rgba[..., :3])

@@ -45,7 +45,7 @@ class Rendered:
     backend: Backend
 
 
-def rasterise(
+def rasterize(
     means: torch.Tensor,
     quaternions: torch.Tensor,
     scales: torch.Tensor,
@@ -68,7 +68,7 @@ def rasterise(
     if backend == "gsplat":
         from neuspring.splats import gsplat_backend
 
-        return gsplat_backend.rasterise(means, quaternions, scales, opacities, colors, view, degree, background, limits)
+        return gsplat_backend.rasterize(means, quaternions, scales, opacities, colors, view, degree, background, limits)
     ellipses = project(means, quaternions, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
     visible = torch.nonzero(touching).squeeze(1)
@@ -78,7 +78,7 @@ def rasterise(
         flat.retain_grad()
     shade = colors[index]
     if degree is not None:
-        shade = harmonics.colours(shade, means[index] - view.position.to(means), degree)
+        shade = harmonics.colors(shade, means[index] - view.position.to(means), degree)
     lists = tiles(depths.detach(), rectangles[visible], view)
     features = torch.cat([shade, depths[:, None]], dim=1)
     total, left = blend(lists, view, limits, flat, ellipses.conics[visible], opacities[index], features)
@@ -113,7 +113,7 @@ def _gsplat_fault(device: str) -> str:
         mean, turn = torch.tensor([[0.0, 0.0, 1.0]], device=device), torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
         scale, opacity = torch.full((1, 3), 0.1, device=device), torch.full((1,), 0.5, device=device)
         view = View(torch.eye(4, device=device), intrinsics, size, size)
-        picture = rasterise(mean, turn, scale, opacity, torch.ones_like(mean), view, backend="gsplat")
+        picture = rasterize(mean, turn, scale, opacity, torch.ones_like(mean), view, backend="gsplat")
     except Exception as error:
         return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return "" if float(picture.alpha.max()) > 0.4 else "it drew nothing"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from neuspring.core.errors import InputError
 from neuspring.splats import reference
 from neuspring.splats.project import project
-from neuspring.splats.rasterise import choose_backend, rasterise
+from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.view import LIMITS
 from tests.support.devices import DEVICES
 from tests.support.golden_splats import CASES, Golden
@@ -42,7 +42,7 @@ def test_pictures_and_gradients_are_the_golden_ones(case, precision, device):
     golden = Golden(case, dtype, device)
     stable = golden.values["stable"]
     for which in "AB":
-        picture = rasterise(*golden.inputs.values(), golden.view, **golden.options)
+        picture = rasterize(*golden.inputs.values(), golden.view, **golden.options)
         for name in ("rgb", "alpha", "depth"):
             result = getattr(picture, name).detach().cpu().numpy()
             error = np.abs(result - golden.values[f"exp_{name}"])[stable].max()
@@ -77,7 +77,7 @@ def test_projection_and_order_are_the_golden_ones(case):
 @pytest.mark.parametrize("case", CASES)
 def test_the_specification_is_the_golden_data(case):
     golden = Golden(case, torch.float64)
-    pictures = reference.rasterise(*golden.inputs.values(), golden.view, **golden.options)
+    pictures = reference.rasterize(*golden.inputs.values(), golden.view, **golden.options)
     for name, picture in zip(("rgb", "alpha", "depth"), pictures, strict=True):
         assert np.abs(picture.detach().numpy() - golden.values[f"exp_{name}"]).max() <= DOUBLE[name]
 
@@ -88,8 +88,8 @@ def test_any_scene_looks_as_the_specification_says(seed, count, side):
     """Tiles, lists and early stops change nothing, whatever the size of picture and splats."""
     splats = random_splats(seed, count, torch.float64)
     view = small_view(*side)
-    picture = rasterise(*splats, view, background=(0.2, 0.3, 0.4))
-    specification = reference.rasterise(*splats, view, background=(0.2, 0.3, 0.4))
+    picture = rasterize(*splats, view, background=(0.2, 0.3, 0.4))
+    specification = reference.rasterize(*splats, view, background=(0.2, 0.3, 0.4))
     for result, expected in zip((picture.rgb, picture.alpha, picture.depth), specification, strict=True):
         assert torch.allclose(result, expected, atol=1e-9)
     weights = torch.rand_like(picture.rgb)
@@ -107,7 +107,7 @@ def test_gradients_are_those_of_central_differences():
     weights = torch.rand(view.height, view.width, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def loss(*tensors):
-        picture = rasterise(*tensors, view, limits=limits)
+        picture = rasterize(*tensors, view, limits=limits)
         # The depth of almost nothing jumps where it becomes nothing; times its coverage it does not.
         depth = picture.alpha * picture.depth
         return (torch.cat([picture.rgb, picture.alpha[..., None], depth[..., None]], dim=-1) * weights).sum()
@@ -118,7 +118,7 @@ def test_gradients_are_those_of_central_differences():
 def test_nothing_in_view_is_an_empty_picture_with_zero_gradients():
     splats = random_splats(0, 5, torch.float32)
     behind = [splats[0] * torch.tensor([1.0, 1.0, -1.0]), *splats[1:]]
-    picture = rasterise(*behind, small_view(), background=(0.1, 0.2, 0.3))
+    picture = rasterize(*behind, small_view(), background=(0.1, 0.2, 0.3))
     assert torch.equal(picture.alpha, torch.zeros_like(picture.alpha))
     assert torch.equal(picture.depth, torch.zeros_like(picture.depth))
     assert torch.allclose(picture.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(picture.rgb))
@@ -129,7 +129,7 @@ def test_nothing_in_view_is_an_empty_picture_with_zero_gradients():
 def test_a_camera_among_the_splats_gives_a_finite_picture_and_finite_gradients():
     splats = random_splats(1, 300, torch.float32)
     centered = [splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]]
-    picture = rasterise(*centered, small_view())
+    picture = rasterize(*centered, small_view())
     (picture.rgb.sum() + picture.depth.sum()).backward()
     assert torch.isfinite(picture.rgb).all()
     assert all(torch.isfinite(tensor.grad).all() for tensor in splats)
@@ -142,15 +142,15 @@ def test_splats_that_are_not_finite_are_named(name):
     position = ["means", "quaternions", "scales", "opacities", "colors"].index(name)
     splats[position][2] = float("nan")
     with pytest.raises(InputError, match=rf"splats, {name}.*finite.*1 of 4"):
-        rasterise(*splats, small_view())
+        rasterize(*splats, small_view())
 
 
 def test_wrong_shapes_are_named():
     splats = [tensor.detach() for tensor in random_splats(0, 4, torch.float32)]
     with pytest.raises(InputError, match=r"splats, scales.*\[4, 3\].*\(4, 1\)"):
-        rasterise(*splats[:2], splats[2][:, :1], *splats[3:], small_view())
+        rasterize(*splats[:2], splats[2][:, :1], *splats[3:], small_view())
     with pytest.raises(InputError, match="degree 2 needs 9"):
-        rasterise(*splats[:4], torch.zeros(4, 4, 3), small_view(), degree=2)
+        rasterize(*splats[:4], torch.zeros(4, 4, 3), small_view(), degree=2)
 
 
 def test_gsplat_is_refused_with_a_reason_where_it_cannot_work():
