@@ -16,6 +16,15 @@ from neuspring.core.errors import InputError
 from neuspring.core.uri import masked
 
 T = TypeVar("T")
+RENAMED = {
+    "colour_rate": "color_rate",
+    "neighbourhood": "neighborhood",
+    "outlier_neighbours": "outlier_neighbors",
+    "least_neighbours": "least_neighbors",
+}
+"""Keys of older versions -> their name now, or a sentence that says where they went. An entry is a key or its dotted path."""
+REMOVED = "removed; commit 7308a7b is the last that has it"
+"""The sentence for what lost its trial."""
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
@@ -40,7 +49,8 @@ def _describe(problem: Any) -> str:
     path = ".".join(str(part) for part in problem["loc"] if not str(part).startswith("constrained")) or "(top level)"
     value = problem["input"]
     if problem["type"] == "unexpected_keyword_argument":
-        return f"{path}: unknown key"
+        now = RENAMED.get(path) or RENAMED.get(path.rpartition(".")[2])
+        return f"{path}: unknown key" + (f" ({now if ' ' in now else f'now {now}'})" if now else "")
     if problem["type"] == "missing":
         return f"{path}: required, but missing"
     hint = ""
