@@ -34,6 +34,11 @@ NO_REST_SHAPE = np.zeros((0, 3))
 """The rest shape that stands for: as in frame 0."""
 
 
+def up_sign(up: str) -> float:
+    """+1 for `+z`, -1 for `-z`."""
+    return 1.0 if up == "+z" else -1.0
+
+
 def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False, omitted: bool = False) -> Any:
     """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
 
@@ -192,7 +197,7 @@ class Scenario(Artifact):
     kind: ClassVar[str] = "scenario"
     name: str
     source: str
-    """The reader that made it: phystwin, mocap or toy."""
+    """The kind of its data, a name of `SOURCES` (data/sources.py)."""
     category: str
     frame_count: int
     train_end: int
@@ -206,6 +211,11 @@ class Scenario(Artifact):
     """What stands in the scene and does not move."""
     provenance: dict[str, str] = field(default_factory=dict)
     """What the reader used, as text: files with digests, options."""
+
+    @property
+    def up_sign(self) -> float:
+        """+1 when +z is up, -1 when -z is up."""
+        return up_sign(self.up)
 
     def check(self) -> None:
         object.__setattr__(self, "obstacles", obstacles_of(self.obstacles, f"scenario {self.name}"))
@@ -478,7 +488,7 @@ class Simulation:
     @property
     def up_sign(self) -> float:
         """+1 when +z is up, -1 when -z is up."""
-        return 1.0 if self.up == "+z" else -1.0
+        return up_sign(self.up)
 
 
 @dataclass(frozen=True, kw_only=True)

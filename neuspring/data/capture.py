@@ -29,6 +29,7 @@ from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
 from neuspring.config.types import STRICT, Finite, Name, Positive
+from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.obstacles import Obstacle
@@ -130,6 +131,11 @@ class Description:
     """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
     provenance: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def up_sign(self) -> float:
+        """+1 when +z is up, -1 when -z is up."""
+        return up_sign(self.up)
 
 
 @dataclass(frozen=True, eq=False)

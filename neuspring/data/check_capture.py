@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_departures, read_description
 from neuspring.data.departure import Departure, Inspection, broken, note
@@ -116,7 +117,7 @@ def _world_departures(capture: Capture, name: str, samples: dict[int, Sample]) -
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
     findings = [
         *depth_findings(camera, samples),
-        *place_findings(f"camera {name}, object", list(bodies.values()), 1.0 if up == "+z" else -1.0),
+        *place_findings(f"camera {name}, object", list(bodies.values()), up_sign(up)),
         *hand_findings(camera, samples),
         *reach_findings(camera, samples),
     ]
@@ -136,7 +137,7 @@ def _alone_departures(capture: Capture, name: str, samples: dict[int, Sample]) -
     departures += horizon_departures(path, camera, mask)
     departures += [Departure.of_finding(path, one) for one in size_findings(camera, mask)]
     # Obstacles stand on the table: what lies beneath one is met above it.
-    on_table = object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * (1.0 if up == "+z" else -1.0)])
+    on_table = object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
     return departures + obstacle_departures(path, capture.description, on_table[np.isfinite(on_table[:, 0])])
 
 

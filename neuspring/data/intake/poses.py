@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Camera
 from neuspring.data.departure import refuse
@@ -90,7 +91,7 @@ def stand(
     if level:
         normal, point, rms = common_plane(tables, poses)
         up = up or "+z"
-        motion = levelling(normal, point, 1.0 if up == "+z" else -1.0)
+        motion = levelling(normal, point, up_sign(up))
         moved = {name: motion @ pose for name, pose in poses.items()}
         turn = float(np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))))
         rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"

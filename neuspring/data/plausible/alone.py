@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neuspring.core.artifacts import up_sign
 from neuspring.core.findings import Finding, finding
 from neuspring.data.capture import OBJECT, Camera
 from neuspring.data.departure import Departure, broken, note, unusual
@@ -30,7 +31,7 @@ def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 def alone_departures(path: Path, camera: Camera, up: str) -> list[Departure]:
     """Departures of a camera that is not above the table z = 0, or does not look at it; else a note on how far it is."""
     where, height = f"cameras.{camera.name}.camera_to_world", float(camera.camera_to_world[2, 3])
-    if height * (1.0 if up == "+z" else -1.0) <= 0:
+    if height * up_sign(up) <= 0:
         rule = f"{where}: the camera must be above the table z = 0, on the side of it that is up"
         return [broken(path, "", rule, f"its center at z = {height:.3f} m, and up {up}. {POSE}")]
     center = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuspring.core.artifacts import up_sign
 from neuspring.data.departure import Departure, broken, note, unusual
 from neuspring.data.intake.lenses import rigid_inverse
 from neuspring.data.intake.plane import Plane
@@ -58,7 +59,7 @@ def table_departures(
     path: Path, name: str, planes: Sequence[Plane], pose: np.ndarray, up: str, unit: float | None
 ) -> list[Departure]:
     """Departures of one camera's table from z = 0. `unit`, m per count, is None where depth is in meters by its type."""
-    sign = 1.0 if up == "+z" else -1.0
+    sign = up_sign(up)
     where = f"cameras.{name}.camera_to_world"
     candidates = [plane for plane in planes if plane.share >= SMALLEST]
     if not candidates:
@@ -95,7 +96,7 @@ def _text(standing: Stand) -> str:
 
 def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Departure | None:
     """The one change that puts the table at z = 0, as an error; None if there is none."""
-    sign = 1.0 if up == "+z" else -1.0
+    sign = up_sign(up)
     where = f"cameras.{name}.camera_to_world"
     other = "-z" if up == "+z" else "+z"
     flipped = stand(plane, pose, -sign)

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neuspring.core.artifacts import up_sign
 from neuspring.data.capture import Camera
 from neuspring.data.departure import Departure, note, unusual
 
@@ -54,7 +55,7 @@ def view_departures(path: Path, cameras: Mapping[str, Camera], depths: Mapping[s
 
 def _compare(a: Camera, depth_a: np.ndarray, b: Camera, depth_b: np.ndarray, up: str) -> tuple[int, float]:
     """Points of A that B sees, and the share of them that B looked through."""
-    sign = 1.0 if up == "+z" else -1.0
+    sign = up_sign(up)
     y, x = np.nonzero(depth_a[::STRIDE, ::STRIDE] > 0)
     pixels = STRIDE * np.stack([x, y], axis=-1)
     points = a.lift(pixels.astype(float), depth_a[pixels[:, 1], pixels[:, 0]])
