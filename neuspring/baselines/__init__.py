@@ -65,8 +65,6 @@ class Baseline:
     """From its settings: whether it is trained on silhouettes."""
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
     """From its settings: keys of the configuration that training reads beside its own section."""
-    work: Callable[[Any, int], int] = lambda section, frames: frames
-    """From its settings and the number of training frames: the cost of a training, which estimates its time."""
     own_splats: bool = False
     """Whether a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False
@@ -106,13 +104,11 @@ BASELINES = {
         takes_pictures=lambda section: bool(section.supervision == "masks"),
         reads=_spring_gaus_reads,
         own_splats=True,
-        work=lambda section, frames: int(section.iterations * frames),
         features=_vgg16,
     ),
     "gs_dynamics": Baseline(
         module="neuspring.baselines.gs_dynamics.entry",
         section="gs_dynamics",
-        work=lambda section, frames: int(section.epochs * section.updates_per_epoch),
         transfers=True,
     ),
     "static": Baseline(module="neuspring.baselines.static", trained=False),

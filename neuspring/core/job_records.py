@@ -25,12 +25,6 @@ RUN = ".run"
 """File in FOLDER that names the current run of the workflow, or the last one."""
 GPU_NOTES = ".gpus"
 """File in FOLDER in which the jobs of that run note which GPUs failed."""
-SIMULATING = ("search", "fits", "fit", "rollout", "transfer")
-"""Rules whose work is spring updates (`neuspring.experiments.size`)."""
-SPRING_UPDATES = "spring_updates"
-"""The fact of their stages' records that counts them."""
-GIGA_UPDATES = "1e9 spring updates"
-"""The unit of their work: a rate in seconds is one in nanoseconds per spring, substep and twin."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
 """How an attempt ended. transient: trying again may help. running: it runs, or its wrapper was killed."""
 
@@ -82,10 +76,6 @@ class JobRecord:
     """Relative to the results folder."""
     attempts: list[Attempt]
     scenario: str = ""
-    work: float = 1.0
-    """Amount of work, in units of its rule (see `neuspring.experiments.plan`)."""
-    unit: str = ""
-    """GIGA_UPDATES for a job whose stage counted its spring updates; empty: frames, iterations, or whatever its rule counts."""
 
     @property
     def last(self) -> Attempt:
@@ -103,14 +93,14 @@ class JobRecord:
         return sum(attempt.seconds for attempt in self.attempts)
 
     @classmethod
-    def of_log(cls, results: Path, log: Path, scenario: str = "", work: float = 1.0) -> JobRecord:
+    def of_log(cls, results: Path, log: Path, scenario: str = "") -> JobRecord:
         """A new record of the job that logs to `log`, which must lie under results/logs. Raises InputError."""
         try:
             name = log.relative_to(results / LOGS).with_suffix("").as_posix()
         except ValueError as error:
             raise InputError(log, f"logs of jobs must lie in {results / LOGS}") from error
         rule, place = name.partition("/")[0], log.relative_to(results).as_posix()
-        return cls(rule=rule, name=name, log=place, attempts=[], scenario=scenario, work=work)
+        return cls(rule=rule, name=name, log=place, attempts=[], scenario=scenario)
 
     def path(self, results: Path) -> Path:
         """Where the record lies."""

@@ -1,13 +1,12 @@
 """Where scenarios come from: `SOURCES` declares every kind of data, and the workflow asks it.
 
-To add a source: a reader (`observations`) or an importer to the capture format (`write_capture`), and its line here; for the
-plan of a run also its body in `neuspring.data.expected`.
+To add a source: a reader (`observations`) or an importer to the capture format (`write_capture`), and its line here.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
 from neuspring.data import capture, phystwin, phystwin_raw
-from neuspring.data.cases import released_cases
 
 if TYPE_CHECKING:
     from neuspring.core.artifacts import Observations
@@ -52,8 +50,6 @@ class Source:
     """Whether images lie beside processed data, so that a capture can be made of them for pictures."""
     required: Callable[[Path], None] = lambda folder: None
     """Raises InputError where its folder lacks what no run can do without."""
-    frames: Callable[[ScenarioRow, Config], int] = lambda row, config: 1
-    """Frames of a scenario as far as they are known before its data are read; 1 otherwise."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
     """Names of the cameras before the capture is made. Raises InputError."""
 
@@ -140,29 +136,10 @@ def _phystwin_capture(module: Any, row: ScenarioRow, settings: Config, folder: P
     module.convert(row, location(row, settings), folder)
 
 
-def _released_frames(row: ScenarioRow, config: Config) -> int:
-    facts: Mapping[str, Any] | None = released_cases().get(Path(row.path).name)
-    return int(facts["frames"]) if facts else 1
-
-
-def _synthetic_frames(row: ScenarioRow, config: Config) -> int:
-    # Synthetic scenes have the names and lengths of the released ones.
-    frames = _released_frames(row, config)
-    return min(frames, config.synthetic.frames or frames)
-
-
 def _required_capture(folder: Path) -> None:
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
-
-
-def _captured_frames(row: ScenarioRow, config: Config) -> int:
-    try:
-        return capture.read_description(location(row, config) / capture.CAPTURE).frame_count
-    except InputError:
-        # Damaged data fail the jobs of their scenario, which say what is wrong.
-        return 1
 
 
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
@@ -179,13 +156,11 @@ SOURCES = {
         reads=("toy",),
         observations=_toy,
         needs_data=False,
-        frames=lambda row, config: config.toy.frames,
     ),
     "mocap": Source(
         module="neuspring.data.mocap",
         reads=("data_root", "mocap"),
         observations=_mocap,
-        frames=lambda row, config: config.mocap.frames or 1,
     ),
     "synthetic": Source(
         module="neuspring.data.synthetic.make",
@@ -194,7 +169,6 @@ SOURCES = {
         write_capture=_synthetic_capture,
         needs_data=False,
         has_truth=True,
-        frames=_synthetic_frames,
         cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
     ),
     "capture": Source(
@@ -203,7 +177,6 @@ SOURCES = {
         films=True,
         own=True,
         required=_required_capture,
-        frames=_captured_frames,
         cameras=_described,
     ),
     "phystwin_raw": Source(
@@ -212,7 +185,6 @@ SOURCES = {
         films=True,
         write_capture=_phystwin_capture,
         capture_files=phystwin_raw.FILES,
-        frames=_released_frames,
         cameras=_counted,
     ),
     "phystwin": Source(
@@ -224,7 +196,6 @@ SOURCES = {
         capture_module="neuspring.data.phystwin_raw",
         capture_files=phystwin_raw.FILES,
         images_beside=phystwin_raw.has_images,
-        frames=_released_frames,
         cameras=_counted,
     ),
 }

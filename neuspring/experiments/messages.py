@@ -1,4 +1,4 @@
-"""What a user is told before and after a run of the workflow."""
+"""What a user is told while the workflow runs, and after it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,87 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import IO
 
 from neuspring.config import plain
+from neuspring.core.errors import InputError
 from neuspring.core.findings import findings_of
-from neuspring.core.job_records import FOLDER, RUN, failure_lines, read_jobs, this_run
+from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.experiments.arguments import Arguments
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.plan import report as plan
 
-__all__ = ["failed", "finished", "plan"]
 MOST_FINDINGS = 20
 """Warnings that are printed at the end of a run."""
+
+
+EVERY = 1.0
+"""s between two looks at the records of jobs."""
+
+
+class Overview:
+    """How far a quiet run is: a line per rule when its last job has succeeded, and on a terminal a line that moves.
+
+    It watches the records of the run's jobs, in a thread of its own, from `start` to `stop`.
+    """
+
+    def __init__(self, results: Path, logs: Iterable[Path], stream: IO[str] | None = None) -> None:
+        self._stream, self._run, self._begun = stream or sys.stdout, this_run(results), time.monotonic()
+        self._waiting: dict[str, set[Path]] = {}
+        for log in logs:
+            record = JobRecord.of_log(results, log)
+            self._waiting.setdefault(record.rule, set()).add(record.path(results))
+        self._counts = {rule: len(paths) for rule, paths in self._waiting.items()}
+        self._seconds = dict.fromkeys(self._counts, 0.0)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Tell what has ended since the last look, and end."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._stopped.wait(EVERY):
+            self._look()
+        self._look()
+        self._show("")
+
+    def _look(self) -> None:
+        for rule, paths in list(self._waiting.items()):
+            ended = {path: seconds for path in paths if (seconds := self._ended(path)) is not None}
+            paths -= set(ended)
+            self._seconds[rule] += sum(ended.values())
+            if not paths:
+                del self._waiting[rule]
+                count = self._counts[rule]
+                self._show("")
+                line = f"{rule:<17} {count:>5} job{'s' if count > 1 else ' '} {self._seconds[rule]:>8.0f} s"
+                print(line, file=self._stream, flush=True)
+        left = {rule: len(paths) for rule, paths in self._waiting.items()}
+        total, (minutes, seconds) = sum(self._counts.values()), divmod(round(time.monotonic() - self._begun), 60)
+        begun = [f"{rule} {count - left[rule]}/{count}" for rule, count in self._counts.items() if 0 < left.get(rule, 0) < count]
+        self._show("  ".join([f"{total - sum(left.values())}/{total} jobs", *begun, f"{minutes}:{seconds:02}"]))
+
+    def _ended(self, path: Path) -> float | None:
+        """Seconds that a job of this run took; None while it has not succeeded."""
+        try:
+            last = JobRecord.load(path).last
+        except (InputError, IndexError):
+            return None
+        return last.seconds if last.run == self._run and last.outcome == "ok" else None
+
+    def _show(self, text: str) -> None:
+        """Put a text in place of the line that moves; nothing where the output is no terminal."""
+        if self._stream.isatty():
+            print(f"\r\x1b[K{text}", end="", file=self._stream, flush=True)
 
 
 def failed(benchmark: Benchmark, arguments: Arguments) -> None:

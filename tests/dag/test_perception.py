@@ -178,7 +178,7 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(project):
     assert "appearance" not in plan(project, changes | {"results": "other"})
 
 
-def test_own_yaml_plans_minutes_and_lets_methods_that_learn_nothing_stand_beside(project):
+def test_own_yaml_lets_methods_that_learn_nothing_stand_beside(project):
     film(project / "mine" / "film", cameras=1)
     add_scenario(project, "film", "capture")
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--cores", "2", "--dry-run"]
@@ -186,9 +186,7 @@ def test_own_yaml_plans_minutes_and_lets_methods_that_learn_nothing_stand_beside
     output = output_of(start(command, project))
     jobs = jobs_in(output)
     assert (jobs["segment"], jobs["lift"], jobs["predict"], jobs["fit"], jobs["score"]) == (1, 1, 2, 2, 5)
-    assert re.search(r"Expected: \d+ jobs, \d+ CPU-minutes", output)
-    assert re.search(r"with 2 cores: at least (\d+ minutes|less than 1 minute)", output)
-    assert not re.search(r"not counted: .*(segment|track|lift|observe|search|fit|rollout|predict|appearance|render|score)", output)
+    assert f"Expected: {sum(jobs.values()) - 1} jobs" in output
 
 
 def test_a_capture_that_is_not_there_is_named_before_any_job(project):

@@ -35,8 +35,7 @@ def two_gpu_run(tmp_path_factory):
 @pytest.mark.slow
 def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
     project, output = two_gpu_run
-    assert re.search(r"Expected: \d+ jobs, .*GPU-(hour|minute)", output)
-    assert "with 2 GPU slots and 4 cores: at least" in output
+    assert re.search(r"Expected: \d+ jobs, no time on record", output)
     leases: dict[str, list[tuple[float, float]]] = {"0": [], "1": []}
     on_gpu = {"search", "fit", "rollout", "render", "appearance"}
     for job in read_jobs(project / "results"):
@@ -129,7 +128,7 @@ def test_a_sweep_ends_with_its_best_and_every_trial_in_mlflow(project):
     assert "logged: 4" in (folder / "mlflow.txt").read_text()
 
 
-def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(project, tmp_path):
+def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
     for name in released_cases():
         (tmp_path / "data" / "different_types" / name).mkdir(parents=True)
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
@@ -144,8 +143,6 @@ def test_the_whole_benchmark_is_planned_with_its_jobs_and_hours(project, tmp_pat
     expected |= {"study": 5, "tables": 1, "report": 1, "all": 1}
     assert jobs_in(output) == expected
     assert f"Expected: {sum(expected.values()) - 1} jobs, " in output
-    # Planned for GPUs, of which this machine need not have one.
-    assert "GPU-hours" in output and "PhysTwin" in output
 
 
 def test_damaged_data_of_one_scenario_stop_nobody_else_s_jobs(project):

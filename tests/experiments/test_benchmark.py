@@ -16,15 +16,16 @@ import yaml
 from neuspring import config
 from neuspring.config import Config, Method, SearchRow, parse
 from neuspring.config.search import HANDS
+from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
-from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.benchmark import Benchmark, check_storage
 from neuspring.experiments.inputs import Inputs
-from neuspring.experiments.needs import Needs
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
 from tests.support.captures import describe
 from tests.support.colored import paint
+from tests.support.project import config_with
 
 ROOT = Path(__file__).parents[2]
 
@@ -359,7 +360,7 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
     assert list(made.searches) == ["uniform", "uniform-all", "uniform-others"]
     assert made.fit_of_method == {"full": "full", "one": "one", "two": "two"}
-    inputs, needs = Inputs(made), Needs(made, "cpu")
+    inputs = Inputs(made)
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     assert [inputs.search_of_fit(job) for job in jobs.values()] == [
         f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-others")
@@ -369,10 +370,6 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     words = [inputs.pool_options(SimpleNamespace(scenario="a", search=name)) for name in made.searches]
     assert words == ["", f"--pool {' '.join(others)}", f"--pool {' '.join(others)} --leave-out"]
     assert [inputs.pool_options(job) for job in jobs.values()] == words
-    work = [needs.work("fit", job) for job in jobs.values()]
-    assert [count / work[0] for count in work] == [1, 3, 2]
-    work = [needs.work("search", SimpleNamespace(scenario="a", search=name)) for name in made.searches]
-    assert [count / work[0] for count in work] == [1, 3, 2]
     assert [json.loads(inputs.variant(job)).get("pool") for job in jobs.values()] == [None, "all", "others"]
     assert json.loads(inputs.variant(jobs["one"]))["clusters"] == 1
 
@@ -391,16 +388,13 @@ def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path
     made = pooled(tmp_path, method_table="more.yaml", methods=["one", "oracle"])
     assert list(made.searches) == ["uniform-all"], "no search alone is needed"
     assert made.fit_of_method == {"one": "one", "oracle": "oracle"}
-    inputs, needs = Inputs(made), Needs(made, "cpu")
+    inputs = Inputs(made)
     jobs = [SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods]
     assert [(json.loads(inputs.variant(job)).get("oracle"), json.loads(inputs.variant(job))["pool"]) for job in jobs] == [
         (None, "all"),
         (True, "all"),
     ]
     assert "released_quirks" in json.loads(inputs.settings("fit", jobs[1]))
-    body = needs.sizes.body("a")
-    work = [needs.work("fit", job) for job in jobs]
-    assert work[1] / work[0] == (body.frames - 1) / (body.train_end - 1) > 1
 
 
 def test_fits_on_a_pool_share_no_launches(tmp_path: Path) -> None:
@@ -634,3 +628,53 @@ def test_methods_that_learn_nothing_stand_beside_on_own_recordings(source, metho
     assert tables._with_references(load(""), {"rope": row}, {"ours": known["ours"]}).methods == ("ours",)
     every = replace(load(""), methods=("ours", "static", "controller_lbs"))
     assert tables._with_references(every, {"rope": row}, known).methods == every.methods
+
+
+def test_workers_on_several_machines_need_a_database_that_locks_across_them():
+    space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    study = {"study": "rate", "method": "baseline", "workers": 2, "space": space}
+    tune = config.parse(Tune, study, "test")
+    check_storage(tune, cluster=False)
+    with pytest.raises(InputError, match="workers on several machines need storage"):
+        check_storage(tune, cluster=True)
+    check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
+    check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
+
+
+def test_only_takes_a_part_by_scenario_category_method_and_seed():
+    names = ["toy_rope_lift_smooth", "toy_rope_shake_smooth", "toy_cloth_lift_smooth"]
+    all_of_it = {"scenarios": names, "methods": ["baseline", "clusters_2", "clusters_3"], "seeds": [0, 1, 2]}
+
+    def chosen(only):
+        part = Benchmark.of(config_with(all_of_it | {"only": only}), ROOT).config
+        return part.scenarios, part.methods, part.seeds
+
+    assert chosen("category=rope method=clusters_* seed=0,2") == (tuple(names[:2]), ("clusters_2", "clusters_3"), (0, 2))
+    assert chosen("scenario=*_lift_* category=cloth")[0] == ("toy_cloth_lift_smooth",)
+    assert chosen("")[0] == tuple(names)
+
+
+def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
+    part = {
+        "methods": ["search_only", "baseline"],
+        "seeds": [0, 1],
+        "compare_with": "baseline",
+        "only": "method=search_only seed=1",
+    }
+    made = Benchmark.of(config_with(part), ROOT)
+    assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
+    assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
+
+
+@pytest.mark.parametrize(
+    ("only", "message"),
+    [
+        ("category=ropes", "category 'ropes' matches none of the configuration's; received rope"),
+        ("method=neuspring", "method 'neuspring' matches none"),
+        ("color=red", "terms scenario="),
+        ("seed", "terms scenario="),
+    ],
+)
+def test_a_part_that_is_not_there_is_explained(only, message):
+    with pytest.raises(InputError, match=message):
+        Benchmark.of(config_with({"only": only}), ROOT)

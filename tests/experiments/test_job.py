@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import GIGA_UPDATES, GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
+from neuspring.core.job_records import GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
 from tests.support.jobs import NAME, record, run, wait_for, wrapped
@@ -17,39 +17,18 @@ from tests.support.jobs import NAME, record, run, wait_for, wrapped
 
 def test_a_job_leaves_its_output_in_the_log_and_a_record(results):
     code = "import time; x = bytearray(50_000_000); print('to see'); time.sleep(0.4)"
-    done = run(results, code, "--scenario", "rope", "--work", "88")
+    done = run(results, code, "--scenario", "rope")
     assert (done.returncode, done.stdout) == (0, "to see\n")
     assert (results / "logs" / f"{NAME}.log").read_text().endswith("to see\n")
     job_record = record(results)
     assert (job_record.rule, job_record.name, job_record.log) == ("search", NAME, f"logs/{NAME}.log")
-    assert (job_record.scenario, job_record.work) == ("rope", 88)
+    assert job_record.scenario == "rope"
     assert not job_record.failed
     last = job_record.last
     assert (last.outcome, last.exit, last.devices, last.cause) == ("ok", 0, [], "")
     assert last.seconds >= 0.4
     assert last.peak_memory_mb > 50
     assert all(len(row) == 5 for row in last.samples)
-
-
-def counted(results, facts, *, status=0):
-    """The record of a job of the rule `search` whose stage wrote a record with these facts."""
-    stage = results / "search.json"
-    stage.unlink(missing_ok=True)
-    values = json.dumps({"format": 1, "stage": "search", "status": "ok", "facts": facts})
-    code = f"import sys; open(sys.argv[2], 'w').write({values!r}); sys.exit({status})"
-    command = [*wrapped(results, "--work", "88"), sys.executable, "-c", code, "--output", str(stage)]
-    subprocess.run(command, check=False, capture_output=True)
-    job_record = record(results)
-    return job_record.work, job_record.unit
-
-
-def test_the_work_of_a_job_that_simulates_is_the_spring_updates_that_its_stage_counted(results):
-    assert counted(results, {"spring_updates": 25_000_000}) == (0.025, GIGA_UPDATES)
-    # A fit whose epochs all ran together with others counts none.
-    assert counted(results, {"spring_updates": 0}) == (0, GIGA_UPDATES)
-    # Of a search that failed, of an older stage, of a job that ended badly, nothing is known but what was planned.
-    for facts, status in (({}, 0), ({"spring_updates": 25_000_000}, 1)):
-        assert counted(results, facts, status=status) == (88, "")
 
 
 def test_a_permanent_failure_is_not_tried_again_but_the_next_run_tries(results):
@@ -126,7 +105,7 @@ def test_a_damaged_record_is_named_and_replaced_by_the_next_run(results):
 
 def test_records_come_back_as_they_were_written(tmp_path):
     attempt = Attempt(started="2026-01-01T00:00:00+00:00", outcome="transient", cause="x", samples=[[0.1, 2.0, 3.0, None, None]])
-    original = JobRecord(rule="fit", name="fit/a/b/0", log="logs/fit/a/b/0.log", attempts=[attempt], scenario="a", work=3.0)
+    original = JobRecord(rule="fit", name="fit/a/b/0", log="logs/fit/a/b/0.log", attempts=[attempt], scenario="a")
     original.save(tmp_path)
     assert read_jobs(tmp_path) == [original]
 

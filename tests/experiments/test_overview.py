@@ -3,8 +3,7 @@
 import io
 
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
-from neuspring.experiments.messages import first_table
-from neuspring.experiments.overview import Overview
+from neuspring.experiments.messages import Overview, first_table
 
 
 def save(results, name: str, **facts) -> None:

@@ -14,7 +14,6 @@ from neuspring.config import Method, parse
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.inputs import Inputs
-from neuspring.experiments.needs import Needs
 from neuspring.experiments.tuning.space import Plan
 
 ROOT = Path(__file__).parents[2]
@@ -56,14 +55,6 @@ def test_an_oracles_fit_is_its_own_though_its_settings_are_those_of_another():
     assert inputs.search(job("oracle_neuspring")) == inputs.search(job("neuspring"))
     together = json.loads(inputs.rows_of_fits(SimpleNamespace(scenario=SCENES[0])))
     assert [bool(row.get("oracle")) for row in together] == [False, False, True]
-
-
-def test_the_work_of_an_oracle_is_that_of_all_frames():
-    found = Needs(benchmark(), "cpu")
-    body = found.sizes.body(SCENES[0])
-    normal, oracle = (found.work("fit", job(name)) for name in ("neuspring", "oracle_neuspring"))
-    assert body.train_end < body.frames
-    assert oracle * (body.train_end - 1) == normal * (body.frames - 1)
 
 
 def test_oracles_are_not_transferred():

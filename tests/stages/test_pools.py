@@ -8,7 +8,6 @@ import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
-from neuspring.core.job_records import SPRING_UPDATES
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.stages import fit, search
 from tests.support import small
@@ -46,7 +45,7 @@ def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
         assert both.inputs["pool0"] == other.inputs["pool0"] == digest_file(seen["shake"])
         assert [record.settings.get("leave_out") for record in (one, both, other)] == [None, None, True]
         assert one.status == both.status == other.status == "ok"
-    ratio = [both.facts[SPRING_UPDATES] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
+    ratio = [both.facts["spring_updates"] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
     assert ratio[1] == 2 * ratio[0]
     stiffness = [
         Twin.load(record.file("twin", tmp_path / name / "fit" / "fit.json")).material.stiffness

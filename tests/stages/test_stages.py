@@ -10,7 +10,6 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.job_records import SPRING_UPDATES
 from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.report.tables import summary as tables
@@ -103,20 +102,20 @@ def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     train = seen.scenario.train_end - 1
     trace = pd.read_parquet(found.with_name("trace.parquet"))
     facts = {name: record.facts for name, record in records.items()}
-    assert facts["search"][SPRING_UPDATES] == train * sum(trace["springs"] * trace["substeps"]) > 0
+    assert facts["search"]["spring_updates"] == train * sum(trace["springs"] * trace["substeps"]) > 0
     per_frame = facts["fit"]["springs"] * facts["fit"]["substeps"]
-    assert facts["fit"][SPRING_UPDATES] == 2 * train * per_frame
+    assert facts["fit"]["spring_updates"] == 2 * train * per_frame
     frames = seen.scenario.frame_count - 1
-    assert StageRecord.load(run.with_name("rollout.json")).facts[SPRING_UPDATES] == frames * per_frame
+    assert StageRecord.load(run.with_name("rollout.json")).facts["spring_updates"] == frames * per_frame
     observations = folder / "small" / "observations.npz"
     rollout.run(observations, [found, fitted], None, "cpu", tmp_path / "both.json")
     coarse = facts["search"]["springs"] * facts["search"]["substeps"]
-    assert StageRecord.load(tmp_path / "both.json").facts[SPRING_UPDATES] == frames * (coarse + per_frame)
+    assert StageRecord.load(tmp_path / "both.json").facts["spring_updates"] == frames * (coarse + per_frame)
     # Carrying over simulates more than its prediction.
     rollout.run(observations, [fitted], "residuals", "cpu", tmp_path / "carried.json")
-    assert SPRING_UPDATES not in StageRecord.load(tmp_path / "carried.json").facts
+    assert "spring_updates" not in StageRecord.load(tmp_path / "carried.json").facts
     transfer.run([observations, observations], fitted, "phystwin", 0, SETTINGS, "cpu", tmp_path / "transfer.json")
-    moved = StageRecord.load(tmp_path / "transfer.json").facts[SPRING_UPDATES]
+    moved = StageRecord.load(tmp_path / "transfer.json").facts["spring_updates"]
     # Substeps are added where the other recording's distances need more.
     assert moved >= 2 * frames * per_frame and moved % (2 * frames * facts["fit"]["springs"]) == 0
 

@@ -15,7 +15,6 @@ rule train:
     conda:
         ENVIRONMENT
     resources:
-        work=work("train"),
         gpu=gpu("train"),
         mem_mb=NEEDS.memory("train"),
         runtime=NEEDS.minutes("train"),
@@ -49,7 +48,6 @@ rule predict:
     conda:
         ENVIRONMENT
     resources:
-        work=work("predict"),
         gpu=gpu("predict"),
         mem_mb=NEEDS.memory("predict"),
         runtime=NEEDS.minutes("predict"),

@@ -114,10 +114,6 @@ def log_of(stage, name):
     return f"{RESULTS}/logs/{stage}/{name}.log"
 
 
-def work(stage):
-    return lambda wildcards: NEEDS.work(stage, wildcards)
-
-
 def gpu(stage):
     """1 for jobs that take a GPU where there is one."""
     return lambda wildcards: int(GPU and INPUTS.gpu(stage, wildcards))
@@ -161,12 +157,12 @@ def common_job(command, gpus=False):
 
 
 def scenario_job(command):
-    return wrapped("--scenario {wildcards.scenario} --work {resources.work}", command)
+    return wrapped("--scenario {wildcards.scenario}", command)
 
 
 def gpu_job(command):
     """A job of a scenario that may take a GPU."""
     return wrapped(
-        "--scenario {wildcards.scenario} --work {resources.work} --gpus {resources.gpu}",
+        "--scenario {wildcards.scenario} --gpus {resources.gpu}",
         f"{command} --threads {{threads}} --device {CONFIG.device}",
     )

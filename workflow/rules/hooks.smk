@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 from neuspring.core.job_records import begin_run
 from neuspring.experiments import messages
-from neuspring.experiments.overview import Overview
 
 RUN = SimpleNamespace(begun=0.0, overview=None, warm=None)
 
@@ -16,7 +15,7 @@ def plan_of_run():
         "gpu": workflow.global_resources["gpu"].value if POOL else 0,
     }
     jobs = needs.planned(workflow.dag.needrun_jobs(exclude_finished=False), NEEDS)
-    print(messages.plan(jobs, NEEDS.history, slots), flush=True)
+    print(needs.plan(jobs, NEEDS.history, slots), flush=True)
     if GPU and not CLUSTER and not POOL:
         print(
             "There is no GPU here: device: cuda will be refused when this is no dry run."
@@ -42,7 +41,7 @@ def begin():
             for job in workflow.dag.needrun_jobs(exclude_finished=False)
             if len(job.log)
         ]
-        RUN.overview = Overview(Path(RESULTS), [Path(job.log[0]) for job in jobs])
+        RUN.overview = messages.Overview(Path(RESULTS), [Path(job.log[0]) for job in jobs])
         RUN.overview.start()
     if not CLUSTER:
         WARM.parent.mkdir(mode=0o700)

@@ -14,7 +14,6 @@ rule appearance:
     conda:
         ENVIRONMENT
     resources:
-        work=work("appearance"),
         gpu=gpu("appearance"),
         mem_mb=NEEDS.memory("appearance"),
         runtime=NEEDS.minutes("appearance"),
@@ -47,7 +46,6 @@ rule render:
     conda:
         ENVIRONMENT
     resources:
-        work=work("render"),
         gpu=gpu("render"),
         mem_mb=NEEDS.memory("render"),
         runtime=NEEDS.minutes("render"),

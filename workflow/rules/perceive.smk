@@ -10,7 +10,6 @@ rule synthesize:
     conda:
         ENVIRONMENT
     resources:
-        work=work("capture"),
         mem_mb=NEEDS.memory("capture"),
         runtime=NEEDS.minutes("capture"),
     params:
@@ -35,7 +34,6 @@ rule capture:
     conda:
         ENVIRONMENT
     resources:
-        work=work("capture"),
         mem_mb=NEEDS.memory("capture"),
         runtime=NEEDS.minutes("capture"),
     params:
@@ -60,7 +58,6 @@ rule segment:
     conda:
         ENVIRONMENT
     resources:
-        work=work("segment"),
         gpu=gpu("segment"),
         mem_mb=NEEDS.memory("segment"),
         runtime=NEEDS.minutes("segment"),
@@ -87,7 +84,6 @@ rule track:
     conda:
         ENVIRONMENT
     resources:
-        work=work("track"),
         gpu=gpu("track"),
         mem_mb=NEEDS.memory("track"),
         runtime=NEEDS.minutes("track"),
@@ -116,7 +112,6 @@ rule lift:
     conda:
         ENVIRONMENT
     resources:
-        work=work("lift"),
         mem_mb=NEEDS.memory("lift"),
         runtime=NEEDS.minutes("lift"),
     params:
@@ -144,7 +139,6 @@ rule judge:
     conda:
         ENVIRONMENT
     resources:
-        work=work("judge"),
         mem_mb=NEEDS.memory("judge"),
         runtime=NEEDS.minutes("judge"),
     params:
@@ -167,7 +161,6 @@ rule observe:
     conda:
         ENVIRONMENT
     resources:
-        work=work("observe"),
         mem_mb=NEEDS.memory("observe"),
         runtime=NEEDS.minutes("observe"),
     params:

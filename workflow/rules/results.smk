@@ -15,7 +15,6 @@ rule score:
     conda:
         ENVIRONMENT
     resources:
-        work=work("score"),
         mem_mb=NEEDS.memory("score"),
         runtime=NEEDS.minutes("score"),
     params:
@@ -126,7 +125,6 @@ rule log_run:
     conda:
         ENVIRONMENT
     resources:
-        work=work("log_run"),
         mem_mb=NEEDS.memory("log_run"),
         runtime=NEEDS.minutes("log_run"),
     params:

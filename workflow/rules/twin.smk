@@ -11,7 +11,6 @@ rule search:
     conda:
         ENVIRONMENT
     resources:
-        work=work("search"),
         gpu=gpu("search"),
         mem_mb=NEEDS.memory("search"),
         runtime=NEEDS.minutes("search"),
@@ -41,7 +40,6 @@ rule fits:
     conda:
         ENVIRONMENT
     resources:
-        work=work("fits"),
         gpu=gpu("fits"),
         mem_mb=NEEDS.memory("fits"),
         runtime=NEEDS.minutes("fits"),
@@ -71,7 +69,6 @@ rule fit:
     conda:
         ENVIRONMENT
     resources:
-        work=work("fit"),
         gpu=gpu("fit"),
         mem_mb=NEEDS.memory("fit"),
         runtime=NEEDS.minutes("fit"),
@@ -104,7 +101,6 @@ rule rollout:
     conda:
         ENVIRONMENT
     resources:
-        work=work("rollout"),
         gpu=gpu("rollout"),
         mem_mb=NEEDS.memory("rollout"),
         runtime=NEEDS.minutes("rollout"),
@@ -135,7 +131,6 @@ rule transfer:
     conda:
         ENVIRONMENT
     resources:
-        work=work("transfer"),
         gpu=gpu("transfer"),
         mem_mb=NEEDS.memory("transfer"),
         runtime=NEEDS.minutes("transfer"),

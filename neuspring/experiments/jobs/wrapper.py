@@ -20,19 +20,8 @@ from pathlib import Path
 from typing import IO
 
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import (
-    FOLDER,
-    GIGA_UPDATES,
-    GPU_NOTES,
-    LOGS,
-    SIMULATING,
-    SPRING_UPDATES,
-    Attempt,
-    JobRecord,
-    this_run,
-)
+from neuspring.core.job_records import FOLDER, GPU_NOTES, LOGS, Attempt, JobRecord, this_run
 from neuspring.core.lock import try_lock
-from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.experiments.jobs import faults, gpus
 from neuspring.experiments.jobs.command import execute, say
 
@@ -51,7 +40,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
     parser.add_argument("--scenario", default="", help="its scenario; jobs of one scenario prefer the same GPU")
-    parser.add_argument("--work", type=float, default=1.0, help="amount of work, in units of its rule")
     parser.add_argument("--quiet", action="store_true", help="write output to the log alone, unless the command fails")
     parser.add_argument("command", nargs=argparse.REMAINDER)
     a = parser.parse_args(arguments)
@@ -62,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         results = _results(a.log)
         job = Job(
             command=tuple(command),
-            record=JobRecord.of_log(results, a.log, a.scenario, a.work),
+            record=JobRecord.of_log(results, a.log, a.scenario),
             results=results,
             log=a.log,
             gpus=a.gpus,
@@ -160,7 +148,7 @@ def _run(job: Job, lock: IO[str] | None) -> int:
         # The command holds lock and slots too: they are free when it has ended, even if this process dies first.
         locks = [*([lock] if lock else []), *(lease.files if lease else ())]
         ended, fault = execute(job.command, job.log, begun, environment=_environment(job, lease), locks=locks, quiet=job.quiet)
-        _save(_measured(record, job.command) if ended.outcome == "ok" else record, ended, job.results)
+        _save(record, ended, job.results)
         if lease:
             _judge(lease, fault)
     finally:
@@ -191,18 +179,6 @@ def _save(record: JobRecord, attempt: Attempt, results: Path) -> None:
         replace(record, attempts=[*record.attempts, attempt]).save(results)
     except (OSError, InputError) as error:
         print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
-
-
-def _measured(record: JobRecord, command: Sequence[str]) -> JobRecord:
-    """The record with the spring updates that its stage counted, if it is one that simulates and does not fail."""
-    if record.rule not in SIMULATING or "--output" not in command[:-1]:
-        return record
-    output = Path(command[list(command).index("--output") + 1])
-    try:
-        updates = float(read_json(output, RECORD_FORMAT)["facts"][SPRING_UPDATES])
-    except (InputError, KeyError, TypeError, ValueError):
-        return record
-    return replace(record, work=updates / 1e9, unit=GIGA_UPDATES)
 
 
 def _lease(job: Job, notes: Path | None) -> gpus.Lease | None:
