@@ -14,19 +14,17 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 
 from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
-from neuspring.config.rows import Carry, Kind, Method, ScenarioRow, SearchRow
+from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.search import Clusters, Polish, Search, SearchRanges, SearchScales, SearchStart
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Fit, LastFrame, Losses, RestShape, SpringField
+from neuspring.config.twin import Fit, Losses, RestShape, SpringField
 
 __all__ = [
-    "Carry",
     "Clusters",
     "Config",
     "Fit",
     "Kind",
-    "LastFrame",
     "Losses",
     "Method",
     "Mocap",

@@ -16,15 +16,18 @@ from neuspring.core.errors import InputError
 from neuspring.core.uri import masked
 
 T = TypeVar("T")
+REMOVED = "removed; commit 7308a7b is the last that has it"
+"""The sentence for what lost its trial."""
 RENAMED = {
     "colour_rate": "color_rate",
     "neighbourhood": "neighborhood",
     "outlier_neighbours": "outlier_neighbors",
     "least_neighbours": "least_neighbors",
+    "carry_over": REMOVED,
+    "average_seeds": REMOVED,
+    "last_frame": REMOVED,
 }
 """Keys of older versions -> their name now, or a sentence that says where they went. An entry is a key or its dotted path."""
-REMOVED = "removed; commit 7308a7b is the last that has it"
-"""The sentence for what lost its trial."""
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:

@@ -9,8 +9,6 @@ from neuspring.config.types import Count, Name, Section
 
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""
-Carry = Literal["residuals", "state"]
-"""How the state at the last training frame is corrected: by interpolated residuals, or by least squares through the simulator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +48,9 @@ class Method(Section):
     oracle: bool = False
     """Fit all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error fitting
     could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles only."""
-    carry_over: Carry | bool = False
-    """Prediction from the last frame: correct the state at the last training frame by what was observed until then, where training
-    frames say that it helps. residuals (or true): by the interpolated residuals of that frame. state: by least squares over the
-    last frames through the simulator, see [last_frame](#last_frame)."""
     pool: Literal["all", "others"] | None = None
     """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
     its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
-    average_seeds: bool = False
-    """Predict the mean of the trajectories of all seeds; this costs as many fits as there are seeds."""
 
     @property
     def searched(self) -> str:
@@ -68,21 +60,12 @@ class Method(Section):
     def __post_init__(self) -> None:
         if (self.search is None) == (self.model is None):
             raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
-        twins_only = {"fit": self.fit, "pool": self.pool, "carry_over": self.carry_over, "average_seeds": self.average_seeds}
-        if self.carry_over is True:
-            # What older tables say.
-            object.__setattr__(self, "carry_over", "residuals")
-        if self.oracle and (not self.fit or self.carry_over):
-            rule = "an oracle has a fit, and is not carried over from the last training frame"
-            raise ValueError(f"oracle: {rule}; received fit {self.fit}, carry_over {self.carry_over}")
+        twins_only = {"fit": self.fit, "pool": self.pool}
+        if self.oracle and not self.fit:
+            raise ValueError("oracle: an oracle has a fit; received fit null")
         misplaced = [name for name, value in twins_only.items() if value]
         if self.model and misplaced:
             raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to model {self.model}")
-
-    @property
-    def task(self) -> str:
-        """What a row does: predict from frame 0 on, or from the last training frame on (filtering), two tables that do not mix."""
-        return "prediction from the last frame" if self.carry_over else "future prediction"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from neuspring.config.perception import Perception
 from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
-from neuspring.config.twin import Fit, LastFrame, Losses
+from neuspring.config.twin import Fit, Losses
 from neuspring.config.types import Count, Name, Section
 from neuspring.core.uri import refuse_password
 
@@ -135,7 +135,6 @@ class Config(Section):
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
-    last_frame: LastFrame = field(default_factory=LastFrame)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)

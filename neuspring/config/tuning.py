@@ -53,8 +53,7 @@ class Tune(Section):
     study: Annotated[Name, StringConstraints(max_length=60)]
     """Name of the sweep and of its folder in `<results>/tune`. A sweep keeps its method, space, settings and data for good."""
     method: Name
-    """Row of the method table that is varied. Trial 0 is the row as it is, with its own settings and those of its search row. What
-    the row does to predictions alone (`carry_over`, `average_seeds`) is left out."""
+    """Row of the method table that is varied. Trial 0 is the row as it is, with its own settings and those of its search row."""
     space: dict[str, Dimension]
     """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
     `released_quirks`, and `clusters`, the number of regions of the method's search."""

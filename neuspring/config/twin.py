@@ -171,23 +171,3 @@ class Fit(Section):
             weights if isinstance(weights, tuple) else (weights,) for weights in (self.rest_prior, self.rest_shape.prior)
         )
         return list(itertools.product(first, second))
-
-
-@dataclass(frozen=True, kw_only=True)
-class LastFrame(Section):
-    """Prediction from the last training frame (methods with `carry_over: state`): the state there, from the frames before it."""
-
-    window: Count = 2
-    """Training frames over which the state is estimated, besides their first. Longer ones average noise, and hold on to what is
-    wrong with the model."""
-    modes: Annotated[int, Field(ge=1, le=64)] = 16
-    """Softest modes of the body along which its position and its velocity at the window's first frame may be corrected."""
-    iterations: Count = 2
-    """Levenberg-Marquardt steps with each weight; from the strongest to the weakest, each goes on where the one before it ended."""
-    weights: tuple[Positive, ...] = (1e-3, 1e-2, 1e-1)
-    """Weights of the prior that keeps the correction small, over the mean squared distance from the observed points; training
-    frames choose one."""
-
-    def __post_init__(self) -> None:
-        if not self.weights:
-            raise ValueError("weights: at least one is required")

@@ -165,7 +165,7 @@ class Benchmark:
     config: Config
     """With what `only` leaves of scenarios, methods and seeds."""
     whole: Config
-    """As it was given: what tables are laid out for, and whose seeds are averaged, whatever part of it is run now."""
+    """As it was given: what tables are laid out for, whatever part of it is run now."""
     scenarios: dict[str, ScenarioRow]
     """Chosen ones, those that twins are transferred to, those of the sweep."""
     whole_scenarios: dict[str, ScenarioRow]

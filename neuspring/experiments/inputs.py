@@ -92,13 +92,12 @@ class Inputs:
     def transfers(self) -> list[str]:
         """Records of transfers: per source, method and seed.
 
-        Carrying over, averaging and oracles concern the future of the same recording, so such methods are not transferred.
+        Oracles concern the future of the same recording, so they are not transferred.
         """
         methods = [
             name
             for name, method in self.benchmark.methods.items()
-            if (method.search or (method.model and BASELINES[method.model].transfers))
-            and not (method.carry_over or method.average_seeds or method.oracle)
+            if (method.search or (method.model and BASELINES[method.model].transfers)) and not method.oracle
         ]
         return [
             f"{self.results}/{scenario}/{method}/{seed}/transfer.json"
@@ -238,13 +237,6 @@ class Inputs:
         """The record that names what was learned: train.json, else fit.json, else search.json."""
         return (self.train(job) or self.fit(job) or self.search(job))[0]
 
-    def rolled_out(self, job: Any) -> list[str]:
-        """The records whose trajectories a prediction is made of: one, or those of all seeds, whatever part of them runs now."""
-        if not self.benchmark.methods[job.method].average_seeds:
-            return [self.learned(job)]
-        seeds = self.benchmark.whole.seeds
-        return [self.learned(SimpleNamespace(scenario=job.scenario, method=job.method, seed=seed)) for seed in seeds]
-
     def appearance(self, job: Any) -> list[str]:
         """The record of the splats, for scenarios with images."""
         if not self.benchmark.has_images(job.scenario):
@@ -275,16 +267,12 @@ class Inputs:
             "search": method.search,
             "clusters": self.benchmark.searches[method.searched].clusters,
             "fit": method.fit or "none",
-            "carry_over": method.carry_over,
-            "average_seeds": method.average_seeds,
         }
         if method.pool:
             switches["pool"] = method.pool
         if method.oracle:
             # Named only where it is one, so that other runs' records stay as they were.
             switches["oracle"] = True
-        if method.carry_over:
-            switches["task"] = method.task
         quirks = self.benchmark.searches[method.searched].released_quirks
         on = {"released_quirks": sorted(key for key, value in quirks.items() if value)} if quirks else {}
         return _json(switches | on | settings)
@@ -295,7 +283,7 @@ class Inputs:
         """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
         # Thousands of jobs share a few texts: those of one source and one row.
         source = self.benchmark.scenarios[job.scenario].source
-        own = {"search": "search", "fit": "method", "train": "method", "rollout": "method", "appearance": "looks"}.get(stage)
+        own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage)
         return self._settings(stage, source, getattr(job, own) if own else "")
 
     @functools.cache  # noqa: B019 - one benchmark a process
@@ -311,8 +299,6 @@ class Inputs:
             return _json(select(config, declared.reads))
         if stage == "observe":
             return _json(select(config, ("perception.sample", "perception.seed") if declared.films else declared.reads))
-        if stage == "rollout" and self.benchmark.methods[name].carry_over != "state":
-            return "{}"
         if stage == "train":
             return self._training_settings(name)
         values = select(config, STAGES[stage].reads)

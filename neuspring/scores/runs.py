@@ -141,7 +141,7 @@ def _facts(record: RunRecord) -> dict[str, Any]:
     facts |= {"oracle": record.oracle, "floors": json.dumps(record.floors)}
     facts |= {f"seconds_{name}": value for name, value in record.timings.items()}
     facts |= {f"memory_mb_{name}": value for name, value in record.peak_memory_mb.items()}
-    facts |= {"averaged": record.params.get("rollout.result.averaged", 1), "images": json.dumps(record.images)}
+    facts |= {"images": json.dumps(record.images)}
     facts["settings"] = json.dumps({name: _digest(values) for name, values in record.settings.items()})
     return facts
 
@@ -166,8 +166,8 @@ def read_scores(path: Path) -> Collected:
     runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
     beside = path.with_name("runs.csv")
     if beside.is_file():
-        table = pd.read_csv(beside).reindex(columns=[*RUN_COLUMNS, "averaged"])
-        texts = dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"averaged": 1, "floors": "{}"}
+        table = pd.read_csv(beside).reindex(columns=list(RUN_COLUMNS))
+        texts = dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"floors": "{}"}
         return Collected(scores, _filled(table.fillna(texts)))
     errors = scores[scores["metric"] == "chamfer"]
     tasks = runs.merge(errors.groupby(["scenario", "method", "seed"])["task"].nunique().reset_index(), how="left")["task"]
@@ -175,7 +175,7 @@ def read_scores(path: Path) -> Collected:
     runs["status"] = np.where(finished, "ok", "failed")
     runs["reason"] = np.where(finished, "", "its scores are not complete")
     nothing: dict[str, Any] = {"notes": "", "images": "null", "run_key": "", "oracle": False, "floors": "{}"}
-    return Collected(scores, runs.assign(source=path.name, averaged=1, **nothing))
+    return Collected(scores, runs.assign(source=path.name, **nothing))
 
 
 def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:

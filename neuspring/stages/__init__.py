@@ -72,7 +72,7 @@ STAGES = {
         minutes=480,
     ),
     "train": Stage(about="observations -> trained model of a baseline", gpu="always", learns=True, memory_mb=8000, minutes=480),
-    "rollout": Stage(about="twin -> trajectory over all frames", reads=("last_frame",), gpu="always", minutes=60),
+    "rollout": Stage(about="twin -> trajectory over all frames", gpu="always", minutes=60),
     "predict": Stage(about="model of a baseline -> trajectory over all frames", gpu="always", minutes=60),
     "transfer": Stage(
         about="learned model -> scores on other recordings of the object", reads=("simulation",), gpu="always", minutes=60

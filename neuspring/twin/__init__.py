@@ -3,10 +3,9 @@
 topology: points to regions, regions to springs. search: CMA-ES (proposals) over topology and a homogeneous material, with lengths
 in units of spacing, then a polish on residuals; trace: its record; trials: its candidates, simulated and judged together. fit: Adam
 through the simulation, on what parameters says is trained, by losses; field is the neural spring field; company: fits that share
-launches. rollout: prediction. motion: velocities from observed points. carry: the state corrected at the end of the training
-frames. transfer: a twin on another recording.
+launches. rollout: prediction. motion: velocities from observed points. transfer: a twin on another recording.
 
 For others: topology.regions, piecewise_topology, uniform_topology; field.SpringField; parameters.TwinParameters;
 losses.FrameLoss; search.SearchProblem, search; fit.FitProblem, fit, tail_start; company.together; rollout.roll_out;
-carry.carry_over; transfer.rebase.
+transfer.rebase.
 """

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -91,12 +90,3 @@ def simulate(
         reason=reason,
         collision_overflow=solver.collision_overflow,
     )
-
-
-def mean_trajectory(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """The mean of complete rollouts of the same number of frames and nodes; a single one is returned as it is."""
-    if len(trajectories) == 1:
-        return trajectories[0]
-    mean: np.ndarray = np.stack([one.positions for one in trajectories]).mean(axis=0, dtype=np.float64)
-    overflow = max(one.collision_overflow for one in trajectories)
-    return replace(trajectories[0], positions=mean, collision_overflow=overflow)

@@ -294,8 +294,8 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ("{description: x}", "either search or model is required, received search None and model None"),
         ("{model: static, search: uniform, description: x}", "either search or model is required"),
         (
-            "{model: gs_dynamics, fit: field, carry_over: true, description: x}",
-            "fit, carry_over: these belong to methods",
+            "{model: gs_dynamics, fit: field, pool: all, description: x}",
+            "fit, pool: these belong to methods",
         ),
         ("{model: gs_dynamics, appearance: {}, description: x}", "only spring_gaus draws with splats of its own"),
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
@@ -465,10 +465,8 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
         ["mocap", "mocap_heldout"],
         ["mocap", "mocap_heldout", "headline"],
         ["mocap", "mocap_markers"],
-        ["mocap", "last_frame"],
         ["mocap", "mocap_pieces"],
         ["mocap", "mocap_field"],
-        ["mocap", "mocap_prediction"],
         ["mocap", "paper"],
         ["color", "footage"],
         ["color", "footage", "footage_parts"],
@@ -547,15 +545,6 @@ def test_every_method_that_is_shipped_is_valid():
         "phystwin": "baseline",
         "clusters_1": "model_b",
         "clusters_5": "neuspring",
-        "baseline_carry_over": "baseline",
-        "model_b_carry_over": "model_b",
-        "plus_carry_over": "neuspring",
-        "plus_average": "neuspring",
-        "neuspring_plus_carry_over": "neuspring_plus",
-        "neuspring_plus_average": "neuspring_plus",
-        "baseline_from_last_frame": "baseline",
-        "neuspring_from_last_frame": "neuspring",
-        "neuspring_plus_from_last_frame": "neuspring_plus",
     }
     # An oracle's fit has seen the future: it is shared with nobody, not even where all settings are equal.
     assert {benchmark.fit_of_method[name] for name in ("oracle_neuspring", "oracle_plus")} == {"oracle_neuspring", "oracle_plus"}

@@ -1,4 +1,4 @@
-"""Rows that predict from the last frame, and oracles: what the workflow makes of them."""
+"""Oracles: what the workflow makes of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neuspring.experiments.inputs import Inputs
 from neuspring.experiments.tuning.space import Plan
 
 ROOT = Path(__file__).parents[2]
-NAMES = ["baseline", "neuspring", "oracle_neuspring", "baseline_carry_over", "baseline_from_last_frame"]
+NAMES = ["baseline", "neuspring", "oracle_neuspring"]
 SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth"]
 
 
@@ -30,19 +30,15 @@ def job(name: str) -> SimpleNamespace:
     return SimpleNamespace(scenario=SCENES[0], method=name, seed=0)
 
 
-def test_records_name_oracles_and_tasks_and_leave_other_rows_as_they_were():
+def test_records_name_oracles_and_leave_other_rows_as_they_were():
     inputs = Inputs(benchmark())
     variants = {name: json.loads(inputs.variant(job(name))) for name in NAMES}
     assert {name for name, variant in variants.items() if "oracle" in variant} == {"oracle_neuspring"}
     assert variants["oracle_neuspring"]["oracle"] is True
-    filtering = {name: variant["task"] for name, variant in variants.items() if "task" in variant}
-    assert filtering == dict.fromkeys(NAMES[3:], "prediction from the last frame")
     assert variants["baseline"] == {
         "search": "uniform",
         "clusters": 1,
         "fit": "springs",
-        "carry_over": False,
-        "average_seeds": False,
         **benchmark().methods["baseline"].settings,
     }
 
@@ -75,8 +71,7 @@ def test_no_sweep_chooses_by_an_oracle():
     [
         ({"search": "uniform", "oracle": True}, "an oracle has a fit"),
         ({"model": "static", "oracle": True}, "an oracle has a fit"),
-        ({"search": "uniform", "fit": "field", "oracle": True, "carry_over": "state"}, "not carried over"),
-        ({"search": "uniform", "carry_over": "everything"}, "carry_over"),
+        ({"search": "uniform", "carry_over": "state"}, "removed"),
     ],
 )
 def test_rows_that_cannot_be(row, message):
@@ -89,19 +84,3 @@ def test_an_oracle_with_a_tail_is_refused_before_any_job(tmp_path):
     (tmp_path / "bad.yaml").write_text(row)
     with pytest.raises(InputError, match="an oracle is fitted on all frames and holds none back"):
         benchmark(method_table=str(tmp_path / "bad.yaml"), methods=["bad"], compare_with=None)
-
-
-def test_what_older_tables_call_true_is_residuals():
-    kinds = {
-        value: parse(Method, {"search": "uniform", "description": "x", "carry_over": value}, "x") for value in (True, "residuals")
-    }
-    assert kinds[True] == kinds["residuals"]
-    assert kinds[True].carry_over == "residuals"
-    assert parse(Method, {"search": "uniform", "description": "x", "carry_over": False}, "x").task == "future prediction"
-
-
-def test_only_states_read_settings_of_the_last_frame():
-    inputs = Inputs(benchmark(last_frame={"window": 3}))
-    texts = {name: json.loads(inputs.settings("rollout", job(name))) for name in NAMES}
-    assert texts.pop("baseline_from_last_frame")["last_frame"]["window"] == 3
-    assert set(map(str, texts.values())) == {"{}"}

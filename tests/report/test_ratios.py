@@ -125,11 +125,11 @@ def test_settings_that_differ_are_those_of_the_records():
         record("x", fit={"fit": {"horizon": 1, "epochs": 20}, "seed": 0}, **same),
         record("y", fit={"fit": {"horizon": 10, "epochs": 20}, "seed": 1}, **same),
         record("z", fit={"fit": {"horizon": 10, "epochs": 20}, "seed": 2}, **same),
-        record("alone", variant={"carry_over": True}, **same),
+        record("alone", variant={"search": "uniform"}, **same),
     ]
     labels = {"x": "X", "y": "Y", "z": "Z", "alone": "Search"}
     found = {row.setting: row.text for row in differing(records, labels)}
-    assert found.pop("method.carry_over") == "–: X, Y, Z; true: Search"
+    assert found.pop("method.search") == "–: X, Y, Z; uniform: Search"
     assert found == {"stages": "search + fit: X, Y, Z; search: Search", "fit.horizon": "1: X; 10: Y, Z"}
 
 

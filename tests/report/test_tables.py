@@ -140,14 +140,6 @@ def test_a_method_that_has_not_begun_does_not_empty_the_table():
     assert "a / z / seed 0: failed: diverged" in text
 
 
-def test_averaged_predictions_are_named():
-    found = collected({("a", "x", 0): 0.010, ("a", "y", 0): 0.008})
-    found.runs["averaged"] = [1, 3]
-    text = tables.summary_text(found, "x")
-    assert "y is the mean of 3 seeds' predictions" in text
-    assert "x is the mean" not in text
-
-
 def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
     text = tables.summary_text(collected(values, failed=(("b", "y", 0),)), "x")

@@ -95,7 +95,7 @@ def run_folder(
     files = record.beside(twin="twin.npz")
     twin.save(files["twin"])
     record.save(files)
-    rollout.run(observations, [folder / "fit.json"], None, "cpu", folder / "rollout.json")
+    rollout.run(observations, folder / "fit.json", "cpu", folder / "rollout.json")
     if with_splats:
         trained = Recorder("appearance", scenario / "appearance" / "0" / "appearance.json")
         files = trained.beside(splats="splats.ply")

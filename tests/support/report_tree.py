@@ -104,7 +104,7 @@ def write_run(
         category=scenario.category,
         run_key=digest_file(folder / "scores.parquet").rpartition(":")[2],
         device="cuda:0",
-        variant={"search": row, "clusters": 5, "fit": "field", "carry_over": False, "average_seeds": False, "horizon": 10},
+        variant={"search": row, "clusters": 5, "fit": "field", "horizon": 10},
         settings=settings,
         histories={name: _relative(path, folder) for name, path in histories.items() if curves},
         timings={name: float(rng.uniform(60, 600)) for name in records} | {"score": 2.0},

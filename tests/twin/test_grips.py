@@ -9,12 +9,8 @@ import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations
-from neuspring.twin import carry
-from neuspring.twin.carry import Residuals, training_states
 from neuspring.twin.fit import TwinFit, fit
-from neuspring.twin.last_frame import StateEstimator
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.motion import initial_velocity
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.search import search
 from tests.support import small
@@ -80,22 +76,3 @@ def test_a_grip_after_the_split_does_not_read_the_body_there():
     spoiled = replace(known, object_points=points)
     np.testing.assert_array_equal(outcome(twin, known), outcome(twin, spoiled))
     assert np.isfinite(outcome(twin, known)).all()
-
-
-def test_what_goes_on_from_a_later_state_holds_what_was_held(monkeypatch):
-    """Both ways to correct a state, with nothing to correct: they end where the rollout does."""
-    scene = small.scene(frames=16)
-    seen, twin = regripped(scene.observations, 4), scene.truth
-    velocity = initial_velocity(seen, "rest")
-    positions = outcome(twin, seen)
-    exact = replace(seen, object_points=positions[:, : seen.object_points.shape[1]])
-    states = training_states(twin, exact, velocity)
-    monkeypatch.setattr(carry, "recent_velocity", lambda seen, frame: np.full(seen.object_points[0].shape, np.nan))
-    for frame in (3, 8):
-        way = Residuals(twin, exact, "cpu").corrected(frame, states, 16)[0]
-        np.testing.assert_array_equal(way, positions[frame + 1 :])
-        run = StateEstimator(twin, exact, config.LastFrame(modes=4))
-        run._before = [x for x, _ in states]
-        x, v = (np.repeat(values[None], 2, axis=0) for values in states[frame])
-        for lane in run.simulate(x, v, frame, 15).positions:
-            np.testing.assert_array_equal(lane[1:], positions[frame + 1 :])

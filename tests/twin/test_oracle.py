@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from neuspring import config
-from neuspring.config import Carry, LastFrame
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
@@ -17,7 +16,6 @@ from neuspring.physics.autograd import twin_tensors
 from neuspring.stages import fit as fit_stage
 from neuspring.stages import fits, rollout
 from neuspring.stages import search as search_stage
-from neuspring.twin.carry import carry_over
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import roll_out
@@ -45,17 +43,13 @@ def parameters(twin: Twin) -> np.ndarray:
 
 
 def whole(seen: Observations, *, oracle: bool) -> list[np.ndarray]:
-    """Everything that a row makes: the search's costs, the fit, rollouts with both corrections of the state."""
+    """Everything that a row makes: the search's costs, the fit, a rollout."""
     found = search(small.search_problem(seen), seed=0)
     fitted = fit(small.fit_problem(seen, twin=found.twin, oracle=oracle))
     made = [found.trace["cost"].to_numpy(), parameters(found.twin), parameters(fitted.twin), fitted.history["loss"].to_numpy(float)]
     velocity = np.tile([0.0, 0.4, 0.0], (len(seen.nodes), 1))
     plain = roll_out(fitted.twin, seen.controller_points, velocity=velocity)
     made.append(plain.positions)
-    ways: tuple[Carry, ...] = ("residuals", "state")
-    for how in ways:
-        carried, facts = carry_over(plain, fitted.twin, seen, velocity, "cpu", how, LastFrame(window=2, modes=4, iterations=1))
-        made += [carried.positions, np.array(list(facts.values()))]
     return made
 
 
@@ -114,7 +108,7 @@ def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_p
         recorder = fit_stage.recorder(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
         keys[oracle] = fit_stage.prepared(recorder, seen, found, SETTINGS).key
         fit_stage.run(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
-        rollout.run(seen, [tmp_path / f"{oracle}" / "fit.json"], None, "cpu", tmp_path / f"{oracle}" / "rollout.json")
+        rollout.run(seen, tmp_path / f"{oracle}" / "fit.json", "cpu", tmp_path / f"{oracle}" / "rollout.json")
     assert keys[False] != keys[True]
     for name in ("fit", "rollout"):
         normal, seeing = (StageRecord.load(tmp_path / f"{oracle}" / f"{name}.json") for oracle in (False, True))

@@ -6,7 +6,7 @@ import numpy as np
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
-from neuspring.twin.rollout import mean_trajectory, roll_out, simulate
+from neuspring.twin.rollout import roll_out, simulate
 from neuspring.twin.search import candidate
 from neuspring.twin.transfer import corresponds, move, rebase
 from tests.support import small
@@ -141,13 +141,3 @@ def test_the_same_nodes_in_another_order_make_the_same_motion():
     # The longest springs ask by rank among equal distances of a regular body, so a few differ.
     moved = np.linalg.norm(here - here[0], axis=2).mean()
     assert np.linalg.norm(there - here, axis=2).mean() < 0.05 * moved
-
-
-def test_the_mean_of_rollouts():
-    problem = small.fit_problem()
-    one = roll_out(problem.twin, problem.observations.controller_points)
-    other = replace(one, positions=one.positions + np.float32(0.02), collision_overflow=3)
-    mean = mean_trajectory([one, other])
-    np.testing.assert_allclose(mean.positions, one.positions + 0.01, atol=SINGLE)
-    assert mean.collision_overflow == 3
-    assert mean_trajectory([one]) is one

@@ -90,7 +90,7 @@ rule fit:
 rule rollout:
     input:
         observations=rules.observe.output,
-        twin=INPUTS.rolled_out,
+        twin=INPUTS.learned,
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/rollout.json",
     log:
@@ -105,17 +105,10 @@ rule rollout:
         mem_mb=NEEDS.memory("rollout"),
         runtime=NEEDS.minutes("rollout"),
     params:
-        carry=lambda wildcards: (
-            f"--carry-over {how}"
-            if (how := BENCHMARK.methods[wildcards.method].carry_over)
-            else ""
-        ),
-        settings=settings_of("rollout"),
         code=code_of("rollout"),
     shell:
         gpu_job(
-            "rollout --observations {input.observations:q} --twin {input.twin:q} {params.carry} --settings {params.settings:q}"
-            " --output {output:q}"
+            "rollout --observations {input.observations:q} --twin {input.twin:q} --output {output:q}"
         )
 
 

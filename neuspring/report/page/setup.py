@@ -33,8 +33,6 @@ COMMON = {
     "search": "Search",
     "clusters": "Regions",
     "fit": "Fit",
-    "carry_over": "Carry over",
-    "average_seeds": "Averages seeds",
 }
 """Switches of methods, and their headings. The model is shown only where a method has one."""
 SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")

@@ -70,7 +70,7 @@ def _settings(record: RunRecord) -> dict[str, Any]:
         if stage in STAGES:
             values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
             named |= {f"{stage}.{name}": value for name, value in values.items() if name.split(".")[-1] not in NOT_SETTINGS}
-    switches = {name: record.variant[name] for name in ("search", "carry_over", "average_seeds") if name in record.variant}
+    switches = {name: record.variant[name] for name in ("search",) if name in record.variant}
     return named | {f"method.{name}": value for name, value in switches.items()}
 
 

@@ -94,7 +94,6 @@ def summary_text(
     if len(bad):
         lines += ["", "Not in the averages:", "", *_not_counted(bad)]
     lines += [line for text in left_out_lines(collected.left_out) for line in ("", text)]
-    lines += _averaged_notes(runs)
     if honest := honest_notes(everything):
         lines += ["", "Of your own recordings:", "", *(f"- {note}" for note in honest)]
     noted = runs[runs["notes"] != ""]
@@ -146,19 +145,6 @@ def _not_counted(bad: pd.DataFrame) -> list[str]:
         counts = ", ".join(f"{method} {count}" for method, count in missing["method"].value_counts(sort=False).items())
         lines.append(f"- {len(missing)} runs have not finished, or were not asked for ({counts}); runs.csv names them.")
     return lines
-
-
-def _averaged_notes(runs: pd.DataFrame) -> list[str]:
-    """What a reader must know of methods whose prediction is a mean over seeds."""
-    if "averaged" not in runs:
-        return []
-    counts = runs.groupby("method", sort=False)["averaged"].max()
-    same = "the same one for every seed; it costs as many fits, of which the times below show one"
-    return [
-        line
-        for method, count in counts[counts > 1].items()
-        for line in ("", f"{method} is the mean of {count:.0f} seeds' predictions, {same}.")
-    ]
 
 
 def _method_table(
