@@ -19,6 +19,8 @@ T = TypeVar("T")
 REMOVED = "removed; commit 7308a7b is the last that has it"
 """The sentence for what lost its trial."""
 RENAMED = {
+    "controller_path": REMOVED,
+    "drag_quadratic": REMOVED,
     "colour_rate": "color_rate",
     "neighbourhood": "neighborhood",
     "outlier_neighbours": "outlier_neighbors",

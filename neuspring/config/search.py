@@ -13,7 +13,7 @@ from neuspring.config.types import Count, NonNegative, Positive, Range, Section
 Scale = Literal["linear", "log"]
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
-EXTRA = ("drag_quadratic", "bending")
+EXTRA = ("bending",)
 """Variables beyond the released ones."""
 HANDS = ("hand_tilt", "hand_size", "hand_depth")
 """Variables of how far hands are from a camera without depth; of captures with depth there are none."""
@@ -50,8 +50,6 @@ class SearchRanges(Section):
     """Velocity decay, 1/s."""
     dashpot: Range = (0.1, 500.0)
     """Damping along springs, N s/m."""
-    drag_quadratic: Range = (0.001, 5.0)
-    """Velocity decay per speed, 1/m; searched where `extra` names it."""
     bending: Range = (0.001, 100.0)
     """Stiffness and dashpot of bending springs over those of the others; searched where `extra` names it."""
     hand_tilt: Range = (-15.0, 60.0)
@@ -102,8 +100,6 @@ class SearchScales(Section):
     """Velocity decay."""
     dashpot: Scale = "log"
     """Damping along springs."""
-    drag_quadratic: Scale = "log"
-    """Velocity decay per speed."""
     bending: Scale = "log"
     """Stiffness and dashpot of bending springs over those of the others."""
     hand_tilt: Scale = "linear"
@@ -142,8 +138,6 @@ class SearchStart(Section):
     """Velocity decay, 1/s."""
     dashpot: float = 20.0
     """Damping along springs, N s/m."""
-    drag_quadratic: float = 0.2
-    """Velocity decay per speed, 1/m."""
     bending: float = 0.1
     """Stiffness and dashpot of bending springs over those of the others."""
     hand_tilt: float = 0.0
@@ -206,7 +200,7 @@ class Search(Section):
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `ranges` and `start`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
-    extra: tuple[Literal["drag_quadratic", "bending"], ...] = ()
+    extra: tuple[Literal["bending"], ...] = ()
     """Variables beyond the released ones that are searched too; without them what they describe is absent."""
     bending_reach: Range = (1.6, 2.6)
     """Lengths of bending springs, from and to, in node spacings of the rest shape; two spacings lie across one node between."""

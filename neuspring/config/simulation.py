@@ -28,9 +28,6 @@ class Simulation(Section):
     """Dashpots use the controllers' velocity (finite differences); false: zero velocity, as in the released simulator."""
     initial_velocity: Literal["rest", "observed"] = "rest"
     """Velocity in frame 0. rest: zero, as released. observed: from the first three frames, for captures that begin in motion."""
-    controller_path: Literal["linear", "cubic"] = "linear"
-    """Motion of the controllers within a frame. linear: straight, as released. cubic: smooth through the positions in neighboring
-    frames, the next one included (Catmull-Rom)."""
     mass: Literal["unit", "volume"] = "unit"
     """Mass of the nodes. unit: 1 kg each, as released. volume: by the space around each, with mean 1."""
 

@@ -25,7 +25,6 @@ from neuspring.core.obstacles import Obstacle, obstacles_of
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed"]
-ControllerPath = Literal["linear", "cubic"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 OMITTED = {"empty": "omitted"}
@@ -416,8 +415,6 @@ class Material(Artifact):
     contact_friction: float
     contact_distance: float
     """Distance below which approaching nodes collide, m."""
-    drag_quadratic: float = 0.0
-    """Velocity decay per speed, 1/m: the drag is dv/dt = -(drag + drag_quadratic |v|) v."""
     mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
 
     def check(self) -> None:
@@ -431,9 +428,8 @@ class Material(Artifact):
             value = getattr(self, name)
             if not np.isfinite(value):
                 raise InputError(f"material.{name}", "must be finite", value)
-        if min(self.drag, self.drag_quadratic) < 0 or self.contact_distance <= 0:
-            rule = "drag >= 0, drag_quadratic >= 0 and contact_distance > 0 are required"
-            raise InputError("material", rule, (self.drag, self.drag_quadratic, self.contact_distance))
+        if self.drag < 0 or self.contact_distance <= 0:
+            raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
 
 
 SCALARS = (
@@ -443,7 +439,6 @@ SCALARS = (
     "contact_elasticity",
     "contact_friction",
     "contact_distance",
-    "drag_quadratic",
 )
 
 
@@ -465,8 +460,6 @@ class Simulation:
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
     """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
-    controller_path: ControllerPath = "linear"
-    """How controllers move within a frame: straight, as in the released simulator, or along a cubic through neighboring frames."""
     obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
     """Nodes collide with them as with the ground, with its elasticity and friction."""
 
@@ -477,8 +470,6 @@ class Simulation:
             raise InputError("simulation", rule, self)
         if self.up not in ("+z", "-z"):
             raise InputError("simulation.up", "must be '+z' or '-z'", repr(self.up))
-        if self.controller_path not in ("linear", "cubic"):
-            raise InputError("simulation.controller_path", "must be 'linear' or 'cubic'", repr(self.controller_path))
 
     @property
     def substep(self) -> float:

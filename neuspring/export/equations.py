@@ -4,8 +4,7 @@ _TEXT = """
 Per frame there are `substeps` steps of dt = frame_time / substeps. Step k = 0, 1, ... of a frame does, in this order:
 
 1. Controllers are at begin + (end - begin) u, u = (k + 1) / substeps, with begin and end the rows of `hands` of this frame and of
-the next. For controller_path = cubic they are on Hermite's cubic, whose tangents in frame t are (hands[t+1] - hands[t-1]) / 2; in
-the first and last frame those of the parabola through the three frames there. Nodes are where the step before left them.
+the next. Nodes are where the step before left them.
 
 2. Spring (i, j): d = (x_j - x_i) / l, l = |x_j - x_i|; force on i: (stiffness (l / rest_length - 1) + dashpot (v_j - v_i) . d) d,
 its negative on j. An index of N or more is controller index - N. Its velocity is 0; if controller_velocity is true, that of its
@@ -15,7 +14,7 @@ path.
 
 4. w = v + dt (force / mass + (0, 0, -gravity up_sign)).
 
-5. Drag: v' = w q / (1 + drag_quadratic m |w|), q = exp(-dt drag), m = (1 - q) / drag (dt where drag is 0).
+5. Drag: v' = w exp(-dt drag).
 
 6. If self_collision: pairs of nodes that were closer than contact_distance at the begin of the frame, are so now, and approach
 (dx . dv < 0) change their velocity. With n = dx / |dx|, u = v_j - v_i = u_n + u_t, u_n along n, a = max(0, 1 - contact_friction

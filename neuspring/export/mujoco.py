@@ -1,7 +1,7 @@
 """MuJoCo: nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, in one MJCF file.
 
 A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. Slides damp as
-linear drag does. MuJoCo has no quadratic drag here, and its ground is soft.
+our drag does, and its ground is soft.
 """
 
 from __future__ import annotations

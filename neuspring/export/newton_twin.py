@@ -4,7 +4,7 @@
     positions = simulate("my_twin", frames=10)  # [11, N, 3], m
 
 Newton's spring has the force ke (l - l0) + kd dl/dt, so ke = stiffness / rest length and kd = dashpot. Its particles have no drag:
-`simulate` slows them after each step. Ground, collisions between nodes and cubic paths of the hands are left out.
+`simulate` slows them after each step. Ground and collisions between nodes are left out.
 """
 
 from __future__ import annotations
@@ -72,18 +72,10 @@ def simulate(folder: str | Path, frames: int, drag: bool = True, device: str = "
             solver.step(now, then, None, None, dt)
             if drag:
                 fast = then.particle_qd.numpy()[:count].astype(float)
-                slow = slowed(fast, dt, settings["drag"], settings["drag_quadratic"])
+                slow = fast * np.exp(-dt * settings["drag"])
                 speeds[:count], places[:count] = slow, places[:count] + dt * slow
                 then.particle_q.assign(places)
                 then.particle_qd.assign(speeds)
             now, then = then, now
         result.append(now.particle_q.numpy()[:count].copy())
     return np.stack(result)
-
-
-def slowed(v: np.ndarray, dt: float, linear: float, quadratic: float) -> np.ndarray:
-    """Velocities [N, 3] after dt of dv/dt = -(linear + quadratic |v|) v."""
-    decay = np.exp(-dt * linear)
-    mean = (1 - decay) / linear if linear else dt
-    slow: np.ndarray = v * decay / (1 + quadratic * mean * np.linalg.norm(v, axis=1, keepdims=True))
-    return slow

@@ -42,7 +42,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         slots: int
         history: int
         collide: int
-        cubic: int
         capacity: int
         up: real
         gravity: lane.Vector
@@ -55,7 +54,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         substep: of_twin
         inverse_time: of_twin
         decay: of_twin
-        quadratic: of_twin
         ground_e: of_twin
         ground_mu: of_twin
         contact_e: of_twin
@@ -72,8 +70,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     class State:
         begin: vectors
         end: vectors
-        bend_begin: vectors
-        bend_end: vectors
         x: slots
         v: slots
         after: slots
@@ -89,7 +85,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         force: slots
         springs: vectors
         decay: numbers
-        quadratic: numbers
         ground_e: numbers
         ground_mu: numbers
         contact_e: numbers
@@ -102,8 +97,7 @@ class Buffers:
     """Torch tensors by name, each with a Warp view of the same storage.
 
     State: x, v [slots, N + C], nodes first, then controllers; velocities [history, N] `after` the forces, and those that nodes are
-    `moving` with; begin and end [C] of the controllers' path, and how its tangents there differ from a line's. Every term
-    adds its own arrays.
+    `moving` with; begin and end [C] of the controllers' path. Every term adds its own arrays.
 
     A differentiable solver keeps all substeps of the last frame, slot k before substep k. Otherwise one slot serves where one
     thread goes through the nodes, and two take turns where each node has a thread.
@@ -139,7 +133,7 @@ class Buffers:
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
         total = nodes + controllers
         self.add_vectors(x=(self.slots, total), v=(self.slots, total), after=(self.history, nodes))
-        self.add_vectors(begin=(controllers,), end=(controllers,), bend_begin=(controllers,), bend_end=(controllers,))
+        self.add_vectors(begin=(controllers,), end=(controllers,))
         self.add_vectors(adj_x=(total,), adj_v=(total,), adj_after=(nodes,))
         self.add_vectors(adj_force=(2, total), **({} if threads else {"force": (total,)}))
         self.add_numbers(counts=None, substep=None, inverse_time=None)
@@ -224,7 +218,6 @@ class Buffers:
             "slots": self.slots,
             "history": self.history,
             "collide": int(sim.self_collision),
-            "cubic": int(sim.controller_path == "cubic"),
             "capacity": sim.collision_capacity,
             "up": sim.up_sign if sim.ground else 0.0,
             "gravity": self.lanes.Vector(*[0.0] * (2 * self.width), *[-sim.gravity * sim.up_sign] * self.width),

@@ -14,7 +14,7 @@ import torch
 
 from neuspring.core.artifacts import Twin
 from neuspring.physics import contact, springs, velocity
-from neuspring.physics.grips import begun
+from neuspring.physics.controllers import begun
 from neuspring.physics.solver import FrameSolver, Parameters
 
 
@@ -46,7 +46,7 @@ def simulate_frame(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`, solvers as in `Frame`.
 
-    Rest lengths are those of the parameters: where grips begin later than frame 0, put theirs there first (`grips.Grips`).
+    Rest lengths are those of the parameters: where grips begin later than frame 0, put theirs there first (`controllers.Grips`).
     """
     state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, begun(begin), end, x, v, *parameters)  # type: ignore[no-untyped-call]
     return state

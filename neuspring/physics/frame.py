@@ -124,19 +124,17 @@ def kernels(real: Any, width: int, among: bool = False) -> Kernels:
             model.gravity,
             model.substep[g],
             model.decay[g],
-            model.quadratic[g],
             model.inverse_mass[i, g],
         )
 
     @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factors)."""
-        adj_v, adj_force, adj_decay, adj_quadratic = updated_adjoint(
+        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factor)."""
+        adj_v, adj_force, adj_decay = updated_adjoint(
             state.after[step, i, g],
             adjoint.after[i, g],
             model.substep[g],
             model.decay[g],
-            model.quadratic[g],
             model.inverse_mass[i, g],
         )
         if step >= model.fewest:
@@ -144,7 +142,6 @@ def kernels(real: Any, width: int, among: bool = False) -> Kernels:
         adjoint.v[i, g] = adj_v
         adjoint.force[step % 2, i, g] = adj_force
         adjoint.decay[i, g] = adjoint.decay[i, g] + adj_decay
-        adjoint.quadratic[i, g] = adjoint.quadratic[i, g] + adj_quadratic
 
     def forward(model: Model, state: State):
         g = wp.tid()
@@ -155,7 +152,7 @@ def kernels(real: Any, width: int, among: bool = False) -> Kernels:
                 move_controller(model, state, step, slot, c, g)
             for i in range(model.nodes):  #  (1-3)  F_i = sum over j of (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d
                 add_row(model, state, slot, i, g)
-            for i in range(model.nodes):  #    (4)  w = v + dt (F / m + g),  v' = w delta / (1 + q |w|)
+            for i in range(model.nodes):  #    (4)  v' = (v + dt (F / m + g)) delta
                 after = update(model, state, slot, i, g, state.force[i, g])
                 state.force[i, g] = Vector()
                 state.after[inner, i, g] = after

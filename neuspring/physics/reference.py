@@ -30,7 +30,6 @@ class Scene:
     contact: tuple[float, float]
     contact_distance: float
     simulation: Simulation
-    drag_quadratic: float = 0.0
     mass: np.ndarray | float = 1.0
     """Of each node [N], or of all, kg."""
 
@@ -49,7 +48,6 @@ class Scene:
             contact=(m.contact_elasticity, m.contact_friction),
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
-            drag_quadratic=m.drag_quadratic,
             mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
         )
 
@@ -65,11 +63,10 @@ def rollout(
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
     hands = controllers.astype(np.float64)
     for k in range(len(hands) - 1):
-        slopes = (tangent(hands, k), tangent(hands, k + 1)) if scene.simulation.controller_path == "cubic" else None
         if valid is not None and k:
             scene = gripped(scene, xs[-1], hands[k], valid[k] & ~valid[k - 1])
         held = scene if valid is None else holding(scene, valid[k] & valid[k + 1])
-        x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1], slopes)
+        x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1])
         xs.append(x)
         vs.append(v)
     return np.stack(xs), np.stack(vs)
@@ -91,59 +88,16 @@ def gripped(scene: Scene, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -
     return replace(scene, rest_lengths=lengths, stiffness=scene.stiffness * (lengths / scene.rest_lengths))
 
 
-def tangent(hands: np.ndarray, k: int) -> np.ndarray:
-    """Derivative by the frame, at frame k, of the parabola through the positions in frames k - 1, k and k + 1 of [F, C, 3].
-
-    At the first and the last frame it is that of the three first and last; of two frames that of a line.
-    """
-    if len(hands) < 3:
-        slope: np.ndarray = hands[-1] - hands[0]
-        return slope
-    middle = min(max(k, 1), len(hands) - 2)
-    before, here, after = hands[middle - 1 : middle + 2]
-    parabola: np.ndarray = (after - before) / 2 + (k - middle) * (after - 2 * here + before)
-    return parabola
-
-
-def frame(
-    scene: Scene,
-    x: np.ndarray,
-    v: np.ndarray,
-    begin: np.ndarray,
-    end: np.ndarray,
-    slopes: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """One frame: `substeps` substeps with controllers moving from begin to end [C, 3].
-
-    They move linearly, or along the cubic that has these slopes [C, 3], m per frame, at both ends (Hermite).
-    """
+def frame(scene: Scene, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One frame: `substeps` substeps with controllers moving in a line from begin to end [C, 3]."""
     sim = scene.simulation
     spread = incidence(scene)
     hands_velocity = (end - begin) / sim.frame_time if sim.controller_velocity else np.zeros_like(begin)
     pairs = candidates(x, scene.contact_distance) if sim.self_collision else None
     for step in range(sim.substeps):
-        u = (step + 1) / sim.substeps
-        hands = begin + (end - begin) * u
-        if slopes is not None:
-            hands = hermite(u, begin, end, *slopes)
-            if sim.controller_velocity:
-                hands_velocity = hermite_slope(u, begin, end, *slopes) / sim.frame_time
+        hands = begin + (end - begin) * ((step + 1) / sim.substeps)
         x, v = substep(scene, x, v, hands, hands_velocity, spread, pairs)
     return x, v
-
-
-def hermite(u: float, p0: np.ndarray, p1: np.ndarray, m0: np.ndarray, m1: np.ndarray) -> np.ndarray:
-    """The cubic with positions p0, p1 and slopes m0, m1 at u = 0 and 1."""
-    place: np.ndarray = (
-        (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * m0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * m1
-    )
-    return place
-
-
-def hermite_slope(u: float, p0: np.ndarray, p1: np.ndarray, m0: np.ndarray, m1: np.ndarray) -> np.ndarray:
-    """Its derivative by u."""
-    slope: np.ndarray = (6 * u**2 - 6 * u) * (p0 - p1) + (3 * u**2 - 4 * u + 1) * m0 + (3 * u**2 - 2 * u) * m1
-    return slope
 
 
 def incidence(scene: Scene) -> csr_matrix:
@@ -170,7 +124,7 @@ def substep(
     force = spread @ spring_forces(scene, np.concatenate([x, hands]), np.concatenate([v, hands_velocity]))
     gravity = np.array([0.0, 0.0, -sim.gravity * sim.up_sign])
     mass = np.broadcast_to(scene.mass, len(v))
-    v = dragged(v + dt * (force / mass[:, None] + gravity), dt, scene.drag, scene.drag_quadratic)
+    v = (v + dt * (force / mass[:, None] + gravity)) * np.exp(-dt * scene.drag)
     if pairs is not None:
         v = collide(x, v, mass, pairs, scene.contact_distance, *scene.contact)
     if sim.obstacles:
@@ -178,14 +132,6 @@ def substep(
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
-
-
-def dragged(v: np.ndarray, dt: float, linear: float, quadratic: float) -> np.ndarray:
-    """The exact solution of dv/dt = -(linear + quadratic |v|) v after dt."""
-    decay = np.exp(-dt * linear)
-    mean = -np.expm1(-dt * linear) / linear if linear else dt
-    slower: np.ndarray = v * decay / (1 + quadratic * mean * np.linalg.norm(v, axis=1, keepdims=True))
-    return slower
 
 
 def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:

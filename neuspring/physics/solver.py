@@ -18,7 +18,7 @@ from neuspring.core.device import load
 from neuspring.core.errors import InputError
 from neuspring.physics import collision, contact, frame, obstacles, position, springs, velocity
 from neuspring.physics.arrays import Buffers, Graphs
-from neuspring.physics.grips import Grips, begins
+from neuspring.physics.controllers import Grips, begins
 
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """What may differ between the simulations of one solver; it does not read the last."""
@@ -33,7 +33,7 @@ class Parameters(NamedTuple):
     springs: torch.Tensor
     """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent."""
     decay: torch.Tensor
-    """[2]: exp(-substep * drag), and how much less a substep leaves of fast velocities, s/m (velocity.py)."""
+    """[1]: exp(-substep * drag)."""
     ground: torch.Tensor
     """[2]: elasticity in [0, 1], friction in [0, 2]."""
     contact: torch.Tensor
@@ -91,7 +91,7 @@ class FrameSolver:
         self._graphs = Graphs(device)
         self.grips = Grips(spring_pairs, nodes, device)
         self._held: torch.Tensor | None = None
-        """Rest lengths of grips that began since the parameters were set [B, L] (grips.py)."""
+        """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
         self._plain: torch.Tensor | None = None
         """Springs as they were set [B, S, 3]."""
         self._factor: torch.Tensor | None = None
@@ -116,7 +116,7 @@ class FrameSolver:
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (path.py)."""
+        """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (`controllers.waypoints`)."""
         self.start(x, v)
         self.advance(begin, end)
         return self._one(self.buffers.get_vectors("x", self.last, self.nodes)), self._one(
@@ -138,26 +138,18 @@ class FrameSolver:
         self.frame_token += 1
 
     def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Take the controllers' path from begin to end: positions [B, C, 3], or with tangents [B, C, 6]."""
-        b, path = self.buffers, self.simulation.controller_path
-        columns = 3 if path == "linear" else 6
-        if begin.shape[-1] == end.shape[-1] == columns + 1:
+        """Take where controllers are at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
+        if begin.shape[-1] == end.shape[-1] == 4:
             if bool(begins(begin).any()):
                 self._held = self.grips.taken(self._held, self.buffers.get_vectors("x", 0, self.nodes), begin)
-            self._hold(begin[..., -1] * end[..., -1] > 0)
-            begin, end = begin[..., :-1], end[..., :-1]
+            self._hold(begin[..., 3] * end[..., 3] > 0)
+        elif {begin.shape[-1], end.shape[-1]} != {3}:
+            rule = "3 numbers per controller are required, or 4 where some do not hold"
+            raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Make them with controllers.waypoints.")
         elif self._factor is not None:
             self._hold(None)
-        if {begin.shape[-1], end.shape[-1]} != {columns}:
-            rule = f"{columns} numbers per controller are required with simulation.controller_path: {path}"
-            raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Make them with neuspring.physics.path.")
-        places = {"begin": begin[..., :3], "end": end[..., :3]}
-        for name, values in places.items():
-            b.set_vectors(name, values)
-        if path == "cubic":
-            travel = places["end"] - places["begin"]
-            for name, values in (("bend_begin", begin), ("bend_end", end)):
-                b.set_vectors(name, values[..., 3:] - travel)
+        for name, places in (("begin", begin), ("end", end)):
+            self.buffers.set_vectors(name, places[..., :3])
 
     def _hold(self, holds: torch.Tensor | None) -> None:
         """Let the springs of controllers act that hold [B, C], and not those of others; None: all act."""
@@ -172,7 +164,7 @@ class FrameSolver:
         springs.fill(self.buffers, own if self._factor is None else own * self._factor)
 
     def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
-        """Hold what was held after the frames of `rows` [T, C, K] (path.py), in which the nodes were at `positions` [N, 3], m.
+        """Hold what was held after the frames of `rows` [T, C, K] of waypoints, in which the nodes were at `positions` [N, 3], m.
 
         For a rollout that does not begin in frame 0; more positions than rows may be given. It makes no difference where all hold.
         """

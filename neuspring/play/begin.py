@@ -9,8 +9,7 @@ import torch
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.physics.grips import begins
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import begins, waypoints
 from neuspring.play.results import Run
 from neuspring.play.simulator import Start
 from neuspring.twin.hand_paths import with_hands
@@ -64,12 +63,8 @@ def begin_at(run: Run, seen: Observations, frame: int, repeat: bool) -> Begin:
         raise InputError(f"{run.name}, frame {frame}", f"its prediction has {known} frames", frame, "Begin at frame 0.")
     before, after = max(frame - 1, 0), min(frame + 1, len(x) - 1)
     velocity = (x[after].astype(float) - x[before]) / max((after - before) * twin.simulation.frame_time, 1e-9)
-    rows = waypoints(torch.tensor(hands[: frame + 1]), _Straight(), holds).numpy()
+    rows = waypoints(torch.tensor(hands[: frame + 1]), holds).numpy()
     earlier = np.flatnonzero(begins(torch.tensor(rows[:frame])).any(dim=-1).numpy())
     flags = rows[frame, :, 3] if rows.shape[2] == 4 else np.ones(count)
     start = Start(x[frame], velocity, hands[frame], flags, tuple((rows[t], x[t]) for t in earlier))
     return Begin(frame, start, script)
-
-
-class _Straight:
-    controller_path = "linear"

@@ -32,7 +32,7 @@ class Controls(Artifact):
     start_velocity: np.ndarray = array("N,3", np.float32, "m/s", "of the nodes at the start", omitted=True)
     start_hands: np.ndarray = array("C,3", np.float32, "m", "controllers at the start", omitted=True)
     start_holds: np.ndarray = array(
-        "C", np.float32, "1", "which controllers hold at the start, as in physics/path.py", omitted=True
+        "C", np.float32, "1", "which controllers hold at the start, as in physics/controllers.py", omitted=True
     )
     grip_rows: np.ndarray = array("G,C,4", np.float32, "m, 1", "controllers when some took hold before the start", omitted=True)
     grip_nodes: np.ndarray = array("G,N,3", np.float32, "m", "the nodes at these moments", omitted=True)

@@ -15,7 +15,7 @@ import torch
 from neuspring.core.artifacts import Twin
 from neuspring.physics import stability
 from neuspring.physics.autograd import solver_for
-from neuspring.physics.grips import BEGINS
+from neuspring.physics.controllers import BEGINS
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.rollout import FAR, Diverged
 
@@ -36,20 +36,17 @@ class Start:
     hands: np.ndarray | None = None
     """[C, 3], m."""
     holds: np.ndarray | None = None
-    """Which hands hold [C], and 2 where one takes hold in this moment (physics/path.py)."""
+    """Which hands hold [C], and 2 where one takes hold in this moment (physics/controllers.py)."""
     grips: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-    """Of hands that took hold earlier: rows [C, 4] of their moments (physics/path.py), and the nodes [N, 3] then."""
+    """Of hands that took hold earlier: rows [C, 4] of their moments (physics/controllers.py), and the nodes [N, 3] then."""
 
 
 class Simulator:
-    """A twin's state, frame by frame. Equal controls give equal states, bit for bit, on a CPU.
-
-    Hands move straight within a frame, whatever path the twin was fitted with: a live hand has no next frame.
-    """
+    """A twin's state, frame by frame. Equal controls give equal states, bit for bit, on a CPU."""
 
     def __init__(self, twin: Twin, device: str = "cpu", start: Start | None = None) -> None:
         stability.check(twin)
-        self.twin = replace(twin, simulation=replace(twin.simulation, controller_path="linear"))
+        self.twin = twin
         self._start = start or Start()
         self._device, self._load = device, stability.twin_spectrum(twin).load(twin.simulation.substep)
         self._free = solver_for(self.twin, device, differentiable=False)

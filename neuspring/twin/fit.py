@@ -32,8 +32,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.autograd import simulate_frame, solver_for
-from neuspring.physics.grips import Grips
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import Grips, waypoints
 from neuspring.physics.solver import FrameSolver, Parameters
 from neuspring.twin.company import Seat
 from neuspring.twin.losses import FrameLoss, frames_seen
@@ -160,7 +159,7 @@ class TwinFit:
         )
         end = problem.frame_end
         hands = torch.tensor(observations.controller_points[:end], device=problem.device)
-        self.hands = waypoints(hands, problem.twin.simulation, observations.controller_valid)
+        self.hands = waypoints(hands, observations.controller_valid)
         graph = problem.twin.topology
         self.grips = Grips(graph.springs, len(graph.nodes), problem.device)
         if settings.selection == "tail" and end < 3:

@@ -35,7 +35,7 @@ from neuspring.twin.field import SpringField, midpoints
 from neuspring.twin.unloaded import UnloadedShape
 
 CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
-DAMPING_FACTORS = ("drag", "dashpot", "drag_quadratic")
+DAMPING_FACTORS = ("drag", "dashpot")
 """Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
 SPRING_FACTORS = ("stiffness", "dashpot")
 """Those that may have a factor of their own for controllers' springs and for bending springs."""

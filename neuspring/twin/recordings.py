@@ -11,7 +11,7 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.transfer import corresponds, rebase
@@ -24,7 +24,7 @@ class Recording:
 
     observations: Observations
     hands: torch.Tensor
-    """Waypoints of the controllers (path.py), [train_end, C, 3] or [train_end, C, 6], m."""
+    """Waypoints of the controllers (controllers.py), [train_end, C, 3], m."""
     velocity: torch.Tensor
     """Of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
@@ -43,7 +43,7 @@ class Recording:
         velocity = initial_velocity(observations, simulation.initial_velocity)
         return cls(
             observations,
-            waypoints(hands, simulation, observations.controller_valid),
+            waypoints(hands, observations.controller_valid),
             torch.tensor(velocity, dtype=torch.float32, device=device),
             FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators),
         )

@@ -10,7 +10,7 @@ import torch
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.physics import stability
 from neuspring.physics.autograd import solver_for
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver
 
 FAR = 1e3
@@ -32,7 +32,7 @@ def frames(
     velocity: np.ndarray | None = None,
     positions: np.ndarray | None = None,
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
-    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (path.waypoints). Raises Diverged.
+    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (controllers.waypoints). Raises Diverged.
 
     `velocity` [N, 3], m/s, and `positions` [N, 3], m, are those of frame 0; none means at rest, and where the twin's nodes are.
     """
@@ -77,7 +77,7 @@ def simulate(
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
     try:
-        for frame, x, _ in frames(twin, solver, waypoints(hands, twin.simulation, valid), velocity):
+        for frame, x, _ in frames(twin, solver, waypoints(hands, valid), velocity):
             positions.append(x.cpu())
             if progress is not None:
                 progress(frame)

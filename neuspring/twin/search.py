@@ -27,8 +27,8 @@ from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.progress import Progress
 from neuspring.physics import stability
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.lanes import COST, WIDTHS, width_for
-from neuspring.physics.path import waypoints
 from neuspring.twin import hand_paths
 from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
@@ -191,7 +191,6 @@ def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
         collision_capacity=settings.collision_capacity,
         controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
-        controller_path=settings.controller_path,
     )
 
 
@@ -256,7 +255,7 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 
 
 def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Waypoints of the hands (path.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s.
+    """Waypoints of the hands (controllers.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s.
 
     Waypoints have an axis [B] of twins where each has hands of its own.
     """
@@ -264,7 +263,7 @@ def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor
 
     def path(points: np.ndarray) -> torch.Tensor:
         hands = torch.tensor(points, dtype=torch.float32, device=problem.device)[:end]
-        return waypoints(hands, simulation_of(problem, 1), observations.controller_valid)
+        return waypoints(hands, observations.controller_valid)
 
     if observations.image is None:
         hands = path(observations.controller_points)

@@ -39,7 +39,7 @@ class Outcome:
 def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
     """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
 
-    hands are the controllers' positions [T, C, 3], or what `path.waypoints` makes of them; or those of each twin, [T, B, C, 3].
+    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them; or those of each twin, [T, B, C, 3].
     """
     solver = solver_of(twins, device, differentiable=False)
     count = len(twins)

@@ -250,7 +250,7 @@ def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
     assert_same(Topology.load(path), topology())
 
 
-LATER: dict[str, dict[str, Any]] = {"material": {"drag_quadratic": 0.0}, "simulation": {"controller_path": "linear"}}
+LATER: dict[str, dict[str, Any]] = {"simulation": {"initial_velocity": "rest"}}
 """Plain fields that older files of twins lack, by part, and what they stand for."""
 
 

@@ -80,7 +80,7 @@ def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engin
 
 
 def test_masses_fall_alike(engine: Engine) -> None:
-    body = scene(3, mass=np.array([0.1, 1.0, 7.0]), drag=2.0, drag_quadratic=0.5, gravity=G, substeps=20, frame_time=0.1)
+    body = scene(3, mass=np.array([0.1, 1.0, 7.0]), drag=2.0, gravity=G, substeps=20, frame_time=0.1)
     v = engine(body, np.zeros((3, 3)), np.zeros((3, 3)), no_hands(3))[1]
     assert v[-1, 0, 2] < -1
     np.testing.assert_array_equal(v[:, 0], v[:, 2])
@@ -93,65 +93,6 @@ def test_nodes_of_other_mass_collide_with_their_momentum(engine: Engine) -> None
     v = engine(body, np.array([[0.0, 0, 0], [0.01, 0, 0]]), start, no_hands(1))[1][1]
     np.testing.assert_allclose(mass @ v, mass @ start, atol=ROUNDING)
     np.testing.assert_allclose(v[1] - v[0], -0.6 * (start[1] - start[0]), atol=ROUNDING)
-
-
-# Quadratic drag --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("drag", [0.0, 1e-9, 3.0])
-@pytest.mark.parametrize("substeps", [1, 50])
-def test_drag_alone_is_exact(engine: Engine, substeps: int, drag: float) -> None:
-    """dv/dt = -(c + b |v|) v along a line: 1/s = (1/s_0 + b/c) e^(ct) - b/c, for any number of substeps."""
-    body = scene(1, drag=drag, drag_quadratic=2.0, substeps=substeps, frame_time=0.1)
-    start = np.array([[3.0, -4.0, 12.0]])
-    v = engine(body, np.zeros((1, 3)), start, no_hands(4))[1]
-    t = 0.1 * np.arange(5)
-    growth = np.expm1(drag * t) / drag if drag else t
-    speed = 1 / (np.exp(drag * t) / 13.0 + 2.0 * growth)
-    np.testing.assert_allclose(v[:, 0], speed[:, None] * start / 13.0, rtol=ROUNDING)
-
-
-@SIDES
-@pytest.mark.parametrize("drag", [0.0, 1.5])
-def test_fall_ends_at_terminal_velocity(engine: Engine, drag: float, up: str) -> None:
-    """b s^2 + c s = g, to first order in the substep; whatever it moved sideways with is gone."""
-    b = 2.0
-    terminal = (np.sqrt(drag**2 + 4 * b * G) - drag) / (2 * b)
-    errors = []
-    for substeps in (40, 80):
-        body = scene(1, drag=drag, drag_quadratic=b, gravity=G, up=up, substeps=substeps, frame_time=0.5)
-        v = engine(body, np.zeros((1, 3)), np.array([[0.7, 0.0, 9.0]]), no_hands(30))[1][-1, 0]
-        assert abs(v[0]) < 1e-12
-        errors.append(abs(v[2] + sign(up) * terminal))
-    assert errors[0] < 0.05 * terminal
-    assert HALVING[0] < errors[0] / errors[1] < HALVING[1]
-
-
-def test_fall_with_quadratic_drag_converges_at_first_order(engine: Engine) -> None:
-    """From rest s = sqrt(g/b) tanh(sqrt(g b) t), fallen ln(cosh(sqrt(g b) t)) / b."""
-    b, t = 2.0, 0.4
-    errors = []
-    for substeps in (50, 100):
-        body = scene(1, drag_quadratic=b, gravity=G, substeps=substeps, frame_time=0.1)
-        x, v = engine(body, np.zeros((1, 3)), np.zeros((1, 3)), no_hands(4))
-        fallen, speed = np.log(np.cosh(np.sqrt(G * b) * t)) / b, np.sqrt(G / b) * np.tanh(np.sqrt(G * b) * t)
-        errors.append((abs(x[-1, 0, 2] + fallen), abs(v[-1, 0, 2] + speed)))
-    for coarse, fine in zip(*errors, strict=True):
-        assert HALVING[0] < coarse / fine < HALVING[1]
-
-
-def test_no_quadratic_drag_is_the_former_law(engine: Engine) -> None:
-    """Bit for bit, v' = (v + dt g) delta."""
-    body = scene(1, drag=2.0, gravity=G, frame_time=1e-2)
-    v = engine(body, np.zeros((1, 3)), np.array([[0.7, 0.0, 2.0]]), no_hands(1))[1]
-    np.testing.assert_array_equal(v[1, 0], (np.array([0.7, 0.0, 2.0]) - 1e-2 * np.array([0, 0, G])) * np.exp(-2e-2))
-
-
-def test_a_huge_substep_with_quadratic_drag_is_stable(engine: Engine) -> None:
-    """Whatever the substep and the speed, drag slows and does not turn."""
-    body = scene(1, drag_quadratic=1e3, frame_time=10.0)
-    v = engine(body, np.zeros((1, 3)), np.array([[1e3, 0.0, 0.0]]), no_hands(3))[1]
-    np.testing.assert_allclose(v[1:, 0, 0], 1 / (1e-3 + 1e4 * np.arange(1, 4)), rtol=ROUNDING)
 
 
 # A linear oscillator: two nodes and a spring --------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import torch
 from neuspring.core.artifacts import Simulation
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import VARIANTS, packed, random_scene, scene, solver_for, tensors, with_values
@@ -20,7 +20,7 @@ FRAMES = 1e-5
 """Relative to the largest entry of the gradient compared, over one to three frames of 10 substeps."""
 LEARNED = (
     "stiffness", "rest_lengths", "dashpot", "drag", "ground_elasticity", "ground_friction", "contact_elasticity",
-    "contact_friction", "drag_quadratic",
+    "contact_friction",
 )  # fmt: skip
 
 
@@ -38,7 +38,7 @@ def test_gradcheck_of_a_frame(variant: str) -> None:
     """torch.autograd.gradcheck over pack and simulate_frame: every physical parameter and the initial state."""
     body, x, v, hands = lively(variant)
     solver, values = solver_for(body, hands.shape[1]), tensors(body)
-    begin, end, *_ = waypoints(torch.tensor(hands), body.simulation)
+    begin, end, *_ = waypoints(torch.tensor(hands))
 
     def run(x: torch.Tensor, v: torch.Tensor, *learned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         parameters = pack(**(values | dict(zip(LEARNED, learned, strict=True))), substep=body.simulation.substep)
@@ -66,7 +66,7 @@ def weights(frames: int, nodes: int) -> np.ndarray:
 
 def loss_gradient(body: reference.Scene, x: np.ndarray, v: np.ndarray, hands: np.ndarray, weight: np.ndarray) -> Arrays:
     """Gradient of sum(weight * (x, v) at frame ends) through all frames, by simulate_frame; frame 0 has no weight."""
-    solver, motion = solver_for(body, hands.shape[1]), waypoints(torch.tensor(hands), body.simulation)
+    solver, motion = solver_for(body, hands.shape[1]), waypoints(torch.tensor(hands))
     values = {name: value.requires_grad_() for name, value in tensors(body).items()}
     start = torch.tensor(x).requires_grad_(), torch.tensor(v).requires_grad_()
     parameters = pack(**values, substep=body.simulation.substep)

@@ -11,8 +11,7 @@ import torch
 
 from neuspring.physics import autograd, reference
 from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.grips import Grips
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import Grips, waypoints
 from neuspring.twin.rollout import frames, roll_out
 from neuspring.twin.trials import motions
 from tests.support.differences import assert_gradients, differences
@@ -53,7 +52,7 @@ def caught(frames):
 @pytest.mark.parametrize(("device", "threads"), WAYS)
 def test_a_falling_body_is_caught_without_a_jump_of_force(device, threads):
     body, x, v, hands, valid, fall = caught(GRIP + 3)
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
     np.testing.assert_allclose(xs[: GRIP + 1, 0, 2], fall[: GRIP + 1], atol=ROUNDING)
     gained = np.diff(vs[:, 0, 2]) / DT
     # Where the grip begins there is weight alone; one substep later also the force of the way fallen since.
@@ -63,7 +62,7 @@ def test_a_falling_body_is_caught_without_a_jump_of_force(device, threads):
 
 def test_a_caught_body_falls_as_deep_as_its_energy_says():
     body, x, v, hands, valid, fall = caught(GRIP + 140)
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid))
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid))
     speed = vs[GRIP, 0, 2]
     # m v^2 / 2 + m g D = K D^2 / 2 at the lowest point.
     depth = (9.8 + np.sqrt(9.8**2 + PER_LENGTH * speed**2)) / PER_LENGTH
@@ -71,9 +70,9 @@ def test_a_caught_body_falls_as_deep_as_its_energy_says():
     assert fall[GRIP] - xs[GRIP:, 0, 2].min() == pytest.approx(depth, rel=0.02)
 
 
-def late_scene(path="linear"):
+def late_scene():
     """A lively body; one hand lets go in frame 2 and grips again in frame 4, the other grips in frame 3 for the first time."""
-    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, on_ground=False, controller_path=path)
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, on_ground=False)
     hands = np.concatenate([hands, hands[::-1]])[:7]
     valid = np.ones(hands.shape[:2], bool)
     valid[2:4, 0] = False
@@ -81,11 +80,10 @@ def late_scene(path="linear"):
     return body, x, v, hands, valid
 
 
-@pytest.mark.parametrize("path", ["linear", "cubic"])
 @pytest.mark.parametrize(("device", "threads"), WAYS)
-def test_the_solver_agrees_with_the_reference(device, threads, path):
-    body, x, v, hands, valid = late_scene(path)
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+def test_the_solver_agrees_with_the_reference(device, threads):
+    body, x, v, hands, valid = late_scene()
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
     expected, speeds = reference.rollout(body, x, v, hands, valid)
     np.testing.assert_allclose(xs, expected, atol=ROUNDING)
     np.testing.assert_allclose(vs, speeds, atol=1e-9)
@@ -110,7 +108,7 @@ def simulated(body, rows, x, v, values):
 def test_gradients_through_grips_are_exact(name):
     """Rest lengths of grips depend on the state in which they begin, and so on everything before: no part is left out."""
     body, x, v, hands, valid = late_scene()
-    rows, weights = waypoints(torch.tensor(hands), body.simulation, valid), np.random.default_rng(0).normal(size=x.shape)
+    rows, weights = waypoints(torch.tensor(hands), valid), np.random.default_rng(0).normal(size=x.shape)
     values, start = tensors(body), {"x": torch.tensor(x), "v": torch.tensor(v)}
     every = values | start
     learned = every[name].clone().requires_grad_()
@@ -130,7 +128,7 @@ def test_gradients_through_grips_are_exact(name):
 
 def test_gradients_straight_from_the_solver_refuse_grips_that_it_took_itself():
     body, x, v, hands, valid = late_scene()
-    rows, state = waypoints(torch.tensor(hands), body.simulation, valid), (torch.tensor(x), torch.tensor(v))
+    rows, state = waypoints(torch.tensor(hands), valid), (torch.tensor(x), torch.tensor(v))
     solver = solver_for(body, hands.shape[1])
     for begin, end in pairwise(rows):
         state = solver.forward(*state, begin, end)
@@ -143,13 +141,13 @@ def test_all_ways_to_roll_out_take_the_same_grips():
     body, x, v, hands, valid = late_scene()
     twin = twin_of(body, x, hands[0])
     alone = roll_out(twin, hands, velocity=v, valid=valid).positions
-    rows = waypoints(torch.tensor(hands, dtype=torch.float32), twin.simulation, valid)
+    rows = waypoints(torch.tensor(hands, dtype=torch.float32), valid)
     stiffer = replace(twin, material=replace(twin.material, stiffness=2.0 * twin.material.stiffness))
     judged, speeds = motions([twin, stiffer], rows, torch.tensor(v, dtype=torch.float32), "cpu")
     np.testing.assert_array_equal(judged[:, 0].numpy(), alone[1:])
     np.testing.assert_array_equal(judged[:, 1].numpy(), roll_out(stiffer, hands, velocity=v, valid=valid).positions[1:])
     double = torch.tensor(hands), torch.tensor(x), torch.tensor(v)
-    fitted = simulated(body, waypoints(double[0], body.simulation, valid), *double[1:], tensors(body))
+    fitted = simulated(body, waypoints(double[0], valid), *double[1:], tensors(body))
     assert np.abs(fitted.numpy() - alone[-1]).max() < 1e-5
     solver = autograd.solver_for(twin, differentiable=False)
     solver.resume(rows[:5], list(alone))

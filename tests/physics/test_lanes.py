@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver
 from tests.support.scenes import VARIANTS, WAYS, random_scene, scene, solver_for, tensors
@@ -38,7 +38,7 @@ class Member(NamedTuple):
     x: np.ndarray
     v: np.ndarray
     hands: np.ndarray
-    """As the solver takes them (path.py)."""
+    """As the solver takes them (controllers.py)."""
 
 
 def member(number: int, variant: str) -> Member:
@@ -56,13 +56,10 @@ def member(number: int, variant: str) -> Member:
         contact_distance=rng.uniform(0.02, 0.045),
         simulation=replace(body.simulation, substeps=SUBSTEPS[number % len(SUBSTEPS)], frame_time=rng.uniform(0.018, 0.022)),
     )
-    if body.drag_quadratic:
-        # Some twins have none, and must not notice those that have.
-        body = replace(body, drag_quadratic=body.drag_quadratic * max(rng.uniform(-0.5, 2.0), 0.0))
     shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
     if np.ndim(body.mass):
         body = replace(body, mass=body.mass * rng.uniform(0.5, 2.0, body.nodes))
-    places = waypoints(torch.tensor(hands + shift[2]), body.simulation).numpy()
+    places = waypoints(torch.tensor(hands + shift[2])).numpy()
     return Member(body, x + shift[0], v + shift[1], places)
 
 
@@ -208,7 +205,7 @@ def test_a_broken_twin_breaks_no_other(how: str, variant: str, broken: int) -> N
 
 @pytest.mark.parametrize(("name", "value"), [
     ("gravity", 1.6), ("up", "-z"), ("ground", False), ("self_collision", True), ("collision_capacity", 7),
-    ("controller_velocity", True), ("controller_path", "cubic"),
+    ("controller_velocity", True),
 ])  # fmt: skip
 def test_twins_share_their_physics(name: str, value: Any) -> None:
     """What the solver takes from the first would be wrong for the others."""

@@ -11,7 +11,7 @@ import torch
 
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.trials import motions
 from tests.support.differences import assert_gradients, differences
@@ -55,7 +55,7 @@ def held_body():
 def test_a_body_let_go_in_the_air_falls_freely(device, threads):
     body, x, v, hands = held_body()
     valid = np.arange(9)[:, None] < 4
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
     momentum, dt = vs.sum(axis=1), body.simulation.substep
     # Held up to frame 3, so that the fall begins there: each substep adds 2 g dt to the momentum of two kilograms.
     for frame in range(3, 8):
@@ -72,7 +72,7 @@ def test_without_damping_the_energy_after_letting_go_is_kept():
     body, x, v, hands = held_body()
     body = replace(body, dashpot=np.zeros(2), simulation=replace(body.simulation, gravity=0.0, substeps=200))
     valid = np.arange(9)[:, None] < 4
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid))
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid))
     length = np.linalg.norm(xs[:, 1] - xs[:, 0], axis=1)
     energy = 0.5 * (vs**2).sum(axis=(1, 2)) + 50.0 * (length - 0.1) ** 2 / (2 * 0.1)
     # The error of symplectic Euler oscillates with omega dt = 1.6e-3.
@@ -87,7 +87,7 @@ def test_the_solver_agrees_with_the_reference(device, threads):
     valid = np.ones(hands.shape[:2], bool)
     valid[2:, 0] = False
     valid[4:7] = False
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), body.simulation, valid), device, threads)
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
     expected, speeds = reference.rollout(body, x, v, hands, valid)
     np.testing.assert_allclose(xs, expected, atol=ROUNDING)
     np.testing.assert_allclose(vs, speeds, atol=1e-9)
@@ -97,19 +97,18 @@ def test_the_solver_agrees_with_the_reference(device, threads):
 
 def test_where_all_hold_nothing_changes_bit_for_bit():
     body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02)
-    plain, every = (waypoints(torch.tensor(hands), body.simulation, valid) for valid in (None, np.ones(hands.shape[:2], bool)))
+    plain, every = (waypoints(torch.tensor(hands), valid) for valid in (None, np.ones(hands.shape[:2], bool)))
     assert torch.equal(plain, every)
     flagged = torch.cat([plain, torch.ones(*plain.shape[:2], 1, dtype=plain.dtype)], dim=-1)
     for one, other in zip(run(body, x, v, plain), run(body, x, v, flagged), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("path", ["linear", "cubic"])
-def test_twins_in_company_let_go_as_alone(path):
-    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, controller_path=path)
+def test_twins_in_company_let_go_as_alone():
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02)
     valid = np.ones(hands.shape[:2], bool)
     valid[2:, 1] = False
-    rows = waypoints(torch.tensor(hands), body.simulation, valid)
+    rows = waypoints(torch.tensor(hands), valid)
     stiffer = replace(body, stiffness=2.0 * body.stiffness)
     together = solver_for([body, stiffer], hands.shape[1])
     state = tuple(torch.tensor(np.stack([values] * 2)) for values in (x, v))
@@ -130,7 +129,7 @@ def test_gradients_through_a_release(name):
     weights = np.random.default_rng(0).normal(size=x.shape)
     values = tensors(body)
     learned = values[name].clone().requires_grad_()
-    solver, rows = solver_for(body, hands.shape[1]), waypoints(torch.tensor(hands), body.simulation, valid)
+    solver, rows = solver_for(body, hands.shape[1]), waypoints(torch.tensor(hands), valid)
     parameters = pack(**(values | {name: learned}), substep=body.simulation.substep)
     state = torch.tensor(x), torch.tensor(v)
     for begin, end in pairwise(rows):
@@ -151,7 +150,7 @@ def test_a_twin_s_rollout_and_its_judge_in_a_search_let_go_alike():
     hands = held_body()[3][:6]
     alone = roll_out(twin, hands, valid=seen).positions
     kept = roll_out(twin, hands).positions
-    rows = waypoints(torch.tensor(hands, dtype=torch.float32), twin.simulation, seen)
+    rows = waypoints(torch.tensor(hands, dtype=torch.float32), seen)
     judged, _ = motions([twin, twin], rows, torch.zeros(2, 3), "cpu")
     np.testing.assert_array_equal(judged[:, 0].numpy(), alone[1:])
     assert np.abs(alone - kept).max() > 1e-3

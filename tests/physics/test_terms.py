@@ -144,16 +144,14 @@ def test_a_force_counts_in_its_substep_only() -> None:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("quadratic", [0.0, 0.7])
-def test_velocity(quadratic: float, width: int) -> None:
-    """v, force and the drag's factors, of lanes with and without quadratic drag."""
+def test_velocity(width: int) -> None:
+    """v, force and the drag's factor."""
     rng, count, kernels = np.random.default_rng(2), 5, terms.kernels
     weight = rng.standard_normal((width, count, 3))
     at = {
         "v": rng.standard_normal((width, count, 3)),
         "force": rng.standard_normal((width, count, 3)) * 50,
         "decay": np.array([0.93, 0.8, 0.99, 0.5])[:width],
-        "quadratic": np.array([quadratic, 0.0, 0.3, 2.0])[:width],
     }
     light = rng.uniform(0.5, 2.0, (width, count))
     fixed = {
@@ -165,20 +163,18 @@ def test_velocity(quadratic: float, width: int) -> None:
     def after(values: Arrays) -> np.ndarray:
         result = vectors(np.zeros_like(values["v"]))
         state = vectors(values["v"]), vectors(values["force"]), vectors(values["gravity"])
-        scalars = (numbers(values[name]) for name in ("dt", "decay", "quadratic", "light"))
+        scalars = (numbers(values[name]) for name in ("dt", "decay", "light"))
         launch(kernels(len(values["v"])).speed, count, *state, *scalars, result)
         return twins(result)
 
     values = at | fixed
     expected = values["v"] + values["dt"][:, None, None] * (values["force"] * light[..., None] + values["gravity"])
-    slower = 1 + values["quadratic"][:, None, None] * np.linalg.norm(expected, axis=2, keepdims=True)
-    np.testing.assert_allclose(after(values), expected * values["decay"][:, None, None] / slower, rtol=EXACT)
+    np.testing.assert_allclose(after(values), expected * values["decay"][:, None, None], rtol=EXACT)
     adj_v, adj_force = (vectors(np.zeros_like(weight)) for _ in range(2))
-    adj_decay, adj_quadratic = (numbers(np.zeros((width, count))) for _ in range(2))
-    state = vectors(after(values)), vectors(weight), *(numbers(values[name]) for name in ("dt", "decay", "quadratic", "light"))
-    launch(kernels(width).speed_adjoint, count, *state, adj_v, adj_force, adj_decay, adj_quadratic)
-    drags = {"decay": twins(adj_decay).sum(axis=1), "quadratic": twins(adj_quadratic).sum(axis=1)}
-    got = {"v": twins(adj_v), "force": twins(adj_force), **drags}
+    adj_decay = numbers(np.zeros((width, count)))
+    state = vectors(after(values)), vectors(weight), *(numbers(values[name]) for name in ("dt", "decay", "light"))
+    launch(kernels(width).speed_adjoint, count, *state, adj_v, adj_force, adj_decay)
+    got = {"v": twins(adj_v), "force": twins(adj_force), "decay": twins(adj_decay).sum(axis=1)}
     for adjoint, wanted in compared(at, fixed, after, got, weight):
         assert_gradients(adjoint, wanted, KERNEL)
 

@@ -39,7 +39,6 @@ def rope(**simulation: object) -> Twin:
             stiffness=rng.uniform(150, 300, len(springs)),
             dashpot=rng.uniform(0.5, 2.0, len(springs)),
             drag=1.5,
-            drag_quadratic=0.2,
             ground_elasticity=0.3,
             ground_friction=0.4,
             contact_elasticity=0.5,

@@ -14,7 +14,7 @@ import torch
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
 from neuspring.physics.autograd import pack
-from neuspring.physics.path import waypoints
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver, Parameters
 from tests.support.devices import CUDA
@@ -32,10 +32,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "free": {"on_ground": False},
     "ground": {},
     "self-collision": {"self_collision": True},
-    "thick air": {"drag_quadratic": 2.0},
-    "all": {"self_collision": True, "up": "-z", "controller_velocity": True, "drag_quadratic": 0.5},
+    "all": {"self_collision": True, "up": "-z", "controller_velocity": True},
     "masses": {"self_collision": True, "mass": MASSES},
-    "cubic path": {"controller_path": "cubic", "controller_velocity": True},
 }
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
@@ -54,7 +52,6 @@ def scene(
     ground: tuple[float, float] = (0.5, 0.3),
     contact: tuple[float, float] = (0.7, 0.3),
     contact_distance: float = 0.02,
-    drag_quadratic: float = 0.0,
     mass: Any = 1.0,
     on_ground: bool = False,
     **simulation: Any,
@@ -73,7 +70,6 @@ def scene(
         contact=contact,
         contact_distance=contact_distance,
         simulation=Simulation(**options),
-        drag_quadratic=drag_quadratic,
         mass=mass,
     )
 
@@ -90,7 +86,6 @@ def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float6
         "contact_elasticity": scene.contact[0],
         "contact_friction": scene.contact[1],
         "contact_distance": scene.contact_distance,
-        "drag_quadratic": scene.drag_quadratic,
         "mass": np.atleast_1d(scene.mass),
     }
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
@@ -101,8 +96,8 @@ def with_values(scene: Scene, values: dict[str, Any]) -> Scene:
     arrays = {k: np.asarray(v, np.float64) for k, v in values.items() if k in ("stiffness", "rest_lengths", "dashpot")}
     ground = (values.get("ground_elasticity", scene.ground[0]), values.get("ground_friction", scene.ground[1]))
     contact = (values.get("contact_elasticity", scene.contact[0]), values.get("contact_friction", scene.contact[1]))
-    drags = {name: float(values.get(name, getattr(scene, name))) for name in ("drag", "drag_quadratic")}
-    return replace(scene, **arrays, **drags, ground=tuple(map(float, ground)), contact=tuple(map(float, contact)))
+    drag = float(values.get("drag", scene.drag))
+    return replace(scene, **arrays, drag=drag, ground=tuple(map(float, ground)), contact=tuple(map(float, contact)))
 
 
 def packed(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Parameters:
@@ -147,7 +142,7 @@ def warp(
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
-    hands = waypoints(tensor(controllers), scene.simulation)
+    hands = waypoints(tensor(controllers))
     states = [(tensor(x), tensor(v))]
     for begin, end in pairwise(hands):
         states.append(solver.forward(*states[-1], begin, end))
@@ -201,7 +196,5 @@ def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
     )
     scalars = dict(zip(SCALARS, (scene.drag, *scene.ground, *scene.contact, scene.contact_distance), strict=True))
     mass = scene.mass if np.ndim(scene.mass) else ()
-    material = Material(
-        stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), drag_quadratic=scene.drag_quadratic, **scalars
-    )
+    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), **scalars)
     return Twin(topology=topology, material=material, simulation=scene.simulation)

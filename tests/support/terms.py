@@ -66,31 +66,27 @@ def kernels(width: int) -> Kernels:
         gravity: vectors,
         dt: numbers,
         decay: numbers,
-        quadratic: numbers,
         light: numbers,
         after: vectors,
     ):
         i = wp.tid()
-        after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], quadratic[0], light[i])
+        after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], light[i])
 
     def speed_adjoint(
         after: vectors,
         weight: vectors,
         dt: numbers,
         decay: numbers,
-        quadratic: numbers,
         light: numbers,
         adj_v: vectors,
         adj_force: vectors,
         adj_decay: numbers,
-        adj_quadratic: numbers,
     ):
         i = wp.tid()
-        own_v, own_force, own_decay, own_quadratic = updated_adjoint(after[i], weight[i], dt[0], decay[0], quadratic[0], light[i])
+        own_v, own_force, own_decay = updated_adjoint(after[i], weight[i], dt[0], decay[0], light[i])
         adj_v[i] = own_v
         adj_force[i] = own_force
         adj_decay[i] = own_decay
-        adj_quadratic[i] = own_quadratic
 
     def motion(x: vectors, v: vectors, dt: numbers, up: wp.float64, e: numbers, mu: numbers, after_x: vectors, after_v: vectors):
         i = wp.tid()

@@ -268,17 +268,6 @@ def test_a_damping_of_zero_has_no_factor():
     assert set(parameters(start=still, damping="homogeneous").factors) == {"dashpot"}
 
 
-def test_quadratic_drag_has_a_factor_where_there_is_some():
-    thick = replace(twin(), material=replace(twin().material, drag_quadratic=0.7))
-    trained = parameters(start=thick, damping="homogeneous")
-    with torch.no_grad():
-        trained.factors["drag_quadratic"].fill_(0.5)
-    torch.testing.assert_close(float(trained.physical()["drag_quadratic"].detach()), 0.7 * np.exp(0.5), rtol=SINGLE, atol=0)
-    assert trained.as_twin(thick).material.drag_quadratic == pytest.approx(0.7 * np.exp(0.5), rel=SINGLE)
-    for without in (parameters(damping="homogeneous"), parameters(start=thick)):
-        assert "factors.drag_quadratic" not in dict(without.named_parameters())
-
-
 def test_fixed_damping_does_not_move():
     trained = disturb(parameters())
     assert "drag" not in dict(trained.named_parameters())

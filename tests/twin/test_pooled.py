@@ -90,10 +90,10 @@ def test_a_recording_beside_itself_changes_nothing():
     pd.testing.assert_frame_equal(searched(LIFTED, LIFTED, leave_out=True), searched(LIFTED))
 
 
-SMOOTH = config.Simulation(controller_path="cubic", mass="volume")
+HEAVY = config.Simulation(mass="volume")
 
 
-@pytest.mark.parametrize("simulation", [config.Simulation(), SMOOTH], ids=["plain", "cubic path, volume masses"])
+@pytest.mark.parametrize("simulation", [config.Simulation(), HEAVY], ids=["plain", "volume masses"])
 def test_a_recording_beside_itself_changes_nothing_of_a_polish(simulation):
     alone = polished(seen(LIFTED), simulation=simulation)
     expected = traced(alone)
@@ -158,7 +158,7 @@ def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
 def test_springs_radii_and_masses_are_the_same_on_all_recordings():
     """Lengths in spacings of the scenario's own body, whatever the poses of the others."""
     search_settings = replace(polished(seen(LIFTED)).search, lengths="spacing")
-    alone = replace(polished(seen(LIFTED), simulation=SMOOTH), search=search_settings)
+    alone = replace(polished(seen(LIFTED), simulation=HEAVY), search=search_settings)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
     recording = Recording.of(stretched, alone.simulation, alone.losses, alone.quirks)
     _, (here, there) = module._made(replace(alone, pool=(recording,)), alone.encode())
@@ -248,11 +248,10 @@ def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
     require_equal(pooled(plain, late), pooled(plain, plain.observations))
 
 
-def test_masses_and_controllers_on_a_cubic_path_reach_every_recording():
+def test_masses_reach_every_recording():
     problem = problem_of(LIFTED, epochs=2)
     mass = np.linspace(0.5, 1.5, len(problem.twin.topology.nodes)).astype(np.float32)
     twin = replace(problem.twin, material=replace(problem.twin.material, mass=mass))
-    twin = replace(twin, simulation=replace(twin.simulation, controller_path="cubic"))
     problem = replace(problem, twin=twin)
     # On the same nodes, the other recording's own fit.
     found, own = pooled(problem, seen(SHAKEN), leave_out=True), fit(replace(problem, observations=seen(SHAKEN)))
@@ -293,7 +292,7 @@ def test_left_out_recordings_lend_their_nodes_alone():
 
 
 @pytest.mark.parametrize(
-    "simulation", [config.Simulation(), replace(SMOOTH, initial_velocity="observed")], ids=["plain", "observed"]
+    "simulation", [config.Simulation(), replace(HEAVY, initial_velocity="observed")], ids=["plain", "observed"]
 )
 def test_search_and_polish_read_nothing_of_what_is_left_out(simulation):
     here = seen(LIFTED)

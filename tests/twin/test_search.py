@@ -106,18 +106,6 @@ def test_the_start_is_decoded_to_itself(changes):
         assert value == pytest.approx(start[name.partition(".")[0]], **slack)
 
 
-def test_quadratic_drag_is_a_variable_where_it_is_asked_for():
-    """It comes last, so that searches without it keep their variables."""
-    values = small.start_values()
-    free = small.search_problem()
-    wanted = replace(free.search, extra=("drag_quadratic",), ranges=replace(free.search.ranges, drag_quadratic=(0.01, 100.0)))
-    searched = small.search_problem(search=wanted)
-    assert searched.variables == (*free.variables, "drag_quadratic")
-    assert searched.decode(np.full(13, 0.25))["drag_quadratic"] == pytest.approx(0.1, rel=CODING)
-    assert candidate(free, values).material.drag_quadratic == 0.0
-    assert candidate(searched, values | {"drag_quadratic": 1.5}).material.drag_quadratic == 1.5
-
-
 def test_the_logarithmic_scale_of_stiffness():
     ranges = {"stiffness": [1e1, 1e5]}
     middle = np.full(12, 0.5)

@@ -1,4 +1,4 @@
-"""Grips that begin later than frame 0: springs of a controller take the rest lengths of the moment in which it takes hold.
+"""Controllers: where they are in each frame, which of them hold, and the springs of those that take hold later than in frame 0.
 
 At the frame in which a controller at x_c begins to hold, spring (c, n) with stiffness Y and rest length l0 becomes
 
@@ -19,18 +19,31 @@ import torch
 from neuspring.physics.lanes import MIN_LENGTH
 
 BEGINS = 2.0
-"""In the last column of a row of waypoints (path.py): the controller begins to hold in this frame."""
+"""In the last column of a row of waypoints: the controller begins to hold in this frame."""
+
+
+def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
+    """What a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m.
+
+    Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0,
+    and 2 where it begins to hold, but in frame 0. The springs of a controller act in a frame if it holds at both ends of the frame.
+    When it begins to hold they take the rest lengths of that moment.
+    """
+    if valid is None or valid.all():
+        return hands
+    holds = torch.tensor(valid[: len(hands)], dtype=hands.dtype, device=hands.device)
+    holds[1:] += (BEGINS - 1.0) * (holds[1:] - holds[:-1]).clamp(min=0.0)
+    return torch.cat([hands, holds[..., None]], dim=-1)
 
 
 def begins(row: torch.Tensor) -> torch.Tensor:
     """Which controllers [..., C] begin to hold, of a row of waypoints; none where it has no such column."""
-    flagged = row.shape[-1] in (4, 7)
-    return row[..., -1] == BEGINS if flagged else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
+    return row[..., 3] == BEGINS if row.shape[-1] == 4 else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
 
 
 def begun(row: torch.Tensor) -> torch.Tensor:
     """The row after its grips were taken: who begins holds."""
-    return torch.cat([row[..., :-1], row[..., -1:].clamp(max=1.0)], dim=-1) if row.shape[-1] in (4, 7) else row
+    return torch.cat([row[..., :3], row[..., 3:].clamp(max=1.0)], dim=-1) if row.shape[-1] == 4 else row
 
 
 class Grips:
