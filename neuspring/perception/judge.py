@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.synthetic.correspond import at_points, under_pixels
-from neuspring.data.synthetic.truth import Truth
+from neuspring.data.synthetic.truth import Truth, at_points, under_pixels
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.perception.shape_prior import visual_hull

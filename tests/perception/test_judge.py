@@ -12,8 +12,7 @@ from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
-from neuspring.data.synthetic.correspond import at_points, under_pixels
-from neuspring.data.synthetic.truth import truth_of, truth_path
+from neuspring.data.synthetic.truth import at_points, truth_of, truth_path, under_pixels
 from neuspring.perception import track_truth
 from neuspring.perception.judge import judge
 from neuspring.perception.lift import lift

@@ -11,10 +11,9 @@ from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, CameraEntry, Writer
-from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.render import HAND, Part, Renderer
-from neuspring.data.synthetic.sensor import quantized
+from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
+from neuspring.data.synthetic.render import HAND, Part, Renderer, quantized
 from neuspring.perception import shape_mesh, shape_prior
 from neuspring.perception.assemble import assemble
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior

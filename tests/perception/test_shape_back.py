@@ -8,10 +8,9 @@ import pytest
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.data.capture import OBJECT, CameraEntry, Writer
-from neuspring.data.synthetic.implicit import capsule, sphere, surface
 from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.render import Part, Renderer
-from neuspring.data.synthetic.sensor import quantized
+from neuspring.data.synthetic.meshes import capsule, sphere, surface
+from neuspring.data.synthetic.render import Part, Renderer, quantized
 from neuspring.perception.figures import lifted_figure
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside

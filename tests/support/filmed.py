@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
-from neuspring.data.synthetic.hands import SKIN
-from neuspring.data.synthetic.implicit import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.render import Part, Renderer
-from neuspring.data.synthetic.sensor import quantized
+from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
+from neuspring.data.synthetic.render import Part, Renderer, quantized
+from neuspring.data.synthetic.scenes import SKIN
 from tests.support.phystwin_case import dump, write_json
 
 FRAMES = 6

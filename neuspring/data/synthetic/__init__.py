@@ -1,8 +1,7 @@
 """Synthetic scenes with known truth.
 
-- `make`: a scene -> capture folder and truth; `scenes`: the 22 scenes; `toy`: small scenes without video.
-- `goods`, `plush`, `hands`: bodies and hands; `body`, `implicit`, `tetrahedra`: what they are made of.
-- `fem`, `fem_model`, `fem_kernels`: Newton's explicit finite elements; `vbd`: a second engine.
-- `render`, `render_kernels`, `sensor`: the ray caster, the depth camera's flaws.
-- `truth`: what methods may not read; `correspond`, `correspond_kernels`: where a material point goes.
+- `make`: a scene -> capture folder and truth; `scenes`: the 22 scenes and their hands; `toy`: small scenes without video.
+- `bodies`: cloths, ropes, a package, plush animals; `meshes`: what they and hands are made of.
+- `fem`: Newton's finite elements, two engines; `render`: the ray caster and the depth camera; `kernels`: Warp kernels of both.
+- `truth`: what methods may not read, and where a material point goes.
 """

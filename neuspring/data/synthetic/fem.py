@@ -1,12 +1,13 @@
-"""Explicit finite elements (Newton's semi-implicit solver) with hands: the motion that synthetic captures show.
+"""Finite elements with hands: the motion that synthetic captures show, by Newton's solvers.
 
-Its numerics have nothing in common with the spring-mass simulator of the twins: stable neo-Hookean tetrahedra, membranes with
-hinge bending, penalty contacts. Substeps follow from the largest eigenvalue of the engine's own forces.
+Their numerics have nothing in common with the spring-mass simulator of the twins: stable neo-Hookean tetrahedra, membranes with
+hinge bending, penalty contacts. Substeps follow from the largest eigenvalue of the engine's own forces. `FiniteElements` is
+explicit (semi-implicit Euler); `VertexBlockDescent` is a second engine, for a held-out split with other numerics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -15,11 +16,105 @@ import numpy as np
 import warp as wp
 
 from neuspring.core.errors import NumericalFailure
-from neuspring.data.synthetic import fem_kernels as kernels
-from neuspring.data.synthetic.body import Body
-from neuspring.data.synthetic.fem_model import GRAVITY, build, lame
-from neuspring.data.synthetic.hands import Hand
-from neuspring.data.synthetic.tetrahedra import volumes
+from neuspring.data.synthetic import kernels
+from neuspring.data.synthetic.bodies import SoftBody
+from neuspring.data.synthetic.meshes import edges, volumes
+from neuspring.data.synthetic.scenes import FIST_RADIUS, Hand
+
+GRAVITY = 9.81
+"""m/s^2, towards -z."""
+LEAST_MASS = 0.3
+"""Nodes of a solid weigh at least this fraction of the median node; lighter ones alone would dictate the step."""
+MAX_SPEED = 20.0
+"""m/s; the engine clips faster nodes."""
+Moduli = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def lame(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lame parameters mu, lambda, Pa."""
+    mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
+    return mu, youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
+
+
+def stable_moduli(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the semi-implicit engine's stable neo-Hookean energy (Smith et al. 2018) needs to have these small-strain moduli:
+    4/3 mu and lambda + 5/6 mu."""
+    mu, first = lame(youngs_modulus, poisson_ratio)
+    return 4.0 / 3.0 * mu, first + 5.0 / 6.0 * mu
+
+
+def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: bool = True, colored: bool = False) -> newton.Model:
+    """The engine's model of a body, a table and kinematic fists.
+
+    `dashpots`: a spring of no stiffness on every edge of a solid, whose damping the caller sets. `colored`: nodes in groups that
+    do not meet, for solvers that move one node after the other.
+    """
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    shape = builder.default_shape_cfg.copy()
+    shape.mu, shape.ke, shape.kd, shape.kf = body.friction, body.contact_stiffness, body.contact_damping, 0.0
+    builder.add_ground_plane(cfg=shape)
+    if body.is_sheet:
+        _add_sheet(builder, body)
+    else:
+        _add_solid(builder, body, moduli, dashpots)
+    for _ in range(fists):
+        link = builder.add_body(is_kinematic=True, mass=1.0)
+        builder.add_shape_sphere(link, radius=FIST_RADIUS, cfg=shape)
+    if colored:
+        builder.color(include_bending=body.is_sheet)
+    model = builder.finalize(device="cpu")
+    if body.self_contact:
+        model.particle_ke, model.particle_kd = body.self_contact_stiffness, 0.01
+        model.particle_kf, model.particle_mu = 0.0, 0.3
+    else:
+        model.particle_grid = None
+    model.soft_contact_ke, model.soft_contact_kd = body.contact_stiffness, body.contact_damping
+    model.soft_contact_kf, model.soft_contact_mu = 0.0, 0.0
+    model.particle_max_velocity = MAX_SPEED
+    return model
+
+
+def _add_solid(builder: newton.ModelBuilder, body: SoftBody, moduli: Moduli, dashpots: bool) -> None:
+    for node in body.nodes:
+        builder.add_particle(wp.vec3(*node), wp.vec3(), 0.0, body.radius)
+    mass = np.zeros(len(body.nodes))
+    elastic = zip(*moduli(body.youngs_modulus, body.poisson_ratio), strict=True)
+    for corners, (mu, first), density in zip(body.tetrahedra.tolist(), elastic, body.density, strict=True):
+        a, b, c, d = corners
+        volume = builder.add_tetrahedron(a, b, c, d, float(mu), float(first), 0.0)
+        mass[corners] += density * volume / 4.0
+    builder.particle_mass[:] = np.maximum(mass, LEAST_MASS * np.median(mass)).tolist()
+    for corners, stiffness in zip(body.triangles.tolist(), body.membrane, strict=True):
+        ke = float(stiffness)
+        builder.add_triangle(*corners, tri_ke=ke, tri_ka=ke / 2.0, tri_kd=0.0, tri_drag=body.air_drag, tri_lift=0.0)
+    for i, j in edges(body.tetrahedra).tolist() if dashpots else ():
+        builder.add_spring(i, j, 0.0, 0.0, 0.0)
+
+
+def _add_sheet(builder: newton.ModelBuilder, body: SoftBody) -> None:
+    builder.add_cloth_mesh(
+        pos=(0.0, 0.0, 0.0),
+        rot=wp.quat_identity(),  # type: ignore[arg-type]
+        scale=1.0,
+        vel=(0.0, 0.0, 0.0),
+        vertices=[wp.vec3(*node) for node in body.nodes],
+        indices=body.triangles.ravel().tolist(),
+        density=body.sheet_density,
+        tri_ke=1.0,
+        tri_ka=1.0,
+        tri_kd=0.0,
+        edge_ke=1.0,
+        edge_kd=0.0,
+        particle_radius=body.radius,
+        tri_drag=body.air_drag,
+    )
+    materials = np.array(builder.tri_materials)
+    materials[:, 0], materials[:, 1] = body.membrane, body.membrane / 2.0
+    builder.tri_materials[:] = [tuple(row) for row in materials.tolist()]
+    hinges = np.array(builder.edge_bending_properties)
+    hinges[:, 0] = body.bending[np.array(builder.edge_indices)[:, 2:]].mean(axis=1)
+    builder.edge_bending_properties[:] = [tuple(row) for row in hinges.tolist()]
+
 
 SAFETY = 0.6
 """Fraction of the critical step."""
@@ -72,7 +167,7 @@ class FiniteElements:
 
     def __init__(
         self,
-        body: Body,
+        body: SoftBody,
         hands: Sequence[Hand],
         frames: int,
         frame_rate: float,
@@ -311,7 +406,7 @@ class FiniteElements:
         return np.asarray(change)
 
 
-def settle(body: Body, frame_rate: float, seconds: float = 4.0, still: float = 0.01) -> np.ndarray:
+def settle(body: SoftBody, frame_rate: float, seconds: float = 4.0, still: float = 0.01) -> np.ndarray:
     """Node positions [N, 3], m, of the body lying on the table: dropped with strong drag until no node moves faster than `still`,
     m/s, at most `seconds`."""
     position, frames = body.nodes, max(int(0.5 * frame_rate), 2)
@@ -344,3 +439,46 @@ def _spans(positions: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def _stable(frequency: float, damping: float) -> float:
     return float((-damping + np.sqrt(damping**2 + 4.0 * frequency**2)) / frequency**2)
+
+
+VBD_SUBSTEPS, VBD_ITERATIONS = 40, 10
+"""Converged here, and far from it at what games use: neither is a setting."""
+
+
+class VertexBlockDescent(FiniteElements):
+    """Vertex block descent (Chen et al. 2024): implicit Euler solved node by node. Solids that hands grip; no fists, no sheets.
+
+    It takes the plain Lame parameters. Its damping is that of implicit Euler, not a material's. Its friction is the engine's
+    smoothed Coulomb friction.
+    """
+
+    def _build(self, fists: int) -> newton.Model:
+        assert not fists, "the held-out engine has no fists"
+        assert not self.body.is_sheet, "the held-out engine has no sheets"
+        model = build(self.body, 0, lame, dashpots=False, colored=True)
+        model.soft_contact_mu = self.body.friction
+        return model
+
+    def _solver(self) -> newton.solvers.SolverBase:
+        return newton.solvers.SolverVBD(self.model, iterations=VBD_ITERATIONS, particle_enable_tile_solve=False)
+
+    def _choose_substeps(self, substeps: int | None) -> int:
+        return substeps or VBD_SUBSTEPS
+
+    def _hold(self, fists: list[int], earlier: np.ndarray | None) -> None:
+        super()._hold(fists, earlier)
+        # Without mass a node would still give way to its neighbors.
+        flags = np.where(self.holder < 0, int(newton.ParticleFlags.ACTIVE), 0)
+        self.model.particle_flags.assign(flags.astype(np.int32))
+
+    def _substeps(self) -> None:
+        for _ in range(self.substeps):
+            now, following = self.now, self.next
+            now.clear_forces()
+            # Held nodes do not move within a step: they are put where they are at its end.
+            wp.launch(kernels.advance, 1, [self._step], device="cpu")
+            held = [self._step, self._poses, self._holder, self._local, self.substep, now.particle_q, now.particle_qd]
+            wp.launch(kernels.drive_nodes, self.model.particle_count, held, device="cpu")
+            self.pipeline.collide(now, self.contacts)
+            self.solver.step(now, following, self.control, self.contacts, self.substep)
+            self.now, self.next = following, now

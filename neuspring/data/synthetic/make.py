@@ -16,14 +16,11 @@ from neuspring.core.points import farthest
 from neuspring.core.progress import Progress
 from neuspring.core.records import digest_file
 from neuspring.data.capture import Camera, Capture, Description, Writer
-from neuspring.data.synthetic.body import Body
-from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, certify, settle
-from neuspring.data.synthetic.hands import SKIN, Hand, place
-from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
-from neuspring.data.synthetic.scenes import SCENES
-from neuspring.data.synthetic.sensor import measured, quantized
+from neuspring.data.synthetic.bodies import SoftBody
+from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle
+from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized
+from neuspring.data.synthetic.scenes import SCENES, SKIN, Hand, place
 from neuspring.data.synthetic.truth import Truth, truth_path
-from neuspring.data.synthetic.vbd import VertexBlockDescent
 
 FRAME_RATE = 30.0
 DEPTH_UNIT = 0.001
@@ -50,7 +47,7 @@ PLUSH_GRAIN, HAND_GRAIN = (36.0, 1.1), (45.0, 0.6)
 
 
 @dataclass(frozen=True)
-class Size:
+class CaptureSize:
     """Images and meshes."""
 
     width: int
@@ -61,7 +58,11 @@ class Size:
     """Spacing of visible vertices, m."""
 
 
-SIZES = {"tiny": Size(120, 68, 0.02, 0.008), "demo": Size(424, 240, 0.014, 0.004), "full": Size(848, 480, 0.014, 0.003)}
+SIZES = {
+    "tiny": CaptureSize(120, 68, 0.02, 0.008),
+    "demo": CaptureSize(424, 240, 0.014, 0.004),
+    "full": CaptureSize(848, 480, 0.014, 0.003),
+}
 
 
 def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, Truth]:
@@ -111,7 +112,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     return writer.finish(_annotate(truth, cameras[0], writer.capture), truth=f"sha256:{digest_file(path)}"), truth
 
 
-def _truth(body: Body, hands: Sequence[Hand], clip: Clip, held: np.ndarray, deviations: tuple[float, float]) -> Truth:
+def _truth(body: SoftBody, hands: Sequence[Hand], clip: Clip, held: np.ndarray, deviations: tuple[float, float]) -> Truth:
     times = np.arange(len(clip.positions)) / FRAME_RATE
     return Truth(
         nodes=clip.positions,
@@ -143,7 +144,7 @@ def _refuse(name: str, truth: Truth) -> None:
         raise NumericalFailure(f"{name}: twice the substeps move the mean node by {deviations}; not converged")
 
 
-def place_cameras(clip: Clip, hands: Sequence[Hand], size: Size, count: int) -> list[Camera]:
+def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize, count: int) -> list[Camera]:
     """Cameras around the object, as near as the motion of object and hands allows, so that they fill the image."""
     focal = 0.5 * size.width / np.tan(np.radians(FIELD_OF_VIEW / 2))
     k = np.array([[focal, 0.0, (size.width - 1) / 2], [0.0, focal, (size.height - 1) / 2], [0.0, 0.0, 1.0]])
@@ -178,13 +179,13 @@ def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _film(
     writer: Writer,
-    body: Body,
+    body: SoftBody,
     clip: Clip,
     hands: Sequence[Hand],
     cameras: Sequence[Camera],
     row: ScenarioRow,
     settings: Synthetic,
-    size: Size,
+    size: CaptureSize,
 ) -> None:
     frames = len(clip.positions)
     times = np.arange(frames) / FRAME_RATE

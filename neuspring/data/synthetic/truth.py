@@ -1,4 +1,5 @@
-"""The truth of a synthetic capture, which methods may not read: motion of every node, correspondences, materials, contact.
+"""The truth of a synthetic capture, which methods may not read: motion of every node, correspondences, materials, contact; and
+where the material at a place of frame 0 goes, to judge perception by.
 
 It lies beside the capture's folder, and the capture's provenance holds its digest.
 """
@@ -6,15 +7,18 @@ It lies beside the capture's folder, and the capture's provenance holds its dige
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import warp as wp
 
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, Capture
+from neuspring.data.capture import CAPTURE, Camera, Capture
+from neuspring.data.synthetic.kernels import first_hit, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,3 +69,50 @@ def truth_of(capture: Capture) -> Truth:
         rule = f"must be the truth that {capture.folder / CAPTURE} names"
         raise InputError(path, rule, "another capture's", "Delete both and make the capture again.")
     return Truth.load(path)
+
+
+FARTHEST = 8.0
+"""m."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialPoints:
+    """Points of the visible surface, each in a triangle."""
+
+    truth: Truth
+    face: np.ndarray
+    """[Q], -1 where there is none."""
+    weights: np.ndarray
+    """[Q, 3] of the triangle's corners."""
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """[T, Q, 3], m, over time."""
+        corners = self.truth.surface_faces[np.maximum(self.face, 0)]
+        frames = range(len(self.truth.nodes))
+        return np.stack([np.einsum("qk,qkc->qc", self.weights, self.truth.surface(frame)[corners]) for frame in frames])
+
+
+def under_pixels(truth: Truth, camera: Camera, pixels: np.ndarray) -> MaterialPoints:
+    """What lies under the `pixels` (x, y) [Q, 2] in frame 0.
+
+    Hands are not looked at: a pixel that shows a hand gets the object behind it. Choose pixels by the capture's masks.
+    """
+    origin = camera.camera_to_world[:3, 3]
+    rays = camera.lift(np.asarray(pixels, dtype=float), np.ones(len(pixels))) - origin
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return _ask(truth, first_hit, len(rays), wp.vec3(*origin), wp.array(rays, dtype=wp.vec3, device="cpu"))
+
+
+def at_points(truth: Truth, points: np.ndarray) -> MaterialPoints:
+    """The material nearest to `points` [Q, 3], m, in frame 0."""
+    return _ask(truth, nearest, len(points), wp.array(points, dtype=wp.vec3, device="cpu"))
+
+
+def _ask(truth: Truth, kernel: wp.Kernel, count: int, *where: object) -> MaterialPoints:
+    indices: wp.array = wp.array(truth.surface_faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+    mesh = wp.Mesh(wp.array(truth.surface(0), dtype=wp.vec3, device="cpu"), indices)
+    face: wp.array = wp.empty(count, dtype=wp.int32, device="cpu")
+    weights: wp.array = wp.zeros(count, dtype=wp.vec3, device="cpu")
+    wp.launch(kernel, count, [mesh.id, *where, FARTHEST, face, weights], device="cpu")
+    return MaterialPoints(truth, np.asarray(face.numpy()), np.asarray(weights.numpy(), dtype=float))

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from neuspring.data.capture import Camera
-from neuspring.data.synthetic.implicit import sphere, surface
 from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer
-from neuspring.data.synthetic.sensor import measured, quantized
+from neuspring.data.synthetic.meshes import sphere, surface
+from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized
 from tests.support.captures import K
 
 

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from neuspring.data.synthetic.body import Body, Surface
-from neuspring.data.synthetic.fem import Damping, FiniteElements, certify
-from neuspring.data.synthetic.fem_model import GRAVITY, stable_moduli
-from neuspring.data.synthetic.hands import Hand, place
-from neuspring.data.synthetic.tetrahedra import block, boundary, oriented
-from neuspring.data.synthetic.vbd import VertexBlockDescent
+from neuspring.data.synthetic.bodies import SoftBody, Surface
+from neuspring.data.synthetic.fem import GRAVITY, Damping, FiniteElements, VertexBlockDescent, certify, stable_moduli
+from neuspring.data.synthetic.meshes import block, boundary, oriented
+from neuspring.data.synthetic.scenes import Hand, place
 
 RATE = 60.0
 NO_DAMPING = Damping(deformation=0.0, drag=0.0, edges=0.0)
 
 
-def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, friction: float = 0.5, cells=(6, 2, 2)) -> Body:
+def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, friction: float = 0.5, cells=(6, 2, 2)) -> SoftBody:
     """A bar of 0.12 x 0.03 x 0.03 m along x, its lower side at `height`."""
     nodes, tetrahedra = block((-0.06, -0.015, height), (0.06, 0.015, height + 0.03), cells)
     skin = boundary(tetrahedra)
@@ -25,7 +23,7 @@ def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, fricti
         rest=nodes, faces=skin, nodes=np.arange(len(nodes))[:, None], weights=np.ones((len(nodes), 1)), colors=nodes * 0
     )
     count = len(tetrahedra)
-    return Body(
+    return SoftBody(
         nodes=nodes,
         surface=surface,
         radius=0.003,

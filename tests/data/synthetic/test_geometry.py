@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuspring.data.synthetic import goods, implicit, plush, tetrahedra
-from neuspring.data.synthetic.hands import Hand, minimum_jerk, place
+from neuspring.data.synthetic import bodies, meshes
+from neuspring.data.synthetic.scenes import Hand, minimum_jerk, place
 
 
 def closed(faces: np.ndarray) -> bool:
@@ -26,39 +26,37 @@ POINTS = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3))
 
 
 def test_distances_by_hand():
-    assert implicit.sphere((0, 0, 0), 0.1)(np.array([0.3, 0.0, 0.0])) == pytest.approx(0.2)
-    assert implicit.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([0.5, 0.3, 0.0])) == pytest.approx(0.2)
-    assert implicit.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([1.5, 0.0, 0.0])) == pytest.approx(0.4)
-    box = implicit.box((0, 0, 0), (0.1, 0.2, 0.3))
+    assert meshes.sphere((0, 0, 0), 0.1)(np.array([0.3, 0.0, 0.0])) == pytest.approx(0.2)
+    assert meshes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([0.5, 0.3, 0.0])) == pytest.approx(0.2)
+    assert meshes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([1.5, 0.0, 0.0])) == pytest.approx(0.4)
+    box = meshes.box((0, 0, 0), (0.1, 0.2, 0.3))
     assert box(np.array([0.4, 0.0, 0.0])) == pytest.approx(0.3)
     assert box(np.array([0.0, 0.0, 0.0])) == pytest.approx(-0.1)
-    np.testing.assert_allclose(
-        implicit.ellipsoid((0, 0, 0), (0.1,) * 3)(POINTS), implicit.sphere((0, 0, 0), 0.1)(POINTS), atol=1e-12
-    )
+    np.testing.assert_allclose(meshes.ellipsoid((0, 0, 0), (0.1,) * 3)(POINTS), meshes.sphere((0, 0, 0), 0.1)(POINTS), atol=1e-12)
 
 
 def test_a_smooth_union_is_the_union_but_for_the_blend():
-    parts = [implicit.sphere((0, 0, 0), 0.1), implicit.sphere((0.1, 0, 0), 0.05)]
-    union, least = implicit.smooth_union(parts, 0.006)(POINTS), np.min([part(POINTS) for part in parts], axis=0)
+    parts = [meshes.sphere((0, 0, 0), 0.1), meshes.sphere((0.1, 0, 0), 0.05)]
+    union, least = meshes.smooth_union(parts, 0.006)(POINTS), np.min([part(POINTS) for part in parts], axis=0)
     assert (union <= least + 1e-12).all()
     assert (union >= least - 0.006 * np.log(2) - 1e-12).all()
 
 
 def test_the_surface_of_a_sphere_is_closed_outward_and_as_large():
-    vertices, faces = implicit.surface(implicit.sphere((0.02, 0, 0), 0.05), (-0.1,) * 3, (0.1,) * 3, 0.004)
+    vertices, faces = meshes.surface(meshes.sphere((0.02, 0, 0), 0.05), (-0.1,) * 3, (0.1,) * 3, 0.004)
     assert closed(faces)
     np.testing.assert_allclose(np.linalg.norm(vertices - [0.02, 0, 0], axis=1), 0.05, atol=1e-4)
     assert enclosed(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
 def test_a_body_is_filled_to_its_surface():
-    sdf = implicit.ellipsoid((0, 0, 0), (0.06, 0.04, 0.03))
-    nodes, elements = tetrahedra.fill(sdf, (-0.08,) * 3, (0.08,) * 3, 0.01)
-    volumes = tetrahedra.volumes(nodes, elements)
+    sdf = meshes.ellipsoid((0, 0, 0), (0.06, 0.04, 0.03))
+    nodes, elements = meshes.fill(sdf, (-0.08,) * 3, (0.08,) * 3, 0.01)
+    volumes = meshes.volumes(nodes, elements)
     assert (volumes > 0).all()
-    assert tetrahedra.altitudes(nodes, elements).min() >= 0.39 * tetrahedra.LATTICE_ALTITUDE * 0.01
+    assert meshes.altitudes(nodes, elements).min() >= 0.39 * meshes.LATTICE_ALTITUDE * 0.01
     assert volumes.sum() == pytest.approx(4 / 3 * np.pi * 0.06 * 0.04 * 0.03, rel=0.06)
-    skin = tetrahedra.boundary(elements)
+    skin = meshes.boundary(elements)
     assert closed(skin)
     assert enclosed(nodes, skin) == pytest.approx(volumes.sum())
     assert np.abs(sdf(nodes[np.unique(skin)])).mean() < 0.0015
@@ -67,24 +65,24 @@ def test_a_body_is_filled_to_its_surface():
 @pytest.mark.parametrize(
     ("mesh", "volume"),
     [
-        (tetrahedra.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2)), 0.006),
-        (tetrahedra.rod(0.5, np.full(11, 0.01), 8), 0.5 * 8 * 0.5 * 0.01**2 * np.sin(np.pi / 4)),
+        (meshes.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2)), 0.006),
+        (meshes.rod(0.5, np.full(11, 0.01), 8), 0.5 * 8 * 0.5 * 0.01**2 * np.sin(np.pi / 4)),
     ],
 )
 def test_boxes_and_rods_fit_together(mesh, volume):
     nodes, elements = mesh
-    assert (tetrahedra.volumes(nodes, elements) > 0).all()
-    assert tetrahedra.volumes(nodes, elements).sum() == pytest.approx(volume)
-    skin = tetrahedra.boundary(elements)
+    assert (meshes.volumes(nodes, elements) > 0).all()
+    assert meshes.volumes(nodes, elements).sum() == pytest.approx(volume)
+    skin = meshes.boundary(elements)
     assert closed(skin)
     assert enclosed(nodes, skin) == pytest.approx(volume)
 
 
 def test_embedded_points_follow_affine_motion_exactly():
-    nodes, elements = tetrahedra.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2))
+    nodes, elements = meshes.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2))
     rng = np.random.default_rng(1)
     points = rng.uniform((-0.02,) * 3, (0.32, 0.22, 0.12), (50, 3))
-    element, weights = tetrahedra.embed(points, nodes, elements)
+    element, weights = meshes.embed(points, nodes, elements)
     matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     moved = np.einsum("vkc,vk->vc", (nodes @ matrix.T + shift)[elements[element]], weights)
     np.testing.assert_allclose(moved, points @ matrix.T + shift, atol=1e-12)
@@ -92,18 +90,18 @@ def test_embedded_points_follow_affine_motion_exactly():
     assert (weights[inside] > -1e-12).all()
 
 
-@pytest.mark.parametrize("make", [plush.sloth, plush.zebra, plush.dinosaur])
+@pytest.mark.parametrize("make", [bodies.sloth, bodies.zebra, bodies.dinosaur])
 def test_animals_are_whole_and_uneven(make):
     body = make(0.02, 0.01)
-    assert not tetrahedra.pieces(body.tetrahedra).any()
-    assert body.nodes[:, 2].min() == pytest.approx(plush.CLEARANCE)
+    assert not meshes.pieces(body.tetrahedra).any()
+    assert body.nodes[:, 2].min() == pytest.approx(bodies.CLEARANCE)
     assert len(np.unique(body.youngs_modulus)) >= 3
     np.testing.assert_allclose(body.surface.follow(body.nodes), body.surface.rest, atol=1e-12)
-    mass = (body.density * tetrahedra.volumes(body.nodes, body.tetrahedra)).sum()
+    mass = (body.density * meshes.volumes(body.nodes, body.tetrahedra)).sum()
     assert 0.05 < mass < 0.3
 
 
-@pytest.mark.parametrize("body", [goods.cloth("scarf", 0.02, 0.01), goods.rope("twine", 0.02, 0.01), goods.package(0.03, 0.01)])
+@pytest.mark.parametrize("body", [bodies.cloth("scarf", 0.02, 0.01), bodies.rope("twine", 0.02, 0.01), bodies.package(0.03, 0.01)])
 def test_goods_show_where_their_material_is(body):
     np.testing.assert_allclose(body.surface.follow(body.nodes), body.surface.rest, atol=1e-7)
     material = body.membrane if body.is_sheet else body.youngs_modulus

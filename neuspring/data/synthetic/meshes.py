@@ -1,18 +1,98 @@
-"""Tetrahedral meshes of implicit bodies (body-centered lattice, boundary snapped to the surface), boxes and rods, in NumPy.
+"""Meshes of bodies and hands: triangle surfaces of signed distance functions, tetrahedra of implicit bodies (body-centered lattice,
+boundary snapped to the surface), boxes and rods, in NumPy.
 
-Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
+Distances [...] of points [..., 3], m, are negative inside. The ellipsoid and the smooth union are approximate distances with exact
+signs away from the blend, which is all that meshing needs. Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import warp as wp
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from warp.geometry import IsoSurfaceMarchingCubes
 
-from neuspring.data.synthetic.implicit import Sdf, gradient
+Sdf = Callable[[np.ndarray], np.ndarray]
+
+
+def sphere(center: Sequence[float], radius: float) -> Sdf:
+    """|p - c| - r."""
+    return lambda p: np.linalg.norm(p - np.asarray(center), axis=-1) - radius
+
+
+def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Sdf:
+    """k0 (k0 - 1) / k1 with k0 = |q / r|, k1 = |q / r^2|, q = p - c: first-order exact at the surface."""
+    middle, half = np.asarray(center, float), np.asarray(radii, float)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        q = (p - middle) / half
+        level = np.linalg.norm(q, axis=-1)
+        return np.asarray(level * (level - 1.0) / np.maximum(np.linalg.norm(q / half, axis=-1), 1e-9))
+
+    return distance
+
+
+def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Sdf:
+    """Distance to the segment from start to end, minus r."""
+    a, b = np.asarray(start, float), np.asarray(end, float)
+    along = b - a
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        t = np.clip((p - a) @ along / (along @ along), 0.0, 1.0)
+        return np.asarray(np.linalg.norm(p - a - t[..., None] * along, axis=-1) - radius)
+
+    return distance
+
+
+def box(center: Sequence[float], half: Sequence[float]) -> Sdf:
+    """An axis-aligned box of half extents `half`."""
+    middle, extent = np.asarray(center, float), np.asarray(half, float)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        q = np.abs(p - middle) - extent
+        return np.asarray(np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(axis=-1), 0.0))
+
+    return distance
+
+
+def smooth_union(parts: Sequence[Sdf] | Mapping[str, Sdf], blend: float) -> Sdf:
+    """-k log sum exp(-d_i / k): the union, rounded over about the length k = `blend` where parts meet."""
+    members = list(parts.values()) if isinstance(parts, Mapping) else list(parts)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        each = np.stack([part(p) for part in members])
+        least = each.min(axis=0)
+        return np.asarray(least - blend * np.log(np.exp(-(each - least) / blend).sum(axis=0)))
+
+    return distance
+
+
+def gradient(sdf: Sdf, points: np.ndarray, step: float = 1e-4) -> np.ndarray:
+    """Unit outward direction [..., 3] by central differences."""
+    differences = [sdf(points + step * axis) - sdf(points - step * axis) for axis in np.eye(3)]
+    slope = np.stack(differences, axis=-1)
+    return np.asarray(slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12))
+
+
+def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Marching cubes of sdf = 0 within the box: vertices [V, 3], m, and faces [F, 3], outward."""
+    first = np.asarray(low, float)
+    counts = np.ceil((np.asarray(high, float) - first) / spacing).astype(int) + 1
+    grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
+    values: wp.array = wp.array(sdf((first + spacing * grid).reshape(-1, 3)).reshape(counts), dtype=wp.float32, device="cpu")
+    # The extractor rejects a grid's bounds in two forms: lattice coordinates are the plain one, scaled here.
+    points, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
+    vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centers = corners.mean(axis=1)
+    outward = (gradient(sdf, centers) * normals).sum(axis=-1).mean() > 0
+    return vertices, faces if outward else faces[:, ::-1].copy()
+
 
 LATTICE_ALTITUDE = np.sqrt(0.5)
 """Altitude of a tetrahedron of the body-centered lattice, in lattice constants."""
