@@ -1,5 +1,5 @@
 """The wrapper of every job of the workflow. All other modules serve it.
 
-`wrapper`: one job, from its GPU lease to its record. `command`: run its command, follow its output. `gpus`: leases of GPUs.
-`faults`: why a command failed, and whether trying again can help. `watch`: time, memory and GPU use of a running command.
+`wrapper`: one job, from its GPU lease to its record. `command`: run its command, follow its output, sample its use of the machine.
+`gpus`: leases of GPUs. `faults`: why a command failed, and whether trying again can help. `warm`: a process that jobs start from.
 """

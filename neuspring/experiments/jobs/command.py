@@ -1,26 +1,32 @@
-"""Run the command of a job: its output goes to the log, signals are passed on, its use of the machine is measured."""
+"""Run the command of a job: its output goes to the log, signals are passed on, its use of the machine is sampled from outside."""
 
 from __future__ import annotations
 
 import collections
 import contextlib
 import os
+import resource
 import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import psutil
 
 from neuspring.core.job_records import Attempt
-from neuspring.experiments.jobs import faults, warm
-from neuspring.experiments.jobs.watch import Watch
+from neuspring.experiments.jobs import faults, gpus, warm
 
 TAIL = 200
 """Lines of output that are searched for a cause of failure."""
+INTERVAL, MOST = 1.0, 120
+"""s between the first samples; the number of rows at which every second one is dropped and the interval doubles."""
+MIB = 2**20
 
 
 def execute(
@@ -42,21 +48,28 @@ def execute(
         try:
             process = _start(command, locks, environment)
         except OSError as error:
-            status, fault = faults.not_started(error)
+            status, refused = faults.not_started(error)
             file.write(f"{error}\n")
-            say(f"{fault.cause}: {error}. {fault.remedy}".strip())
-            return replace(begun, outcome=fault.outcome, cause=fault.cause, message=str(error), exit=status), fault
+            say(f"{refused.cause}: {error}. {refused.remedy}".strip())
+            return replace(begun, outcome=refused.outcome, cause=refused.cause, message=str(error), exit=status), refused
+        tail: collections.deque[str] = collections.deque(maxlen=TAIL)
+        assert process.stdout is not None
         with Watch(process.pid, begun.devices) as watch:
-            status, tail = _follow(process, file, quiet=quiet)
+            for line in process.stdout:
+                tail.append(line)
+                file.write(line)
+                if not quiet:
+                    _print(line)
+            status = process.wait()
     ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
-    cause = faults.diagnose(status, tail)
-    if cause is None:
+    fault = faults.diagnose(status, list(tail))
+    if fault is None:
         return ended, None
     if quiet:
         _print("".join(tail))
-    again = " (may be tried again)" if cause.outcome == "transient" else ""
-    say(f"{cause.cause}{again}. {cause.remedy}".strip())
-    return replace(ended, outcome=cause.outcome, cause=cause.cause, message=faults.last_words(tail)), cause
+    again = " (may be tried again)" if fault.outcome == "transient" else ""
+    say(f"{fault.cause}{again}. {fault.remedy}".strip())
+    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(tail))), fault
 
 
 def say(text: str) -> None:
@@ -83,18 +96,6 @@ def _start(
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda received, frame: process.send_signal(received))
     return process
-
-
-def _follow(process: subprocess.Popen[str] | warm.WarmProcess, log: _Log, *, quiet: bool) -> tuple[int, list[str]]:
-    """(exit status, last lines of the output) of a command, once it has ended."""
-    tail: collections.deque[str] = collections.deque(maxlen=TAIL)
-    assert process.stdout is not None
-    for line in process.stdout:
-        tail.append(line)
-        log.write(line)
-        if not quiet:
-            _print(line)
-    return process.wait(), list(tail)
 
 
 def _print(text: str) -> None:
@@ -129,3 +130,96 @@ class _Log:
 
     def close(self) -> None:
         self._file.close()
+
+
+class Watch:
+    """Samples a process tree and GPUs in a thread, for the length of a `with` block."""
+
+    def __init__(self, pid: int, devices: Sequence[str]) -> None:
+        self._pid, self._devices = pid, tuple(devices)
+        self._rows: list[list[float | None]] = []
+        self._peak = 0.0
+        self._cpu: dict[int, float] = {}
+        self._names: list[str] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def facts(self) -> dict[str, Any]:
+        """The fields of an `Attempt` that describe the use of the machine. Call this after the block."""
+        # Samples miss short peaks; the kernel remembers the peak of the largest ended process.
+        largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 if sys.platform != "darwin" else MIB)
+        shares = [row[3] for row in self._rows if row[3] is not None]
+        memory = [row[4] for row in self._rows if row[4] is not None]
+        return {
+            "peak_memory_mb": round(max(self._peak, largest), 1),
+            "cpu_seconds": round(sum(self._cpu.values()), 2),
+            "samples": self._rows,
+            "device_names": self._names,
+            "peak_gpu_memory_mb": max(memory) if memory else None,
+            "gpu_utilization": round(sum(shares) / len(shares), 1) if shares else None,
+        }
+
+    def _sample(self) -> None:
+        start = last = time.monotonic()
+        interval, before = INTERVAL, 0.0
+        with gpus.nvml() if self._devices else contextlib.nullcontext() as library:
+            handles = self._handles(library)
+            while True:
+                # A short first wait, so that jobs of a second are seen too.
+                ended = self._stop.wait(interval if self._rows else 0.1)
+                moment = time.monotonic()
+                memory, cpu = self._tree()
+                self._peak = max(self._peak, memory)
+                share = 100 * (cpu - before) / max(moment - last, 1e-3)
+                if not ended or not self._rows:
+                    gpu = _gpu(library, handles)
+                    self._rows.append([round(moment - start, 2), round(max(share, 0.0), 1), round(memory, 1), *gpu])
+                last, before = moment, cpu
+                if ended:
+                    return
+                if len(self._rows) >= MOST:
+                    del self._rows[::2]
+                    interval *= 2
+
+    def _handles(self, library: Any) -> list[Any]:
+        if library is None:
+            return []
+        handles = []
+        for device in self._devices:
+            with contextlib.suppress(Exception):  # a MIG slice: NVML does not measure it by this name
+                handle = gpus.handle_of(library, device)
+                self._names.append(str(library.nvmlDeviceGetName(handle)))
+                handles.append(handle)
+        return handles
+
+    def _tree(self) -> tuple[float, float]:
+        """(resident MiB, CPU seconds) of the process and its children. The seconds include ended children."""
+        memory = 0.0
+        with contextlib.suppress(psutil.Error):
+            root = psutil.Process(self._pid)
+            for process in (root, *root.children(recursive=True)):
+                with contextlib.suppress(psutil.Error):
+                    times = process.cpu_times()
+                    self._cpu[process.pid] = times.user + times.system
+                    memory += process.memory_info().rss / MIB
+        return memory, sum(self._cpu.values())
+
+
+def _gpu(library: Any, handles: Sequence[Any]) -> tuple[float | None, float | None]:
+    """(mean utilization %, memory in use MiB) of the leased devices."""
+    if not handles:
+        return None, None
+    try:
+        rates = [library.nvmlDeviceGetUtilizationRates(handle).gpu for handle in handles]
+        memory = [library.nvmlDeviceGetMemoryInfo(handle).used / MIB for handle in handles]
+    except Exception:  # a device may be lost while it is watched; the command will say so
+        return None, None
+    return sum(rates) / len(rates), round(sum(memory), 1)

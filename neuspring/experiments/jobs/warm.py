@@ -1,9 +1,12 @@
-"""A process that has already imported the heavy libraries. It forks one child per job, which then starts in tenths of a second.
+"""A process that has already imported the heavy libraries. It forks a child per job, which then starts in tenths of a second.
 
 `python -m neuspring.experiments.jobs.warm SOCKET` runs it, for as long as its standard input is open: the workflow holds the other
 end, so it ends with the workflow. Jobs of one run use it; where it is not there (yet), the wrapper starts a process of its own. The
 results are the same: a child has its own environment, folder and output. Before the fork no library has touched a device, or
 started a thread that does not prepare for a fork. Linux alone: elsewhere a fork after these imports is not safe.
+
+`multiprocessing`'s fork server does not fit: it serves the process that started it, and a job's wrapper is another one, which needs
+the job's output, its exit status, and its end when the wrapper is killed.
 """
 
 from __future__ import annotations
@@ -15,9 +18,10 @@ import importlib
 import json
 import os
 import runpy
-import selectors
+import select
 import signal
 import socket
+import socketserver
 import subprocess
 import sys
 import threading
@@ -35,10 +39,8 @@ LIBRARIES = ("numpy", "scipy.spatial", "pandas", "torch", "warp", "cv2", "trimes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SAFE_THREADS = {"jemalloc_bg_thd"}
 """Threads of libraries that prepare for a fork themselves."""
-MESSAGE = 1 << 20
-"""Most bytes of a request."""
-FILES = 64
-"""Most open files that a job inherits."""
+MOST_FILES = 64
+"""Open files that a job inherits, at most."""
 
 
 def die_with_parent() -> None:
@@ -54,23 +56,18 @@ def die_with_parent() -> None:
 class WarmProcess:
     """A job in a child of the warm process; has what the wrapper uses of `subprocess.Popen`."""
 
-    def __init__(self, connection: socket.socket, pid: int, stdout: IO[str]) -> None:
-        self.pid, self.stdout = pid, stdout
-        self._connection = connection
-        self._status: int | None = None
+    def __init__(self, answers: IO[str], pid: int, stdout: IO[str]) -> None:
+        self.pid, self.stdout, self._answers = pid, stdout, answers
 
     def wait(self) -> int:
         """The exit status; -N if signal N ended the job."""
-        answer = self._connection.makefile("r").readline()
-        self._connection.close()
-        # Without an answer the warm process was killed, and its children with it.
-        status = int(json.loads(answer)["status"]) if answer else -signal.SIGKILL
-        self._status = status
-        return status
+        with self._answers:
+            # Without an answer the warm process was killed, and its children with it.
+            return int(self._answers.readline() or -signal.SIGKILL)
 
     def send_signal(self, number: int) -> None:
         """Pass a signal on."""
-        if self._status is None:
+        if not self._answers.closed:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
@@ -85,27 +82,26 @@ def start(command: Sequence[str], held: Sequence[IO[str]], environment: Mapping[
         return None
     if environment.get(VISIBLE):
         return None  # CUDA in a forked process was never tried, and a job on a GPU takes longer than its start
-    connection = socket.socket(socket.AF_UNIX)
-    try:
-        connection.connect(path)
-    except OSError:
-        connection.close()
-        return None
-    reading, writing = os.pipe()
     request = {"arguments": list(command[len(COMMAND) :]), "environment": dict(environment), "folder": os.getcwd()}
-    try:
-        files = [writing, *(file.fileno() for file in held)]
-        socket.send_fds(connection, [json.dumps(request).encode() + b"\n"], files)
-        answer = connection.recv(64)
-    except OSError:
-        answer = b""
-    os.close(writing)
-    if not answer:
-        os.close(reading)
-        connection.close()
-        return None
+    reading, writing = os.pipe()
     stdout = os.fdopen(reading, encoding="utf-8", errors="replace", buffering=1)
-    return WarmProcess(connection, json.loads(answer)["pid"], stdout)
+    answers = None
+    try:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(path)
+            # The length goes with the files: one message carries them, however long the request is.
+            data = json.dumps(request).encode()
+            socket.send_fds(connection, [len(data).to_bytes(4)], [writing, *(file.fileno() for file in held)])
+            connection.sendall(data)
+            answers = connection.makefile("r")
+            return WarmProcess(answers, int(answers.readline()), stdout)
+    except (OSError, ValueError):
+        stdout.close()
+        if answers:
+            answers.close()
+        return None
+    finally:
+        os.close(writing)
 
 
 # --- the workflow's side
@@ -118,8 +114,14 @@ def serve_while_running(path: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
+class _Server(socketserver.ForkingMixIn, socketserver.UnixStreamServer):
+    """Forks a child per connection; closing it waits for the children."""
+
+    max_children, request_queue_size = 100_000, 64
+
+
 def main(path: str) -> None:
-    """Import the libraries, then fork a child per request until standard input is closed and no job is left."""
+    """Import the libraries, then serve jobs until standard input is closed and no job is left."""
     if sys.platform != "linux":
         return
     # Here, because every job imports this module for its own side.
@@ -131,137 +133,73 @@ def main(path: str) -> None:
     for library in LIBRARIES:
         with contextlib.suppress(ImportError):
             importlib.import_module(library)
-    if threading.active_count() > 1 or set(_native_threads()) - SAFE_THREADS:
+    # Threads of this process beside the first.
+    tasks = [task.read_text().strip() for task in Path("/proc/self/task").glob("*/comm") if task.parent.name != str(os.getpid())]
+    if threading.active_count() > 1 or set(tasks) - SAFE_THREADS:
         return  # a fork of several threads is not safe: every job starts a process of its own
     gc.collect()
     gc.freeze()
-    wake, wakened = socket.socketpair()
-    for end in (wake, wakened):
-        end.setblocking(False)
-    signal.set_wakeup_fd(wakened.fileno())
-    signal.signal(signal.SIGCHLD, lambda number, frame: None)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C also reaches the jobs' wrappers, which end them
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(path)
-    listener.listen(64)
-    _Server(listener, wake).run()
+    with _Server(path, _Job) as server:
+        closed = sys.stdin.fileno()
+        while closed not in select.select([server.fileno(), closed], [], [])[0]:
+            server.handle_request()
+            server.service_actions()  # takes note of children that have ended
 
 
-def _native_threads() -> list[str]:
-    """Names of the threads of this process beside the first, where the system tells (Linux)."""
-    own = str(os.getpid())
-    return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm") if path.parent.name != own]
+class _Job(socketserver.BaseRequestHandler):
+    """In a child of the warm process: a job, watched until it has ended or its wrapper has gone."""
 
+    request: socket.socket
+    server: _Server
 
-class _Server:
-    """Children by process id and by connection."""
-
-    def __init__(self, listener: socket.socket, wake: socket.socket) -> None:
-        self._listener, self._wake = listener, wake
-        self._connections: dict[int, socket.socket] = {}
-        self._selector = selectors.DefaultSelector()
-        self._stdin = sys.stdin.fileno()
-        for file in (listener, wake, self._stdin):
-            self._selector.register(file, selectors.EVENT_READ)
-
-    def run(self) -> None:
-        open_for_jobs = True
-        while open_for_jobs or self._connections:
-            for key, _ in self._selector.select():
-                if key.fileobj is self._listener:
-                    self._accept()
-                elif key.fileobj is self._wake:
-                    with contextlib.suppress(BlockingIOError):
-                        self._wake.recv(4096)
-                    self._reap()
-                elif key.fileobj == self._stdin:
-                    open_for_jobs = bool(os.read(self._stdin, 1))
-                    if not open_for_jobs:
-                        self._selector.unregister(self._stdin)
-                        self._selector.unregister(self._listener)
-                else:
-                    self._wrapper_gone(int(key.data))
-
-    def _accept(self) -> None:
-        connection, _ = self._listener.accept()
-        try:
-            data, files, _, _ = socket.recv_fds(connection, MESSAGE, FILES)
-            while not data.endswith(b"\n"):
-                part = connection.recv(MESSAGE)
-                if not part:
-                    raise ConnectionError("the request ended early")
-                data += part
-            request = json.loads(data)
-        except (OSError, ValueError):
-            connection.close()
-            return
+    def handle(self) -> None:
+        die_with_parent()
+        length, files, *_ = socket.recv_fds(self.request, 4, MOST_FILES)
+        with self.request.makefile("rb") as stream:
+            request = json.loads(stream.read(int.from_bytes(length)))
         pid = os.fork()
         if pid == 0:
-            self._run_child(request, connection, files)
+            self._run(request, *files)
         for file in files:
             os.close(file)
-        self._connections[pid] = connection
-        self._selector.register(connection, selectors.EVENT_READ, pid)
-        with contextlib.suppress(OSError):
-            connection.sendall(json.dumps({"pid": pid}).encode() + b"\n")
-
-    def _wrapper_gone(self, pid: int) -> None:
-        """The wrapper of a job has gone: its job ends too."""
-        if pid not in self._connections:
-            return  # the job ended in the same moment
-        self._selector.unregister(self._connections[pid])
-        with contextlib.suppress(ProcessLookupError):
+        self.request.sendall(f"{pid}\n".encode())
+        # The wrapper says nothing more: its connection is readable when it has gone, and then its job ends too.
+        select.select([self.request.fileno(), os.pidfd_open(pid)], [], [])
+        if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
             os.kill(pid, signal.SIGKILL)
+        status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        with contextlib.suppress(OSError):
+            self.request.sendall(f"{status}\n".encode())
 
-    def _reap(self) -> None:
-        with contextlib.suppress(ChildProcessError):
-            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-                pid, status = ended
-                connection = self._connections.pop(pid)
-                with contextlib.suppress(KeyError):
-                    self._selector.unregister(connection)
-                with contextlib.suppress(OSError):
-                    connection.sendall(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode() + b"\n")
-                connection.close()
-
-    def _run_child(self, request: Mapping[str, Any], connection: socket.socket, files: Sequence[int]) -> None:
-        """In the child: run the command and end."""
+    def _run(self, request: Mapping[str, Any], output: int, *held: int) -> None:
+        """In the job's own process: run the command and end. The files `held` stay open."""
         status = 1
         try:
             die_with_parent()
-            signal.set_wakeup_fd(-1)
-            for number in (signal.SIGCHLD, signal.SIGINT):
-                signal.signal(number, signal.SIG_DFL if number == signal.SIGCHLD else signal.default_int_handler)
-            self._selector.close()
-            for other in (self._listener, self._wake, connection, *self._connections.values()):
-                other.close()
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            self.request.close()
+            self.server.socket.close()
             nothing = os.open(os.devnull, os.O_RDONLY)
-            for source, target in ((nothing, 0), (files[0], 1), (files[0], 2)):
+            for source, target in ((nothing, 0), (output, 1), (output, 2)):
                 os.dup2(source, target)
             os.close(nothing)
-            os.close(files[0])
+            os.close(output)
             os.chdir(request["folder"])
             os.environ.clear()
             os.environ.update(request["environment"])
-            status = _run(request["arguments"])
+            sys.argv = ["neuspring", *request["arguments"]]
+            runpy.run_module("neuspring", run_name="__main__")
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        except BaseException:
+            traceback.print_exc()
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
             # Skip the exit handlers that were inherited from the parent.
             os._exit(status)
-
-
-def _run(arguments: Sequence[str]) -> int:
-    """`python -m neuspring`; its exit status, as the interpreter would have it."""
-    sys.argv = ["neuspring", *arguments]
-    try:
-        runpy.run_module("neuspring", run_name="__main__")
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:
-        traceback.print_exc()
-        return 1
-    return 0
 
 
 if __name__ == "__main__":

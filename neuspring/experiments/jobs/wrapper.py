@@ -14,7 +14,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
@@ -47,41 +47,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not command:
         parser.error("a command is required after --")
     try:
-        results = _results(a.log)
-        job = Job(
-            command=tuple(command),
-            record=JobRecord.of_log(results, a.log, a.scenario),
-            results=results,
-            log=a.log,
-            gpus=a.gpus,
-            quiet=a.quiet,
-        )
-        return run(job)
+        results = next((folder.parent for folder in a.log.parents if folder.name == LOGS), None)
+        if results is None:
+            raise InputError(a.log, f"the log of a job must lie in a folder {LOGS} of the results")
+        record = JobRecord.of_log(results, a.log, a.scenario)
+        # A job runs once at a time: wrapper and command may outlive Snakemake, and meet those of the next run at the same files.
+        with alone(record.path(results), say) as lock:
+            return _run(command, record, results, lock, gpu_count=a.gpus, quiet=a.quiet)
     except (InputError, TimeoutError) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
         return faults.BAD_INPUT
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """A command of the workflow and where its record and log go."""
-
-    command: tuple[str, ...]
-    record: JobRecord
-    """Without attempts."""
-    results: Path
-    log: Path
-    gpus: int = 0
-    quiet: bool = False
-
-
-def run(job: Job) -> int:
-    """Run a job; returns its exit status (1 if a signal ended it). Raises InputError if it needs more GPUs than there are.
-
-    A job runs once at a time: a wrapper and its command may outlive Snakemake, and meet those of the next run at the same files.
-    """
-    with alone(job.record.path(job.results), say) as lock:
-        return _run(job, lock)
 
 
 @contextlib.contextmanager
@@ -127,30 +102,49 @@ def _locked(path: Path, waiting: Callable[[str], object]) -> IO[str]:
     return file
 
 
-def _run(job: Job, lock: IO[str] | None) -> int:
-    # Read under the lock: an earlier run may just have written them.
-    record = replace(job.record, attempts=_earlier(job.record.path(job.results)))
-    this = this_run(job.results)
-    if this and record.attempts and record.last.outcome == "permanent" and record.last.run == this:
+def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str] | None, *, gpu_count: int, quiet: bool) -> int:
+    """Run a job whose record has no attempts yet; returns its exit status (1 if a signal ended it).
+
+    Raises InputError if it needs more GPUs than there are.
+    """
+    earlier: list[Attempt] = []
+    with contextlib.suppress(InputError):  # none yet, or a record that a full disk cut short
+        # Read under the lock: an earlier run may just have written them.
+        earlier = JobRecord.load(record.path(results)).attempts
+    this = this_run(results)
+    if this and earlier and earlier[-1].outcome == "permanent" and earlier[-1].run == this:
         # Snakemake cannot tell causes apart; its second try ends here.
-        print(f"not tried again ({record.last.cause}): {record.last.message}", file=sys.stderr)
-        return record.last.exit or 1
+        print(f"not tried again ({earlier[-1].cause}): {earlier[-1].message}", file=sys.stderr)
+        return earlier[-1].exit or 1
+
+    def save(attempt: Attempt) -> None:
+        try:
+            replace(record, attempts=[*earlier, attempt]).save(results)
+        except (OSError, InputError) as error:
+            print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
+
     try:
-        lease = _lease(job, job.results / FOLDER / GPU_NOTES if this else None)
+        lease = _lease(gpu_count, record.scenario, results / FOLDER / GPU_NOTES if this else None)
     except (InputError, TimeoutError) as error:
-        refused = Attempt(started=_now(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT)
-        _save(record, refused, job.results)
+        save(Attempt(started=_now(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT))
         raise
     try:
-        devices, waited = (list(lease.devices), round(lease.waited, 3)) if lease else (_given(job), 0.0)
+        devices = list(lease.devices) if lease else list(gpus.visible_devices()) if gpu_count else []
+        waited = round(lease.waited, 3) if lease else 0.0
         begun = Attempt(started=_now(), run=this, host=platform.node(), devices=devices, waited=waited)
-        _save(record, begun, job.results)
+        save(begun)
+        # A job sees its own GPUs, and none if it asked for none.
+        own = lease.environment() if lease else {} if gpu_count else {gpus.VISIBLE: ""}
         # The command holds lock and slots too: they are free when it has ended, even if this process dies first.
         locks = [*([lock] if lock else []), *(lease.files if lease else ())]
-        ended, fault = execute(job.command, job.log, begun, environment=_environment(job, lease), locks=locks, quiet=job.quiet)
-        _save(record, ended, job.results)
-        if lease:
-            _judge(lease, fault)
+        log = results / record.log
+        ended, fault = execute(command, log, begun, environment=os.environ | own, locks=locks, quiet=quiet)
+        save(ended)
+        if lease and (fault is None or fault.device):
+            try:
+                lease.note(fault.device if fault else "")
+            except OSError as error:
+                say(f"warning: what became of GPU {', '.join(lease.devices)} could not be noted: {error}")
     finally:
         if lease:
             lease.release()
@@ -158,62 +152,19 @@ def _run(job: Job, lock: IO[str] | None) -> int:
     return ended.exit if ended.exit >= 0 else 1
 
 
-def _results(log: Path) -> Path:
-    """The results folder of a log."""
-    for parent in log.parents:
-        if parent.name == LOGS:
-            return parent.parent
-    raise InputError(log, f"the log of a job must lie in a folder {LOGS} of the results")
-
-
-def _earlier(path: Path) -> list[Attempt]:
-    try:
-        return JobRecord.load(path).attempts
-    except InputError:
-        return []  # none yet, or a record that a full disk cut short
-
-
-def _save(record: JobRecord, attempt: Attempt, results: Path) -> None:
-    """Write the earlier attempts and this one. A record that cannot be written must not fail its job."""
-    try:
-        replace(record, attempts=[*record.attempts, attempt]).save(results)
-    except (OSError, InputError) as error:
-        print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
-
-
-def _lease(job: Job, notes: Path | None) -> gpus.Lease | None:
+def _lease(count: int, scenario: str, notes: Path | None) -> gpus.Lease | None:
     """GPUs of this machine; None where none is needed or a cluster has chosen them."""
     pool = os.environ.get(POOL, "")
-    if not job.gpus or pool == GIVEN:
+    if not count or pool == GIVEN:
         return None
     names = [name for name in pool.split(",") if name] or gpus.visible_devices()
     share = int(os.environ.get(SHARE, "1"))
-    return gpus.acquire(job.gpus, names, jobs_per_gpu=share, affinity=job.record.scenario, notes=notes, say=say)
-
-
-def _judge(lease: gpus.Lease, fault: faults.Fault | None) -> None:
-    """Note what the end of a job says about its GPUs, for the jobs after it."""
-    try:
-        if fault is None or fault.device:
-            lease.note(fault.device if fault else "")
-    except OSError as error:
-        say(f"warning: what became of GPU {', '.join(lease.devices)} could not be noted: {error}")
+    return gpus.acquire(count, names, jobs_per_gpu=share, affinity=scenario, notes=notes, say=say)
 
 
 def _now() -> str:
     """UTC, with milliseconds: leases follow one another closely."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def _given(job: Job) -> list[str]:
-    return list(gpus.visible_devices()) if job.gpus else []
-
-
-def _environment(job: Job, lease: gpus.Lease | None) -> dict[str, str]:
-    """The command's environment. It shows a job its own GPUs, and none to a job that asked for none."""
-    if lease:
-        return os.environ | lease.environment()
-    return dict(os.environ) if job.gpus else os.environ | {gpus.VISIBLE: ""}
 
 
 if __name__ == "__main__":
