@@ -24,11 +24,10 @@ def annotate(a: Namespace) -> None:
     """`neuspring annotate`: serves until Ctrl-C."""
     from neuspring.data.capture import Capture
     from neuspring.perception.annotate.guard import is_loopback
-    from neuspring.perception.annotate.method import FromMarks
     from neuspring.perception.annotate.server import Server
 
     settings = shared.read_settings(a.settings).perception.segment.marks
-    server = Server(Capture.load(a.capture), FromMarks(settings), a.host, a.port)
+    server = Server(Capture.load(a.capture), settings, a.host, a.port)
     print(f"Annotate {a.capture} at {server.url} (stop with Ctrl-C)", flush=True)
     if not is_loopback(a.host):
         print("Anybody who can read this network's traffic can read the address; an SSH tunnel to 127.0.0.1 is safer.", flush=True)

@@ -55,16 +55,13 @@ def mask(a: Namespace) -> int:
     for name in wanted:
         source = store.source_digest(capture, name, marks.of(name), a.backend, settings)
         if made.holds(capture, name, source) and not a.again:
-            picture = sheet.sheet_of(capture, name)
+            picture, doubts = sheet.sheet_of(capture, name), made.cameras[name].doubt
             print(f"camera {name}: marks, images and settings are unchanged; its masks are kept; look at {picture}")
         else:
             carried = _carry(capture, name, marks.of(name), a.backend, segmentation, a.device)
-            store.save_masks(capture, name, carried.labels)
-            doubt = tuple(round(float(value), 4) for value in carried.doubt)
-            made = made.save(capture, name, store.MadeCamera(source=source, backend=a.backend, doubt=doubt))
-            picture = sheet.save_sheet(capture, name, carried)
+            doubts = store.save_carried(capture, name, carried, source, a.backend).doubt
+            picture = sheet.sheet_of(capture, name)
             print(f"camera {name}: masks are in {a.capture / 'mask' / name}; look at {picture}")
-        doubts = made.cameras[name].doubt
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]
         print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
     without = [name for name in capture.cameras if not store.has_masks(capture, [name])]

@@ -18,8 +18,7 @@ from neuspring.data.intake.views import pairs
 from neuspring.data.plausible.alone import on_table
 from neuspring.perception import segment_opencv
 from neuspring.perception.annotate.annotations import Annotations, Click, Point
-from neuspring.perception.annotate.pointing import Pointing
-from neuspring.perception.annotate.tracks import tracks_of
+from neuspring.perception.annotate.tracks import Pointing, tracks_of
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.look import look_at_masks
 from neuspring.perception.marks.store import film_of, save_masks

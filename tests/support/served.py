@@ -14,9 +14,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.guard import TOKEN_HEADER
-from neuspring.perception.annotate.masks import Method
-from neuspring.perception.annotate.server import Server
+from neuspring.perception.annotate.server import TOKEN_HEADER, Server
 
 TOKEN = "the-token"
 
@@ -25,7 +23,7 @@ class Client:
     """Requests to a server."""
 
     def __init__(self, server: Server) -> None:
-        self.server, self.port = server, server.server_address[1]
+        self.server, self.port = server, server.port
 
     def raw(self, method: str, path: str, body: bytes | None = None, **headers: str | None) -> tuple[int, dict[str, str], bytes]:
         """Status, headers and body; the token is sent, and underscores in names of headers are dashes; None leaves one out."""
@@ -77,10 +75,10 @@ def decoded(content: bytes) -> np.ndarray:
 
 
 @contextmanager
-def served(capture: Capture, method: Method) -> Iterator[Client]:
+def served(capture: Capture) -> Iterator[Client]:
     """A server for a capture, while the block runs."""
-    server = Server(capture, method, token=TOKEN)
-    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    server = Server(capture, token=TOKEN)
+    thread = Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
         yield Client(server)

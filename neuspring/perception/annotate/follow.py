@@ -53,7 +53,7 @@ class Trail:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class OneWay:
     """What following from one click found in other frames, by frame."""
 
     places: dict[int, np.ndarray]
@@ -86,7 +86,7 @@ class GrayImages:
         return image
 
 
-def follow(images: GrayImages, camera: str, clicks: Sequence[Click], *, run: Callable[..., Run] | None = None) -> Trail:
+def follow(images: GrayImages, camera: str, clicks: Sequence[Click], *, run: Callable[..., OneWay] | None = None) -> Trail:
     """The trail of a point that was clicked in some frames of a camera.
 
     `clicks` are sorted by frame. `run` stands in for `follow_from`, with results that it kept from before.
@@ -110,13 +110,13 @@ def follow(images: GrayImages, camera: str, clicks: Sequence[Click], *, run: Cal
     return trail
 
 
-def follow_from(images: GrayImages, camera: str, click: Click, stop: int, aim: Click | None) -> Run:
+def follow_from(images: GrayImages, camera: str, click: Click, stop: int, aim: Click | None) -> OneWay:
     """Follow a click to the frame before `stop`, in either direction; `aim` is the click there, if there is one."""
     assert click.place is not None
     start = np.array(click.place)
     template, before = images(camera, click.frame), images(camera, click.frame)
     last, motion, alive = start, np.zeros(2), True
-    found = Run({}, {})
+    found = OneWay({}, {})
     step = 1 if stop > click.frame else -1
     for frame in range(click.frame + step, stop, step):
         if not images.capture.has(camera, frame):
@@ -138,7 +138,7 @@ def follow_from(images: GrayImages, camera: str, click: Click, stop: int, aim: C
     return found
 
 
-def _write(trail: Trail, forward: Run, backward: Run | None, start: int, stop: int) -> None:
+def _write(trail: Trail, forward: OneWay, backward: OneWay | None, start: int, stop: int) -> None:
     """Blend the runs of the frames between `start` and `stop` into the trail."""
     step = 1 if stop > start else -1
     for frame in range(start + step, stop, step):

@@ -2,127 +2,100 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 
+from neuspring.config import parse, plain
+from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.document import Document
-from neuspring.perception.annotate.job import Job, Report
-from neuspring.perception.marks.marks import MARKS
+from neuspring.perception.annotate.shared import Document, Job, Report
+from neuspring.perception.marks.carry import Carried, frame_mask
+from neuspring.perception.marks.marks import MARKS, Marks
+from neuspring.perception.marks.store import Made, carry_camera, film_of, save_carried, source_digest
 
 MOST_MARKS = 2000
 """Marks of a camera: a limit for what a browser may send."""
 
 
-class Method(Protocol):
-    """What marks are and how masks come from them: `neuspring.perception.marks`, or a stand-in."""
-
-    def load(self, capture: Capture) -> Any:
-        """The marks of a capture; none where there is no file. Raises InputError."""
-
-    def read(self, values: Any, capture: Capture) -> Any:
-        """Marks from plain values, checked. Raises InputError."""
-
-    def plain(self, marks: Any) -> dict[str, Any]:
-        """Marks as plain values."""
-
-    def save(self, marks: Any, capture: Capture) -> None:
-        """Write marks.json."""
-
-    def preview(self, capture: Capture, camera: str, frame: int, marks: Any) -> np.ndarray:
-        """Labels [H, W] of one marked frame. Raises InputError."""
-
-    def carry(
-        self, capture: Capture, camera: str, marks: Any, progress: Callable[[int, int], None]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Labels [T, H, W] and doubt [T] of every frame. Raises InputError."""
-
-    def save_masks(self, capture: Capture, camera: str, labels: np.ndarray, doubt: np.ndarray, marks: Any) -> None:
-        """Write mask/<camera>/, and how the masks were made."""
-
-    def doubt(self, capture: Capture) -> dict[str, list[float]]:
-        """Doubt [T] of masks that the capture has, by camera, where it is known. Raises InputError."""
-
-
 @dataclass(frozen=True, eq=False)
-class Result:
+class CarriedMasks:
     """Masks of one camera, as they were carried."""
 
     images: Sequence[bytes]
     """A gray PNG per frame."""
     doubt: np.ndarray
     """[T], 0 sure, 1 doubtful."""
-    marks: Any
+    marks: Marks
     """What they came from."""
-    source: str
-    """Digest of the camera's marks."""
     saved: bool = False
-
-    def labels(self) -> np.ndarray:
-        """[T, H, W] uint8."""
-        return np.stack([decode(image) for image in self.images])
 
 
 class Masks:
     """State of the masks mode, shared by all tabs."""
 
-    def __init__(self, capture: Capture, method: Method) -> None:
-        self.capture, self.method, self.job = capture, method, Job()
-        self.document: Document[Any] = Document(
-            capture.folder / MARKS, lambda: method.load(capture), lambda marks: method.save(marks, capture)
+    def __init__(self, capture: Capture, settings: MarksSegmentation) -> None:
+        self.capture, self.settings, self.job = capture, settings, Job()
+        path = capture.folder / MARKS
+        self.document: Document[Marks] = Document(
+            path, lambda: Marks.load(path) if path.exists() else Marks(), lambda marks: marks.save(path)
         )
-        self._results: dict[str, Result] = {}
+        self._results: dict[str, CarriedMasks] = {}
         self._lock, self._saving = Lock(), Lock()
 
     def plain(self) -> dict[str, Any]:
         """Marks with their revision, the job, and what was carried, as plain values."""
         revision, marks = self.document.read()
-        values = self.method.plain(marks)
         with self._lock:
             carried = {
                 camera: {
                     "doubt": [round(float(value), 3) for value in result.doubt],
                     "saved": result.saved,
-                    "stale": result.source != digest(values, camera),
+                    "stale": result.marks.of(camera) != marks.of(camera),
                 }
                 for camera, result in self._results.items()
             }
-        doubt = self.method.doubt(self.capture)
-        saved = {camera: doubt.get(camera, []) for camera in self.saved_cameras()}
-        return {"revision": revision, "marks": values, "job": self.job.plain(), "carried": carried, "saved": saved}
+        made = Made.of(self.capture).cameras
+        saved = {camera: list(made[camera].doubt) if camera in made else [] for camera in self.saved_cameras()}
+        return {"revision": revision, "marks": plain(marks), "job": self.job.plain(), "carried": carried, "saved": saved}
 
     def write(self, revision: Any, values: Any) -> str:
-        """Replace the marks; returns the new revision. Raises Stale, InputError."""
-        lists = values.get("cameras") if isinstance(values, dict) else None
-        if isinstance(lists, dict):
-            for camera, marks in lists.items():
-                if isinstance(marks, list) and len(marks) > MOST_MARKS:
-                    raise InputError(f"{MARKS}, cameras.{camera}", f"at most {MOST_MARKS} marks a camera", len(marks))
-        return self.document.write(revision, self.method.read(values, self.capture))
+        """Replace the marks by plain values; returns the new revision. Raises Stale, InputError.
+
+        Half-done work is good too: the object may come last.
+        """
+        if not isinstance(values, dict):
+            raise InputError(MARKS, "a JSON object is required", type(values).__name__)
+        cameras = values.get("cameras")
+        for camera, marks in cameras.items() if isinstance(cameras, dict) else ():
+            if isinstance(marks, list) and len(marks) > MOST_MARKS:
+                raise InputError(f"{MARKS}, cameras.{camera}", f"at most {MOST_MARKS} marks a camera", len(marks))
+        parsed = parse(Marks, values, MARKS)
+        parsed.require(self.capture, whole=False)
+        return self.document.write(revision, parsed)
 
     def preview(self, camera: str, frame: int) -> np.ndarray:
-        """Labels [H, W] of one marked frame. Raises InputError."""
-        return self.method.preview(self.capture, camera, frame, self.document.read()[1])
+        """Labels [H, W] of one marked frame from its marks alone. Raises InputError."""
+        # A film lacks the frames that its camera missed.
+        place = sum(self.capture.has(camera, before) for before in range(frame))
+        marks = [replace(mark, frame=place) for mark in self.document.read()[1].of(camera) if mark.frame == frame]
+        return frame_mask(film_of(self.capture, camera), place, marks, self.settings)
 
     def carry(self, cameras: Sequence[str]) -> None:
         """Begin to carry the marks of cameras through the video. Raises InputError, Busy."""
         marks = self.document.read()[1]
-        values = self.method.plain(marks)
-        unmarked = [camera for camera in cameras if not values["cameras"].get(camera)]
+        unmarked = [camera for camera in cameras if not marks.of(camera)]
         if unmarked or not cameras:
             where = f"camera {', '.join(unmarked)}" if unmarked else "the capture"
             raise InputError(where, "the object must be marked in a frame", "no marks", "Draw a box around it first.")
-        self.job.start(lambda report: self._carry(list(cameras), marks, values, report))
+        self.job.start(lambda report: self._carry(list(cameras), marks, report))
 
-    def _carry(self, cameras: Sequence[str], marks: Any, values: dict[str, Any], report: Report) -> str:
+    def _carry(self, cameras: Sequence[str], marks: Marks, report: Report) -> str:
         doubtful = 0
         for camera in cameras:
 
@@ -130,9 +103,9 @@ class Masks:
                 report(f"camera {camera}", done, total)
 
             progress(0, self.capture.frame_count)
-            labels, doubt = self.method.carry(self.capture, camera, marks, progress)
-            doubtful += int((doubt > 0.5).sum())
-            result = Result([encode(image) for image in labels], doubt, marks, digest(values, camera))
+            carried = carry_camera(self.capture, camera, marks.of(camera), self.settings, progress=progress)
+            doubtful += int((carried.doubt > 0.5).sum())
+            result = CarriedMasks([_png(labels) for labels in carried.labels], carried.doubt, marks)
             with self._lock:
                 self._results[camera] = result
         names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
@@ -144,9 +117,9 @@ class Masks:
         if source == "carried":
             with self._lock:
                 result = self._results.get(camera)
-            return decode(result.images[frame]) if result and self.capture.has(camera, frame) else None
+            return _labels(result.images[frame]) if result and self.capture.has(camera, frame) else None
         exists = self.capture.has(camera, frame) and self.capture.path("mask", camera, frame).exists()
-        return self.capture.mask(camera, frame) if exists else None
+        return self.capture.mask(camera, frame) if source == "saved" and exists else None
 
     def save(self) -> list[str]:
         """Write what was carried to the capture; returns the cameras. Raises InputError where nothing was carried."""
@@ -157,7 +130,9 @@ class Masks:
         # Two tabs would write the same files, and the record of one of them would be lost.
         with self._saving:
             for camera, result in results.items():
-                self.method.save_masks(self.capture, camera, result.labels(), result.doubt, result.marks)
+                carried = Carried(np.stack([_labels(image) for image in result.images]), result.doubt)
+                source = source_digest(self.capture, camera, result.marks.of(camera), "marks", self.settings)
+                save_carried(self.capture, camera, carried, source, "marks")
                 with self._lock:
                     if self._results.get(camera) is result:
                         self._results[camera] = replace(result, saved=True)
@@ -169,16 +144,10 @@ class Masks:
         return [c for c in self.capture.cameras if any(self.capture.path("mask", c, frame).exists() for frame in frames)]
 
 
-def digest(values: dict[str, Any], camera: str) -> str:
-    """Digest of the marks of a camera."""
-    return hashlib.sha256(json.dumps(values["cameras"].get(camera, []), sort_keys=True).encode()).hexdigest()
-
-
-def encode(labels: np.ndarray) -> bytes:
-    """A gray PNG."""
+def _png(labels: np.ndarray) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(labels), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
-def decode(image: bytes) -> np.ndarray:
+def _labels(image: bytes) -> np.ndarray:
     """Labels [H, W] of a gray PNG."""
     return np.asarray(cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED))

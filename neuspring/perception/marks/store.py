@@ -27,8 +27,9 @@ from neuspring.core.files import write_atomically, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, Capture, images_digest
 from neuspring.data.json_file import load_json
-from neuspring.perception.marks.carry import Carried, Images, carry
+from neuspring.perception.marks.carry import Carried, carry
 from neuspring.perception.marks.marks import Mark, marks_digest
+from neuspring.perception.marks.sheet import save_sheet
 
 MADE = "masks.json"
 """What the masks of a capture were made from, and how far each frame is doubted; in its folder."""
@@ -68,12 +69,8 @@ class Film:
         return np.where(depth > 0, sign * view.lift(pixels, depth)[..., 2], np.nan).astype(np.float32)
 
 
-def film_of(capture: Capture, camera: str) -> Images:
-    """The frames that a camera has, as `carry` takes them. Raises InputError for an unknown camera."""
-    return _film(capture, camera)
-
-
-def _film(capture: Capture, camera: str) -> Film:
+def film_of(capture: Capture, camera: str) -> Film:
+    """The frames that a camera has. Raises InputError for an unknown camera."""
     capture.require_camera(camera)
     return Film(capture, camera, tuple(frame for frame in range(capture.frame_count) if capture.has(camera, frame)))
 
@@ -90,7 +87,7 @@ def carry_camera(
 
     Raises InputError where marks do not fit the capture.
     """
-    film = _film(capture, camera)
+    film = film_of(capture, camera)
     place = {number: index for index, number in enumerate(film.frames)}
     absent = [mark.frame for mark in marks if mark.frame not in place]
     if absent:
@@ -192,6 +189,15 @@ class Made:
     def holds(self, capture: Capture, camera: str, source: str) -> bool:
         """Whether the camera's masks are there and were made from this source."""
         return camera in self.cameras and self.cameras[camera].source == source and has_masks(capture, [camera])
+
+
+def save_carried(capture: Capture, camera: str, carried: Carried, source: str, backend: str) -> MadeCamera:
+    """Write mask/<camera>/, the sheet to look at, and what the masks were made from: `source_digest`. Raises InputError."""
+    save_masks(capture, camera, carried.labels)
+    save_sheet(capture, camera, carried)
+    made = MadeCamera(source=source, backend=backend, doubt=tuple(round(float(value), 4) for value in carried.doubt))
+    Made.of(capture).save(capture, camera, made)
+    return made
 
 
 def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend: str, settings: Any) -> str:

@@ -9,7 +9,6 @@ from neuspring import config
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.make import make
-from neuspring.perception.annotate.method import FromMarks
 from neuspring.perception.marks import Mark
 from neuspring.perception.marks.compare import overlap
 from tests.benchmarks.masks import MOST_MARKS, corrections, outlines
@@ -79,7 +78,7 @@ def test_five_marks_a_camera_give_the_masks_of_the_demo(browser, tmp_path, scena
     description = json.loads((capture.folder / "capture.json").read_text())
     (capture.folder / "capture.json").write_text(json.dumps(description | {"masks": False}))
     capture = Capture.load(capture.folder)
-    with served(capture, FromMarks()) as client:
+    with served(capture) as client:
         browser.open("about:blank", 1280, 800)
         browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", 1280, 800)
         browser.wait("document.body.dataset.ready === 'yes'")

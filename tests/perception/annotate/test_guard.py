@@ -2,8 +2,6 @@
 
 import json
 import socket
-from email.message import Message
-from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -11,9 +9,8 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.perception.annotate import guard
-from neuspring.perception.annotate.server import PAGE, Server
+from neuspring.perception.annotate.server import MOST_BYTES, STATIC, Server
 from tests.support.moving import moving
-from tests.support.painted import Painted
 from tests.support.served import TOKEN, served
 
 BODY = json.dumps({"revision": "none", "marks": {"format": 1, "cameras": {}}}).encode()
@@ -23,14 +20,14 @@ BODY = json.dumps({"revision": "none", "marks": {"format": 1, "cameras": {}}}).e
 def client(tmp_path_factory):
     folder = tmp_path_factory.mktemp("guarded")
     (folder / "secret.txt").write_text("secret")
-    with served(moving(folder / "capture"), Painted()) as client:
+    with served(moving(folder / "capture")) as client:
         yield client
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "10.0.0.1", "[::2]", "", "["])
 def test_other_names_of_this_address_are_refused(client, host):
     """DNS rebinding: a name of another site that leads here."""
-    for path in ("/", "/api/state"):
+    for path in ("/", "/app.js", "/api/state"):
         status, _, content = client.raw("GET", path, Host=host)
         assert status in (400, 403)
         assert b"frames" not in content and b"<html" not in content
@@ -40,6 +37,23 @@ def test_other_names_of_this_address_are_refused(client, host):
 def test_names_of_this_machine_are_taken_at_any_port(client, host):
     """An SSH tunnel may end at another port."""
     assert client.raw("GET", "/api/state", Host=host)[0] == 200
+
+
+def host(header: str | None, bound: str) -> bool:
+    try:
+        guard.check_host(header, bound)
+    except guard.Refused:
+        return False
+    return True
+
+
+def test_a_server_for_a_network_is_reached_by_address_or_by_its_own_name():
+    assert host("192.168.1.7:8765", "0.0.0.0")
+    assert host(f"{socket.gethostname()}:8765", "0.0.0.0")
+    assert not host("evil.example:8765", "0.0.0.0")
+    assert not host("192.168.1.7:8765", "127.0.0.1")
+    assert not host("192.168.1.7:8765", "::1")
+    assert not host(None, "0.0.0.0")
 
 
 @pytest.mark.parametrize(
@@ -56,21 +70,19 @@ def test_names_of_this_machine_are_taken_at_any_port(client, host):
         ({"Content_Type": "text/plain"}, 415),
         ({"Content_Type": "application/x-www-form-urlencoded"}, 415),
         ({"Content_Length": None}, 411),
-        ({"Content_Length": "-5"}, 411),
+        ({"Content_Length": "-5"}, 400),
         ({"Transfer_Encoding": "chunked"}, 411),
-        ({"Content_Length": str(guard.MOST_BYTES + 1)}, 413),
-        ({"Content_Length": "9" * 50}, 413),
+        ({"Content_Length": str(MOST_BYTES + 1)}, 413),
+        ({"Content_Length": "9" * 50}, 400),
     ],
 )
 def test_hostile_writes_are_refused_and_change_nothing(client, headers, status):
-    answer, _, content = client.raw("POST", "/api/marks", BODY, **headers)
-    assert answer == status
-    assert json.loads(content)["error"]
-    assert not (client.server.desk.capture.folder / "marks.json").exists()
+    assert client.raw("POST", "/api/marks", BODY, **headers)[0] == status
+    assert not (client.server.capture.folder / "marks.json").exists()
 
 
-def test_reads_need_the_token_too(client):
-    for path in ("/api/state", "/api/color/0/0", "/api/masks", "/nothing"):
+def test_all_under_api_needs_the_token(client):
+    for path in ("/api/state", "/api/color/0/0", "/api/masks", "/api/nothing"):
         assert client.raw("GET", path, X_NeuSpring_Token=None)[0] == 401
 
 
@@ -78,16 +90,17 @@ def test_requests_of_the_page_itself_are_taken(client):
     origin = f"http://127.0.0.1:{client.port}"
     status, headers, _ = client.raw("GET", "/api/state", Origin=origin, Sec_Fetch_Site="same-origin")
     assert status == 200
-    assert headers["Content-Security-Policy"].startswith("default-src 'self'")
-    assert not any(name.startswith("Access-Control") for name in headers)
+    assert headers["content-security-policy"].startswith("default-src 'self'")
+    assert not any(name.startswith("access-control") for name in headers)
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        "/../capture/capture.json", "/%2e%2e/secret.txt", "/capture.json", "/static/app.js", "//etc/passwd", "/app.py",
-        "/api/color/0/..%2f..%2f..%2fsecret.txt", "/api/color/..%2f..%2f../0", "/api/color/%2e%2e/0", "/api/color/0/99999999999",
-        "/api/color/0/12", "/api/color/0/-1", "/api/color/2/0", "/api/overlay/..%2f/0/0", "/api/overlay/saved/0/0", "/api/nothing",
+        "/../capture/capture.json", "/%2e%2e/secret.txt", "/../server.py", "/..%2fserver.py", "/capture.json", "/static/app.js",
+        "//etc/passwd", "/%2fetc/passwd", "/app.py", "/api/color/0/..%2f..%2f..%2fsecret.txt", "/api/color/..%2f..%2f../0",
+        "/api/color/%2e%2e/0", "/api/color/0/99999999999", "/api/color/0/12", "/api/color/0/-1", "/api/color/2/0",
+        "/api/overlay/..%2f/0/0", "/api/overlay/other/0/0", "/api/overlay/saved/0/0", "/api/nothing",
     ],
 )  # fmt: skip
 def test_no_address_leads_out_of_the_capture(client, path):
@@ -102,10 +115,9 @@ def test_a_link_in_the_capture_gives_no_file_that_is_not_its_image(tmp_path):
     path = capture.path("color", "0", 1)
     path.unlink()
     path.symlink_to(tmp_path / "secret.txt")
-    with served(capture, Painted()) as client:
+    with served(capture) as client:
         status, _, content = client.raw("GET", "/api/color/0/1")
         assert status == 422
-        assert b"must be a readable PNG" in content
         assert b"secret" not in content.replace(b"secret.txt", b"")
         # An image of another size is none of this camera.
         path.unlink()
@@ -115,79 +127,46 @@ def test_a_link_in_the_capture_gives_no_file_that_is_not_its_image(tmp_path):
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b"1", b"[" * 100_000, b"\xff\xfe"])
 def test_bodies_that_are_no_object_are_refused(client, body):
-    status, _, content = client.raw("POST", "/api/marks", body)
-    assert status == 400
-    assert "JSON" in json.loads(content)["error"]
+    assert client.raw("POST", "/api/marks", body)[0] == 400
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "PATCH", "TRACE", "HEAD"])
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "PATCH"])
 def test_other_methods_are_not_there(client, method):
-    assert client.raw(method, "/api/marks")[0] == 501
+    assert client.raw(method, "/api/marks")[0] == 405
 
 
 def test_the_page_comes_from_the_package_alone(client):
     """Every file of the page is given out, and none of them asks the network for more."""
-    static = files("neuspring.perception.annotate").joinpath("static")
-    assert {name for name, _ in PAGE.values()} == {path.name for path in static.iterdir()}
-    for path in PAGE:
-        status, headers, content = client.raw("GET", path, X_NeuSpring_Token=None)
+    for name in ("", *(path.name for path in STATIC.iterdir())):
+        status, headers, content = client.raw("GET", f"/{name}", X_NeuSpring_Token=None)
         assert status == 200
-        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert headers["x-content-type-options"] == "nosniff"
         assert TOKEN.encode() not in content
         assert b"://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
-
-
-def host(header: str, bound: str) -> bool:
-    try:
-        guard.check_host(header, bound)
-    except guard.Refused:
-        return False
-    return True
-
-
-def test_a_server_for_a_network_is_reached_by_address_or_by_its_own_name():
-    assert host("192.168.1.7:8765", "0.0.0.0")
-    assert host(f"{socket.gethostname()}:8765", "0.0.0.0")
-    assert not host("evil.example:8765", "0.0.0.0")
-    assert not host("192.168.1.7:8765", "127.0.0.1")
-    assert not host("192.168.1.7:8765", "::1")
-    with pytest.raises(guard.Refused, match="Host header is required"):
-        guard.check_host(None, "0.0.0.0")
-
-
-def test_lengths_of_bodies_are_limited_before_they_are_read():
-    headers = Message()
-    headers["Content-Type"], headers["Content-Length"] = "application/json; charset=utf-8", str(guard.MOST_BYTES)
-    assert guard.body_length(headers) == guard.MOST_BYTES
 
 
 @pytest.mark.parametrize(
     ("where", "message"),
     [
-        ({"port": -1}, "--port: must be 0 to 65535; received -1"),
-        ({"port": 70000}, "--port: must be 0 to 65535; received 70000"),
-        (
-            {"host": "192.0.2.1"},
-            r"--host: must be an address of this machine; received 192\.0\.2\.1\. 127\.0\.0\.1 is for this machine",
-        ),
+        ({"port": 70000}, "--port: must be 0 to 65535"),
+        ({"host": "192.0.2.1"}, "--host: must be an address of this machine"),
         ({"host": "no.such.name.invalid"}, "--host: must be an address of this machine"),
     ],
 )
 def test_addresses_that_cannot_be_had_say_the_next_move(tmp_path, where, message):
     with pytest.raises(InputError, match=message):
-        Server(moving(tmp_path), Painted(), **where)
+        Server(moving(tmp_path), **where)
 
 
 def test_a_port_in_use_says_the_next_move(client, tmp_path):
-    with pytest.raises(InputError, match=rf"--port: must be a free port; received {client.port}\. Another program listens there"):
-        Server(moving(tmp_path), Painted(), port=client.port)
+    with pytest.raises(InputError, match="--port: must be a free port"):
+        Server(moving(tmp_path), port=client.port)
 
 
 def test_the_address_has_the_token_where_no_server_logs_it(tmp_path):
-    server = Server(moving(tmp_path), Painted())
+    server = Server(moving(tmp_path))
     try:
-        assert server.url == f"http://127.0.0.1:{server.server_address[1]}/#{server.token}"
+        assert server.url == f"http://127.0.0.1:{server.port}/#{server.token}"
         assert len(server.token) >= 20
-        assert server.server_address[0] == "127.0.0.1"
     finally:
         server.close()

@@ -29,13 +29,13 @@ def capture(tmp_path) -> Capture:
 
 
 @pytest.fixture
-def method() -> Painted:
-    return Painted()
+def painted(monkeypatch) -> Painted:
+    return Painted(monkeypatch)
 
 
 @pytest.fixture
-def client(capture, method):
-    with served(capture, method) as client:
+def client(capture, painted):
+    with served(capture) as client:
         yield client
 
 
@@ -175,14 +175,14 @@ def test_frames_and_cameras_are_reached_by_keys(page):
     page.shown("#hint", "This camera missed this frame.")
 
 
-def test_marks_are_previewed_carried_with_progress_and_saved(page, method):
+def test_marks_are_previewed_carried_with_progress_and_saved(page, painted, capture):
     page.drag((40, 50), (60, 70))
     page.shown("#overlay-text", "previewed")
-    method.gate.clear()
+    painted.gate.clear()
     page.browser.click("#carry")
     page.browser.wait("!document.getElementById('progress').hidden")
     page.browser.wait("document.getElementById('progress-text').textContent.startsWith('camera 0: ')")
-    method.gate.set()
+    painted.gate.set()
     page.shown("#overlay-text", "carried")
     page.told("Carried camera 0")
     page.browser.wait("annotate.view.overlay !== null")
@@ -190,24 +190,24 @@ def test_marks_are_previewed_carried_with_progress_and_saved(page, method):
     page.browser.key("d")
     page.shown("#frame-text", "frame 11 of 0–11")
     page.browser.click("#save-masks")
-    page.client.wait(lambda: "0" in method.written)
+    page.client.wait(lambda: capture.path("mask", "0", 11).exists())
     page.told("Saved masks of camera 0")
     page.drag((70, 50), (90, 70))
     page.saved()
     page.browser.wait("!document.getElementById('stale').hidden")
 
 
-def test_what_is_carried_again_at_once_can_be_saved(page, method):
+def test_what_is_carried_again_at_once_can_be_saved(page, painted, capture):
     page.drag((40, 50), (60, 70))
     page.saved()
     masks = "annotate.modes.masks"
     page.browser.run(f"void {masks}.carry(['0'])")
     page.browser.wait(f"{masks}.results.job.state === 'done'")
     # Between two looks of the page at the job.
-    method.gate.clear()
+    painted.gate.clear()
     page.browser.run(f"void {masks}.carry(['0'])")
     time.sleep(0.6)
-    method.gate.set()
+    painted.gate.set()
     page.browser.wait("!document.getElementById('save-masks').disabled")
 
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.masks import Masks
-from neuspring.perception.annotate.method import FromMarks
 from neuspring.perception.marks.store import Made
 from tests.support.moving import CORNER, FRAMES, SHIFT, SIDE, moving
 
@@ -43,22 +43,27 @@ def overlap(one, other) -> float:
     return (one & other).sum() / (one | other).sum()
 
 
+def page_of(capture: Capture) -> Masks:
+    return Masks(capture, MarksSegmentation())
+
+
 def test_a_preview_is_of_the_frame_that_was_marked_also_after_missing_frames(capture):
-    method = FromMarks()
-    labels = method.preview(capture, "0", 6, method.read(marks(box(6), box(9)), capture))
+    page = page_of(capture)
+    page.write("none", marks(box(6), box(9)))
+    labels = page.preview("0", 6)
     assert overlap(labels == 1, square(6)) > 0.85
     assert overlap(labels == 1, square(9)) < 0.8
 
 
 def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
-    page = Masks(capture, FromMarks())
+    page = page_of(capture)
     page.write("none", marks(box(0)))
     page.carry(["0"])
     page.job.join()
     assert page.job.plain()["state"] == "done", page.job.plain()
     assert page.save() == ["0"]
     assert (capture.folder / "mask_0.png").exists()
-    later = Masks(capture, FromMarks()).plain()
+    later = page_of(capture).plain()
     assert len(later["saved"]["0"]) == FRAMES
     assert Made.of(capture).cameras["0"].backend == "marks"
     assert not capture.path("mask", "0", MISSING[0]).exists()
@@ -68,7 +73,7 @@ def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
 
 def test_a_camera_without_frame_0_has_masks_too(tmp_path):
     capture = moving(tmp_path / "late", missing=(0,), tint=(1.0, 0.6, 0.2))
-    page = Masks(capture, FromMarks())
+    page = page_of(capture)
     assert page.saved_cameras() == []
     capture.path("mask", "0", 3).parent.mkdir(parents=True)
     cv2.imwrite(str(capture.path("mask", "0", 3)), np.zeros((96, 128), np.uint8))
@@ -77,9 +82,9 @@ def test_a_camera_without_frame_0_has_masks_too(tmp_path):
 
 def test_half_done_work_is_kept(capture):
     """A hand is marked before the object."""
-    page = Masks(capture, FromMarks())
+    page = page_of(capture)
     page.write("none", marks(box(0, "hand")))
-    assert Masks(capture, FromMarks()).document.read()[1].of("0")[0].label == "hand"
+    assert page_of(capture).document.read()[1].of("0")[0].label == "hand"
 
 
 @pytest.mark.parametrize(
@@ -98,4 +103,4 @@ def test_half_done_work_is_kept(capture):
 )
 def test_bad_marks_are_refused(capture, values, message):
     with pytest.raises(InputError, match=re.escape(message)):
-        FromMarks().read(values, capture)
+        page_of(capture).write("none", values)

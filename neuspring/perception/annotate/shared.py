@@ -1,15 +1,50 @@
-"""One piece of long work at a time, in the background, with progress, an end, and a way to stop it."""
+"""What all tabs share: a file that each may edit, and one piece of long work at a time."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from threading import Event, Lock, Thread
 from time import monotonic
-from typing import Any, Literal, TypeAlias
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 from neuspring.core.errors import InputError, NumericalFailure
+
+T = TypeVar("T")
+
+
+class Stale(Exception):
+    """The file changed since the state that a write started from."""
+
+
+class Document(Generic[T]):
+    """A file, read and written whole. Every write names the revision that it started from, and a stale one is refused.
+
+    The revision is a digest of the file's bytes, so that changes by other programs count too; "none" without a file.
+    """
+
+    def __init__(self, path: Path, load: Callable[[], T], save: Callable[[T], object]) -> None:
+        self.path, self._load, self._save, self._lock = path, load, save, Lock()
+
+    def read(self) -> tuple[str, T]:
+        """Its revision and its value. Raises InputError for a damaged file."""
+        with self._lock:
+            return self._revision(), self._load()
+
+    def write(self, revision: Any, value: T) -> str:
+        """Replace the value that had `revision`; returns the new revision. Raises Stale."""
+        with self._lock:
+            if revision != self._revision():
+                raise Stale(self.path.name)
+            self._save(value)
+            return self._revision()
+
+    def _revision(self) -> str:
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] if self.path.exists() else "none"
+
 
 Report: TypeAlias = Callable[[str, int, int], None]
 """What work calls: (what, done, of all). Raises Stopped when the user stopped the work."""
@@ -24,8 +59,8 @@ class Busy(Exception):
 
 
 @dataclass(frozen=True)
-class State:
-    """How the work stands."""
+class JobState:
+    """How far work is."""
 
     state: Literal["idle", "running", "done", "failed", "stopped"] = "idle"
     what: str = ""
@@ -36,10 +71,10 @@ class State:
 
 
 class Job:
-    """At most one piece of work."""
+    """At most one piece of work, in a thread, with its progress and a way to stop it."""
 
     def __init__(self) -> None:
-        self._lock, self._stop, self._state, self._start = Lock(), Event(), State(), 0.0
+        self._lock, self._stop, self._state, self._start = Lock(), Event(), JobState(), 0.0
         self._thread: Thread | None = None
 
     def start(self, work: Callable[[Report], str]) -> None:
@@ -48,7 +83,7 @@ class Job:
             if self._state.state == "running":
                 raise Busy("Masks are being carried. Wait for the end, or stop it.")
             self._stop.clear()
-            self._state, self._start = State("running"), monotonic()
+            self._state, self._start = JobState("running"), monotonic()
             self._thread = Thread(target=self._run, args=(work,), daemon=True)
             self._thread.start()
 
@@ -67,12 +102,6 @@ class Job:
             state = self._state
             seconds = monotonic() - self._start if state.state == "running" else state.seconds
         return asdict(replace(state, seconds=seconds))
-
-    @property
-    def running(self) -> bool:
-        """Whether work goes on."""
-        with self._lock:
-            return self._state.state == "running"
 
     def _run(self, work: Callable[[Report], str]) -> None:
         try:
