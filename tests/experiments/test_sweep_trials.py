@@ -5,11 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord
-from neuspring.experiments.tuning import store, trial, worker
-from neuspring.twin.fit import FitProblem, TwinFit, fit
+from neuspring.experiments.tuning import trial, worker
+from neuspring.twin.fit import FitProblem, TwinFit, fit, tail_start
 from tests.support import small
 from tests.support.sweeps import furnish, report, results_of, settings, slots, sweep, work
 
@@ -24,7 +23,7 @@ def test_no_test_frame_changes_any_trial(tmp_path, finished):
 
 def test_the_search_does_not_see_the_tail(tmp_path):
     scene = small.observations()
-    end = trial.head_end(scene.scenario.train_end, 0.4)
+    end = tail_start(scene.scenario.train_end, 0.4)
     points = scene.object_points.copy()
     points[end:] += 1.0
     heads = []
@@ -35,14 +34,6 @@ def test_the_search_does_not_see_the_tail(tmp_path):
         assert len(Observations.load(made.head).object_points) == end < scene.scenario.train_end
         assert len(made.training.object_points) == scene.scenario.train_end < scene.scenario.frame_count
     assert heads[0] == heads[1]
-
-
-@pytest.mark.parametrize("fraction", [0.01, 0.2, 0.5, 0.9])
-@pytest.mark.parametrize("frames", [8, 20])
-def test_the_tail_is_the_one_that_the_fit_holds_back(fraction, frames):
-    problem = small.fit_problem(small.scene(frames=frames).observations)
-    end = TwinFit(dataclasses.replace(problem, fit=config.Fit(selection="tail", tail_fraction=fraction))).head_end
-    assert trial.head_end(problem.observations.scenario.train_end, fraction) == end
 
 
 @pytest.mark.parametrize(("method", "selection"), [("baseline", "training_loss"), ("baseline", "tail"), ("search_only", "tail")])
@@ -122,7 +113,7 @@ def test_a_trial_that_keeps_ending_its_worker_is_given_up(folder, monkeypatch):
         crashes += 1
         raise MemoryError("no room")
 
-    monkeypatch.setattr(store, "MOST_DEATHS", 2)
+    monkeypatch.setattr(worker, "MOST_DEATHS", 2)
     with monkeypatch.context() as patch:
         patch.setattr(trial, "fit", crashing)
         for _ in range(2):

@@ -7,7 +7,7 @@ import pytest
 
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
-from neuspring.experiments.tuning import store
+from neuspring.experiments.tuning import worker
 from neuspring.stages import search as search_stage
 from neuspring.twin.fit import TwinFit
 from tests.support import stores
@@ -133,7 +133,7 @@ def test_postgresql_holds_a_sweep(folder, monkeypatch):
         tune = sweep(trials=6, workers=2, pruner="none", storage=cluster.database("study"))
         two_workers(folder, tune)
         assert "6 of 6 trials" in report(folder, tune)
-    assert not (folder / store.DATABASE).exists()
+    assert not (folder / worker.DATABASE).exists()
 
 
 def test_a_trial_of_a_worker_that_is_no_longer_configured_is_finished_by_another(folder, monkeypatch):

@@ -15,8 +15,8 @@ from neuspring.core.artifacts import Observations
 from neuspring.experiments.tuning import report as tuning_report
 from neuspring.experiments.tuning import worker
 from neuspring.experiments.tuning.space import Plan
-from neuspring.experiments.tuning.store import Slot, Store
-from neuspring.experiments.tuning.store import slots as slots_of
+from neuspring.experiments.tuning.worker import Slot, Store
+from neuspring.experiments.tuning.worker import slots as slots_of
 from tests.support import small
 
 OBSERVATIONS = "observations.npz"

@@ -1,6 +1,5 @@
 """Sweeps: Optuna studies over settings of one method.
 
-`space`: what a sweep varies. `worker`: one worker, a job of the workflow (`work`). `trial`: search and fit with a trial's settings.
-`store`: the storage that workers share, and who works on which trial. `records`: run records of trials and sweep. `report`:
-summary, tables and best overlay (`report`). `figures`: its pictures.
+`space`: what a sweep varies. `trial`: search and fit with a trial's settings. `worker`: one worker, a job of the workflow (`work`),
+and the storage that workers share. `report`: summary, tables, pictures, run records and best overlay (`report`).
 """

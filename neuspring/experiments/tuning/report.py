@@ -1,30 +1,39 @@
-"""The report of a sweep: a table of its trials, the best one as an overlay, pictures, and a summary, which is written last."""
+"""The report of a sweep: trials.csv, run records, the best trial as an overlay, pictures, and a summary, which is written last.
+
+Everything is made from the sweep's storage, of a sweep that is finished or not. Run records of trials and sweep go to MLflow as
+those of any run do (`neuspring sync`). Trials have the numbers of their slots. In Optuna's pictures they have its own, which differ
+where a trial was begun again.
+"""
 
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import optuna
 import pandas as pd
 import yaml
+from optuna.study import Study
 
 from neuspring import config
 from neuspring.config import Config
 from neuspring.config.tuning import Tune
-from neuspring.core.files import write_text
+from neuspring.core.files import write_atomically, write_table, write_text
 from neuspring.core.markdown import markdown
+from neuspring.core.records import canonical
+from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
 from neuspring.experiments.benchmark import read_methods, read_searches
-from neuspring.experiments.tuning.records import FACTS, VALUES, labels, write_sweep, write_trial
-from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan
-from neuspring.experiments.tuning.store import DEFINITION, WORKER, Slot, Store, slots
-
-if TYPE_CHECKING:
-    from optuna.study import Study
+from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan, labels
+from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, Store, slots
+from neuspring.report.figures.views import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
 SHARED = ("simulation", "losses", "released_quirks")
@@ -39,6 +48,15 @@ PICTURES = {
     "importances.png": "Importance of the settings",
     "steps.png": "What pruning saw",
 }
+LOSS = "loss of the tail [m²]"
+LOG_FROM = 3.0
+"""A loss has a log axis if its largest value is at least this many times its smallest."""
+LEGEND = 16
+"""The most entries of a legend that is shown."""
+WIDTH, HEIGHT = 2.9, 3.8
+"""Size of a panel, inches."""
+KEYED = ("scenario", "source", "category", "method", "variant", "seed", "status", "reason", "data_digest", "params")
+"""Fields that the key of a run record is made of, beside its scores and results."""
 
 
 @dataclass(frozen=True)
@@ -76,21 +94,17 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
     findings = Findings(plan, begun, _table(begun, plan), _importances(study), tuple(definition["frames"]))
     for slot in begun:
         if slot.state in ("complete", "pruned", "failed"):
-            write_trial(plan, definition, slot, folder)
+            _record_trial(findings, slot, definition, folder)
     # No file of an earlier report may stay beside this one's.
     for name in (*TABLES, *PICTURES):
         (folder / name).unlink(missing_ok=True)
     write_text(folder / "trials.csv", findings.table.to_csv(index=False))
     write_best(findings, settings, folder, root)
     if findings.table["state"].isin(["complete", "pruned"]).any():
-        from neuspring.experiments.tuning import figures
-
-        figures.draw(study, folder, importances=bool(findings.importances))
+        _draw(study, folder, importances=bool(findings.importances))
     write_text(output, summary(findings, folder))
-    files = [folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file()]
-    losses = {"best": findings.best.trials[-1].value if findings.best else None, "baseline": findings.baseline}
-    scores = {name: value for name, value in losses.items() if value is not None}
-    write_sweep(tune, definition, begun, scores, [output, *files], folder)
+    files = [output, *(folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file())]
+    _record_sweep(findings, definition, files, folder)
 
 
 def _table(begun: Sequence[Slot], plan: Plan) -> pd.DataFrame:
@@ -112,8 +126,6 @@ def _table(begun: Sequence[Slot], plan: Plan) -> pd.DataFrame:
 
 
 def _importances(study: Study) -> dict[str, float]:
-    import optuna
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -242,3 +254,132 @@ def _trial_lines(findings: Findings) -> list[str]:
     rows = [[str(row["trial"]), f"{row['loss']:.4e}", *(_shown(row[name]) for name in names)] for row in done.to_dict("records")]
     lines = markdown(["Trial", "Loss [m²]", *names], rows) if rows else ["None."]
     return [f"## The best {SHOWN} finished trials", "", *lines, "", "All trials: `trials.csv`.", ""]
+
+
+def _draw(study: Study, folder: Path, *, importances: bool) -> None:
+    """Draw a sweep that has a finished or pruned trial; `importances`: whether they can be computed."""
+    import optuna.visualization.matplotlib as plots
+
+    losses = [trial.value for trial in study.get_trials(deepcopy=False) if trial.value is not None]
+    columns = len({name for trial in study.get_trials(deepcopy=False) for name in trial.params})
+    if losses:
+        _save(lambda: plots.plot_optimization_history(study, target_name=LOSS), folder / "history.png", 2.4, losses)
+        _save(lambda: plots.plot_slice(study, target_name=LOSS), folder / "slices.png", columns, losses)
+        _save(lambda: plots.plot_parallel_coordinate(study, target_name=LOSS), folder / "parallel.png", columns)
+    if importances:
+        _save(lambda: plots.plot_param_importances(study, target_name=LOSS), folder / "importances.png", 2.4)
+    values = [value for trial in study.get_trials(deepcopy=False) for value in trial.intermediate_values.values()]
+    if values:
+        _save(
+            lambda: plots.plot_intermediate_values(study), folder / "steps.png", 3.0, values, "epoch, counted through the scenarios"
+        )
+
+
+def _save(plot: Callable[[], Any], path: Path, columns: float, losses: list[float] | None = None, label: str = "") -> None:
+    """Save a picture of `columns` panels; `losses` are those on its y axis."""
+    from matplotlib import pyplot as plt
+
+    with warnings.catch_warnings(), plt.style.context("default"):
+        warnings.simplefilter("ignore")
+        axes = list(np.ravel(plot()))
+    figure = axes[0].figure.get_figure(root=True)
+    assert figure is not None
+    figure.set_size_inches(WIDTH * columns + 0.8, HEIGHT)
+    if losses and min(losses) > 0 and max(losses) >= LOG_FROM * min(losses):
+        axes[0].set_yscale("log")
+    if (legend := axes[0].get_legend()) and len(legend.get_texts()) > LEGEND:
+        legend.remove()
+    if label:
+        axes[0].set(xlabel=label, ylabel="mean " + LOSS, title="")
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=DPI, format="png", bbox_inches="tight"))
+    plt.close(figure)
+
+
+def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any], folder: Path) -> None:
+    """Write trials/<slot>/run.json and the files that it names, unless they are there."""
+    plan, trial = findings.plan, slot.trials[-1]
+    facts, values = trial.user_attrs.get(FACTS, {}), trial.user_attrs.get(VALUES, {})
+    scores = {"loss": trial.value} if slot.state == "complete" else {}
+    scores |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
+    steps = sorted(trial.intermediate_values.items())
+    history = pd.DataFrame([(step, "tail_loss", value) for step, value in steps], columns=["step", "metric", "value"])
+    fields = {
+        "scenario": f"trial-{slot.number}",
+        "variant": {"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(values)},
+        "status": "failed" if slot.state == "failed" else "ok",
+        "reason": slot.reason,
+        "params": labels(plan.flat(values)),
+        "attempt": len(slot.trials),
+        "commit": facts.get("commit", ""),
+        "device": facts.get("device", ""),
+        "started": facts.get("started", _utc(trial.datetime_start)),
+        "ended": facts.get("ended", _utc(trial.datetime_complete or trial.datetime_start)),
+        "timings": facts.get("seconds", {}),
+        "histories": {"steps": "history.parquet"},
+    }
+    place = folder / "trials" / str(slot.number)
+    _write_record(plan.tune, definition, fields, scores, steps, place, {"history.parquet": history})
+
+
+def _record_sweep(findings: Findings, definition: Mapping[str, Any], files: Sequence[Path], folder: Path) -> None:
+    """Write the run.json of the sweep. `files`, its tables and pictures, lie in `folder`."""
+    tune, best = findings.plan.tune, findings.best
+    facts = [slot.trials[-1].user_attrs[FACTS] for slot in findings.slots if slot.trials[-1].user_attrs.get(FACTS)]
+    facts = facts or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
+    losses = {"best": best.trials[-1].value if best else None, "baseline": findings.baseline}
+    fields = {
+        "scenario": "study",
+        "variant": {"study": tune.study, "method": tune.method, "pruner": tune.pruner},
+        "status": "ok" if best else "failed",
+        "reason": "" if best else "no trial has finished",
+        "params": {"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
+        "attempt": 1,
+        "commit": facts[-1].get("commit", ""),
+        "device": facts[-1].get("device", ""),
+        "started": min(fact["started"] for fact in facts),
+        "ended": max(fact["ended"] for fact in facts),
+        "timings": {name: sum(fact["seconds"].get(name, 0.0) for fact in facts) for name in ("search", "fit")},
+        "artifacts": {
+            "tables": [path.name for path in files if path.suffix != ".png"],
+            "plots": [path.name for path in files if path.suffix == ".png"],
+        },
+    }
+    scores = {name: value for name, value in losses.items() if value is not None}
+    states = [[slot.number, slot.state, slot.trials[-1].value] for slot in findings.slots]
+    _write_record(tune, definition, fields, scores, states, folder, {})
+
+
+def _write_record(
+    tune: Tune,
+    definition: Mapping[str, Any],
+    fields: Mapping[str, Any],
+    scores: Mapping[str, Any],
+    results: Any,
+    folder: Path,
+    tables: Mapping[str, pd.DataFrame],
+) -> None:
+    """Write a run record under its key, with its scores and tables, unless a record of that key is there."""
+    record = RunRecord(
+        run_key="0" * 8,  # until the record is complete
+        source="tune",
+        category="tune",
+        method=f"tune-{tune.study}",
+        seed=tune.seed,
+        data_digest=hashlib.sha256(canonical(definition.get("frames", {})).encode()).hexdigest(),
+        scores_file="scores.parquet",
+        **fields,
+    )
+    path = folder / RUN_RECORD
+    # Without timings: the same results have the same key.
+    key = key_of({name: getattr(record, name) for name in KEYED}, scores, results)
+    if path.is_file() and RunRecord.load(path).run_key == key:
+        return
+    table = pd.DataFrame([("tail", name, value) for name, value in scores.items()], columns=["task", "metric", "value"])
+    for name, values in {"scores.parquet": table, **tables}.items():
+        write_table(values.astype({"value": "float64"}), folder / name)
+    replace(record, run_key=key).save(path)
+
+
+def _utc(time: datetime | None) -> str:
+    """A time of Optuna's, which is local and names no zone, in UTC, ISO 8601; now if there is none."""
+    return (time or datetime.now()).astimezone(UTC).isoformat(timespec="seconds")

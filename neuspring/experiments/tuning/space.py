@@ -23,6 +23,7 @@ from neuspring import config
 from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
+from neuspring.core.records import canonical
 from neuspring.core.run_record import flat
 from neuspring.experiments.benchmark import fit_of, losses_of, quirks_of, read_methods, read_searches, search_of
 
@@ -130,6 +131,16 @@ class Plan:
             yield from (dict(zip(ends, values, strict=True)) for values in itertools.product(*ends.values()))
         else:
             yield from ({name: values[place] for name, values in ends.items()} for place in (0, -1))
+
+
+def label(value: Any) -> Any:
+    """A setting's value as one plain value: JSON text for lists and mappings."""
+    return value if value is None or isinstance(value, bool | int | float | str) else canonical(value)
+
+
+def labels(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Setting -> value as one plain value."""
+    return {name: label(value) for name, value in values.items()}
 
 
 def is_whole(name: str) -> bool:

@@ -30,7 +30,7 @@ from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.experiments.tuning.space import Plan
 from neuspring.stages import search as search_stage
-from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit
+from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
 
 Report = Callable[[int, float, str], None]
 """Receives a step, the mean loss of the scenarios begun so far, m^2, and what was just done."""
@@ -52,7 +52,7 @@ class Scene:
         if scenario.train_end < 3:
             rule = "a tail needs at least two training frames after frame 0"
             raise InputError(f"scenario {scenario.name}", rule, scenario.train_end - 1)
-        head = cut(observations, head_end(scenario.train_end, tail_fraction))
+        head = cut(observations, tail_start(scenario.train_end, tail_fraction))
         target = folder / f"{scenario.name}.npz"
         head.save(target)
         return cls(scenario.name, cut(observations, scenario.train_end), target)
@@ -71,11 +71,6 @@ def cut(observations: Observations, end: int) -> Observations:
     arrays["tracks"] = arrays["tracks"][:, :0]
     # The reader's notes, such as digests of files, depend on later frames.
     return replace(observations, scenario=replace(observations.scenario, frame_count=end, train_end=end, provenance={}), **arrays)
-
-
-def head_end(train_end: int, tail_fraction: float) -> int:
-    """The first frame of the tail. A test holds it equal to that of `TwinFit`."""
-    return train_end - min(max(round(tail_fraction * (train_end - 1)), 1), train_end - 2)
 
 
 @dataclass
@@ -152,9 +147,6 @@ def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: s
     from filelock import FileLock
 
     values = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
-    if clusters == 1:
-        for name in ("clusters", "tied_rollouts", "freed_sigma"):
-            del values["search"][name]
     facts = [
         scene.name,
         digest_file(scene.head),

@@ -1,8 +1,13 @@
 """One worker of a sweep, a job of the workflow: it runs trials until the sweep has as many as configured.
 
-Workers share the sweep's storage, so each may be on another GPU or machine. Trials are judged on a tail of the training frames. The
-sampler is seeded for every slot by itself: a sweep of one worker that was killed and continued finds what it would have found in
-one go.
+Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. A sweep has slots 0 .. trials - 1.
+Each is filled by one finished, pruned or failed trial. A worker takes the lowest free slot under a lock in the sweep's folder, so
+that together workers make exactly as many trials as were asked for. When a killed worker starts again, it frees the slot of the
+trial that it left running. The slot keeps its values, so that fits continue from their checkpoints. The sampler is seeded for every
+slot by itself: a sweep of one worker that was killed and continued finds what it would have found in one go.
+
+Optuna's own means do not give that. `MaxTrialsCallback` counts after a trial, when other workers have begun more. Its heartbeat
+notices a dead worker only after minutes, and never one that died before the first beat; a worker's number tells at once.
 """
 
 from __future__ import annotations
@@ -16,14 +21,18 @@ import math
 import socket
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import optuna
+import sqlalchemy
 from filelock import FileLock, Timeout
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import BaseSampler, TPESampler
+from optuna.storages import RDBStorage
+from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from neuspring.config import Config
@@ -31,14 +40,137 @@ from neuspring.config.tuning import Dimension, Tune
 from neuspring.core import provenance
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
-from neuspring.core.records import RECORD_FORMAT, now
-from neuspring.experiments.tuning.records import FACTS, VALUES, label, labels, write_trial
-from neuspring.experiments.tuning.space import Plan, holds, is_whole
-from neuspring.experiments.tuning.store import CRASH, DEFINITION, REASON, SLOT, Store, claim, slots
+from neuspring.core.records import RECORD_FORMAT, canonical, now
+from neuspring.core.run_record import flat
+from neuspring.experiments.tuning.space import Plan, holds, is_whole, label, labels
 from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
 
-if TYPE_CHECKING:
-    from optuna.study import Study
+DATABASE = "optuna.db"
+DEFINITION = "definition"
+"""Attribute of the study: what must not change while it lasts."""
+SLOT, WORKER, REASON, CRASH = "slot", "worker", "reason", "crash"
+"""Attributes of a trial. A failed trial with a reason fills its slot; one without was left behind or crashed."""
+FACTS, VALUES = "facts", "values"
+"""Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
+MOST_DEATHS = 5
+"""A slot whose trial ends its worker this often counts as failed, so that the sweep ends."""
+PATIENCE = 60.0
+"""Seconds that SQLite waits for another writer."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Where a sweep is kept: its folder, and a PostgreSQL URI or None for a SQLite file in the folder."""
+
+    folder: Path
+    uri: str | None
+    study: str
+
+    def lock(self) -> FileLock:
+        """Holds the sweep against its other workers; the death of the holder frees it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return FileLock(self.folder / ".lock")
+
+    def open(self, facts: Mapping[str, Any], pruner: BasePruner) -> Study:
+        """The sweep, made if there is none. Raises InputError if it was begun with other `facts`."""
+        # Several processes must not create the tables at once.
+        with self.lock():
+            study = optuna.create_study(
+                storage=self._storage(), study_name=self.study, pruner=pruner, load_if_exists=True, direction="minimize"
+            )
+            if DEFINITION not in study.user_attrs:
+                study.set_user_attr(DEFINITION, dict(facts))
+        return self._checked(study, facts)
+
+    def load(self, facts: Mapping[str, Any]) -> Study:
+        """The sweep for reading. Raises InputError if there is none, or if it was begun with other `facts`."""
+        if self.uri or (self.folder / DATABASE).is_file():
+            with contextlib.suppress(KeyError), self.lock():
+                study = optuna.load_study(storage=self._storage(), study_name=self.study)
+                if DEFINITION in study.user_attrs:
+                    return self._checked(study, facts)
+        raise InputError(f"sweep {self.study}", "must have been begun", None, "Run neuspring tune first.")
+
+    def _checked(self, study: Study, facts: Mapping[str, Any]) -> Study:
+        definition = {name: study.user_attrs[DEFINITION].get(name) for name in facts}
+        if canonical(definition) != canonical(facts):
+            before, after = flat(definition), flat(facts)
+            changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
+            rule, where = "must go on with what it was begun with", "" if self.uri else f" ({self.folder})"
+            remedy = f"Name a new sweep (tune.study), or delete this one{where}."
+            raise InputError(f"sweep {self.study}", rule, f"another {', '.join(changed)}", remedy)
+        return study
+
+    def _storage(self) -> RDBStorage:
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        if self.uri is None:
+            path = str((self.folder / DATABASE).resolve())
+            uri = sqlalchemy.URL.create("sqlite", database=path).render_as_string()
+            return RDBStorage(uri, engine_kwargs={"connect_args": {"timeout": PATIENCE}})
+        try:
+            # A server may close connections that are idle during a long fit.
+            return RDBStorage(self.uri, engine_kwargs={"pool_pre_ping": True})
+        except ImportError as error:
+            raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A place for one trial, with the trials that were begun for it, oldest first. The last one decides."""
+
+    number: int
+    trials: tuple[FrozenTrial, ...]
+
+    @property
+    def state(self) -> Literal["complete", "pruned", "failed", "running", "waiting", "free"]:
+        """Free: all its trials were left behind or crashed, too few times to give up. Waiting: about to run."""
+        last = self.trials[-1]
+        if last.state != TrialState.FAIL:
+            return last.state.name.lower()  # type: ignore[return-value]
+        return "failed" if REASON in last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
+
+    @property
+    def reason(self) -> str:
+        """Why it was pruned or failed, empty otherwise."""
+        attributes = self.trials[-1].user_attrs
+        if self.state not in ("pruned", "failed"):
+            return ""
+        given_up = f"given up after {len(self.trials)} attempts, the last: {attributes.get(CRASH, 'its worker was killed')}"
+        return str(attributes.get(REASON, given_up))
+
+
+def slots(study: Study) -> dict[int, Slot]:
+    """The slots for which trials were begun, in order."""
+    trials: dict[int, list[FrozenTrial]] = {}
+    for trial in study.get_trials(deepcopy=False):
+        trials.setdefault(trial.user_attrs[SLOT], []).append(trial)
+    return {number: Slot(number, tuple(trials[number])) for number in sorted(trials)}
+
+
+def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampler: Callable[[int], BaseSampler]) -> Trial | None:
+    """A trial of the lowest free slot, None if there is none. `first` are the values of slot 0; each slot has its `sampler`.
+
+    The caller holds the sweep's lock, is the only process that is `worker`, and runs no other trial.
+    """
+    for running in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        owner = running.user_attrs.get(WORKER)
+        # Left behind by this worker's earlier process; by a process killed under this lock, before it named its worker; or by a
+        # worker that the configuration no longer has.
+        if owner in (None, worker) or owner >= tune.workers:
+            study.tell(running.number, state=TrialState.FAIL)
+    begun = slots(study)
+    # A trial that waits was left between being queued and being taken.
+    number = next((n for n, slot in begun.items() if slot.state == "waiting"), None)
+    if number is None:
+        number = next((n for n in range(tune.trials) if n not in begun or begun[n].state == "free"), None)
+        if number is None:
+            return None
+        values = begun[number].trials[-1].params if number in begun else {}
+        study.enqueue_trial((dict(first) if number == 0 else {}) | values, user_attrs={SLOT: number})
+    study.sampler = sampler(number)
+    trial = study.ask()
+    trial.set_user_attr(WORKER, worker)
+    return trial
 
 
 def sampler_of(tune: Tune, slot: int, *, grouped: bool) -> BaseSampler:
@@ -118,32 +250,22 @@ def work(
     store = Store(folder, tune.storage, tune.study)
     study = store.open(facts, pruner_of(tune, len(scenes), plan.epochs))
     finished: list[int] = []
-    with _only(folder, worker):
-        while True:
-            with store.lock():
-                trial = claim(study, worker, tune, first, sampler)
-            if trial is None:
-                break
-            slot = trial.user_attrs[SLOT]
-            outcome = _attempt(study, trial, plan, scenes, folder, device)
-            write_trial(plan, study.user_attrs[DEFINITION], slots(study)[slot], folder)
-            finished.append(slot)
-            done(slot, outcome)
+    try:
+        with FileLock(folder / f".worker-{worker}.lock", timeout=0):
+            while True:
+                with store.lock():
+                    trial = claim(study, worker, tune, first, sampler)
+                if trial is None:
+                    break
+                outcome = _attempt(study, trial, plan, scenes, folder, device)
+                finished.append(trial.user_attrs[SLOT])
+                done(finished[-1], outcome)
+    except Timeout as error:
+        rule = "one process at a time may be this worker"
+        raise InputError("--worker", rule, worker, "Wait for the other one to end.") from error
     content = {"study": tune.study, "worker": worker, "slots": finished, "ended": now(), "device": device}
     content |= {"format": RECORD_FORMAT, "host": socket.gethostname()}
     write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
-
-
-@contextlib.contextmanager
-def _only(folder: Path, worker: int) -> Iterator[None]:
-    """Be the only process with this number. Raises InputError if there is another."""
-    try:
-        with FileLock(folder / f".worker-{worker}.lock", timeout=0):
-            yield
-    except Timeout as error:
-        raise InputError(
-            "--worker", "one process at a time may be this worker", worker, "Wait for the other one to end."
-        ) from error
 
 
 def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], folder: Path, device: str) -> str:
