@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import fnmatch
 import shlex
-import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +29,6 @@ from neuspring.config import (
     read_yaml,
 )
 from neuspring.config.images import Appearance
-from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, read_scenarios
 from neuspring.perception.backends import BACKENDS
@@ -130,32 +128,6 @@ def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
     values = plain(settings)
     merge(values, own)
     return values
-
-
-def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmark:
-    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
-    benchmark = Benchmark.of(values, root)
-    if benchmark.config.tune:
-        # Optuna takes a second to import.
-        from neuspring.experiments.tuning.space import Plan
-
-        Plan.of(benchmark.config, benchmark.config.tune, root)
-        check_storage(benchmark.config.tune, cluster=cluster)
-    results = Path(benchmark.config.results)
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=results).close()
-    except OSError as error:
-        where, rule = f"configuration, results ({results})", "this folder must be writable"
-        raise InputError(where, rule, error.strerror, "Choose another: --config results=...") from error
-    return benchmark
-
-
-def check_storage(tune: Tune, *, cluster: bool) -> None:
-    """Raise InputError if workers of a sweep on several machines would share an SQLite file, whose locks hold within one alone."""
-    if cluster and tune.workers > 1 and tune.storage is None:
-        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
-        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What jobs need, as far as earlier jobs of the results folder tell it: GPUs of this machine, memory, time; the plan of a run.
+"""What the Snakefile asks before any job exists: a checked benchmark, GPUs of this machine, memory and time of jobs, the plan.
 
 A job asks for somewhat more than the most that earlier jobs of its rule needed, on the same scenario if there were any. Without
 earlier jobs it asks for its stage's first request (`memory_mb`, `minutes`). The plan adds up medians, and names the rules of which
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import statistics
+import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,10 +20,12 @@ from typing import Any, Literal
 
 from neuspring.config import Config
 from neuspring.config.gpus import Gpus
+from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
+from neuspring.experiments.tuning.space import Plan
 from neuspring.stages import STAGES
 
 Kind = Literal["cpu", "gpu"]
@@ -49,6 +52,29 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
     "log_sweep": (2000, 30),
 }
 """Rule -> MB and minutes to ask for, before any job of it was measured."""
+
+
+def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmark:
+    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
+    benchmark = Benchmark.of(values, root)
+    if benchmark.config.tune:
+        Plan.of(benchmark.config, benchmark.config.tune, root)
+        check_storage(benchmark.config.tune, cluster=cluster)
+    results = Path(benchmark.config.results)
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=results).close()
+    except OSError as error:
+        where, rule = f"configuration, results ({results})", "this folder must be writable"
+        raise InputError(where, rule, error.strerror, "Choose another: --config results=...") from error
+    return benchmark
+
+
+def check_storage(tune: Tune, *, cluster: bool) -> None:
+    """Raise InputError if workers of a sweep on several machines would share an SQLite file, whose locks hold within one alone."""
+    if cluster and tune.workers > 1 and tune.storage is None:
+        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
+        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
 
 
 def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:

@@ -19,8 +19,9 @@ from neuspring.config.search import HANDS
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
-from neuspring.experiments.benchmark import Benchmark, check_storage
+from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.inputs import Inputs
+from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
 from tests.support.captures import describe

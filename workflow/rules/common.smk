@@ -17,7 +17,6 @@ from neuspring.core.errors import InputError
 from neuspring.core.provenance import code_digest
 from neuspring.experiments import needs
 from neuspring.experiments.arguments import Arguments
-from neuspring.experiments.benchmark import checked
 from neuspring.experiments.inputs import Inputs, one_of, options
 from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
@@ -52,7 +51,7 @@ def or_workflow_error(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
-BENCHMARK = or_workflow_error(checked, config, ROOT, cluster=CLUSTER)
+BENCHMARK = or_workflow_error(needs.checked, config, ROOT, cluster=CLUSTER)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
