@@ -18,6 +18,7 @@ import warp as wp
 from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load, start_warp
 from neuspring.physics.lanes import lanes, width_for
+from neuspring.physics.parameters import PARAMETERS, Parameters
 
 
 @functools.cache
@@ -33,7 +34,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     table: Any = wp.array2d(dtype=int)
     reals: Any = wp.array2d(dtype=real)
 
-    @wp.struct
     class Model:
         nodes: int
         controllers: int
@@ -53,14 +53,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         counts: of_twin
         substep: of_twin
         inverse_time: of_twin
-        decay: of_twin
-        ground_e: of_twin
-        ground_mu: of_twin
-        contact_e: of_twin
-        contact_mu: of_twin
-        distance: of_twin
-        inverse_mass: numbers
-        springs: vectors
         near: lists
         near_lanes: lists
         near_count: table
@@ -76,21 +68,19 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         moving: slots
         force: vectors
 
-    @wp.struct
     class Adjoint:
         x: vectors
         v: vectors
         moving: vectors
         after: vectors
         force: slots
-        springs: vectors
-        decay: numbers
-        ground_e: numbers
-        ground_mu: numbers
-        contact_e: numbers
-        contact_mu: numbers
 
-    return Model, State, Adjoint
+    kinds = {"spring": vectors, "node": numbers, "twin": of_twin}
+    Model.__annotations__ |= {name: kinds[parameter.per] for name, parameter in PARAMETERS.items()}
+    # The part of each node in the gradient of a twin's number.
+    kinds["twin"] = numbers
+    Adjoint.__annotations__ |= {name: kinds[parameter.per] for name, parameter in PARAMETERS.items() if parameter.trained}
+    return wp.struct(Model), State, wp.struct(Adjoint)
 
 
 class Buffers:
@@ -197,6 +187,38 @@ class Buffers:
         twins = source.permute(1, 2, 0).reshape(self.groups * self.width, len(source))
         # Contiguous, so that the sum over a twin's numbers takes the same order whatever the width.
         return twins[: self.twins].contiguous()
+
+    def add_parameters(self, springs: int) -> None:
+        """Add what is declared in parameters.py, and its adjoints."""
+        for name, parameter in PARAMETERS.items():
+            adjoint = {f"adj_{name}"} if parameter.trained else set()
+            if parameter.per == "spring":
+                self.add_vectors(**dict.fromkeys({name} | adjoint, (springs,)))
+            else:
+                size = self.nodes if parameter.per == "node" else None
+                self.add_numbers(**{name: size}, **dict.fromkeys(adjoint, self.nodes))
+
+    def set_parameter(self, name: str, values: torch.Tensor) -> None:
+        """Take a parameter with a leading axis [B]; one of springs in the caller's order."""
+        per = PARAMETERS[name].per
+        if per == "spring":
+            self.set_vectors(name, values.index_select(1, self.indices["order"]))
+        else:
+            self.set_numbers(name, values.expand(-1, self.nodes) if per == "node" else values)
+
+    def gradients(self) -> Parameters:
+        """dL/d(parameters) [B, ...] of those that are trained."""
+        result = {}
+        for name, parameter in PARAMETERS.items():
+            if parameter.trained and parameter.per == "spring":
+                own = self.get_vectors(f"adj_{name}")
+                # The kernels leave the factor Y of dL/d(1 / l0) to the end.
+                own[..., 1] *= self.get_vectors(name)[..., 0]
+                result[name] = own.index_select(1, self.indices["ranks"])
+            elif parameter.trained:
+                of_nodes = self.get_numbers(f"adj_{name}")
+                result[name] = of_nodes if parameter.per == "node" else of_nodes.sum(dim=1)
+        return result
 
     def _padded(self, values: torch.Tensor) -> torch.Tensor:
         spare = self.groups * self.width - self.twins

@@ -1,7 +1,7 @@
 """Self-collision by impulses between near nodes (Jacobi), and its adjoint.
 
 Node i takes the mean impulse over its listed partners j that are closer than the contact distance and approach, by the response of
-contact.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody else keeps its momentum.
+motion.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody else keeps its momentum.
 
 Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost grows with the
 nodes. A list is in node order; where a twin has more than `collision_capacity`, those with the lowest indices stay.
@@ -16,9 +16,9 @@ import torch
 import warp as wp
 
 from neuspring.core.device import load
-from neuspring.physics import contact
 from neuspring.physics.arrays import Buffers, structs
 from neuspring.physics.lanes import lanes
+from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
@@ -40,8 +40,7 @@ class Functions(NamedTuple):
 
 
 def allocate(b: Buffers) -> None:
-    """Response and distance; with self-collision also the lists of partners and the velocities after collisions."""
-    b.add_numbers(contact_e=None, contact_mu=None, distance=None, adj_contact_e=b.nodes, adj_contact_mu=b.nodes)
+    """With self-collision, the lists of partners and the velocities after collisions."""
     if not b.simulation.self_collision:
         return
     capacity, twins = b.simulation.collision_capacity, b.groups * b.width
@@ -162,7 +161,7 @@ def functions(real: Any, width: int) -> Functions:
     dot, root, column, put = lane.dot, lane.root, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
-    approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
+    approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
     @wp.func
     def hits(mask: int, q: int, length: real, closing: real, distance: real) -> bool:

@@ -77,7 +77,7 @@ class Grips:
         return lengths
 
     def applied(self, packed: torch.Tensor, lengths: torch.Tensor | None) -> torch.Tensor:
-        """Parameters [..., S, 3] of springs (springs.pack) with rest lengths [..., L], and the stiffness that goes with them."""
+        """Parameters [..., S, 3] of springs with rest lengths [..., L], and the stiffness that goes with them."""
         if lengths is None:
             return packed
         stiffness, inverse, dashpot = packed[..., self.springs, :].unbind(dim=-1)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuspring.physics import collision, obstacles, position, springs, velocity
+from neuspring.physics import collision, motion, obstacles, springs
 from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import lanes
 
@@ -39,12 +39,12 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def _open(real: Any, width: int) -> position.Functions:
-    """The motion of position.py, with a last argument that it has no use for."""
+def _open(real: Any, width: int) -> motion.Position:
+    """The positions of motion.py, with a last argument that they have no use for."""
     lane = lanes(real, width)
     Vector, Number = lane.Vector, lane.Number
     Table: Any = wp.array2d(dtype=real)
-    plain, plain_adjoint = position.functions(real, width)
+    plain, plain_adjoint = motion.position(real, width)
 
     @wp.func
     def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, table: Table):
@@ -56,7 +56,7 @@ def _open(real: Any, width: int) -> position.Functions:
         adj_x, adj_v, adj_e, adj_mu = plain_adjoint(p, w, dt, up, e, mu, hx, hv)
         return adj_x, adj_v, adj_e, adj_mu
 
-    return position.Functions(moved, moved_adjoint)
+    return motion.Position(moved, moved_adjoint)
 
 
 @functools.cache
@@ -65,11 +65,10 @@ def kernels(real: Any, width: int, among: bool = False) -> Kernels:
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
-    spring, speed = springs.functions(real, width), velocity.functions(real, width)
-    move_controller, updated, updated_adjoint = speed
-    moved, moved_adjoint = obstacles.functions(real, width) if among else _open(real, width)
+    move_controller, updated, updated_adjoint = motion.velocity(real, width)
+    moved, moved_adjoint = obstacles.position(real, width) if among else _open(real, width)
     collided, collided_adjoint = collision.functions(real, width)
-    add_row, add_row_adjoint, gathered, gathered_adjoint = spring[2:]
+    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)[2:]
 
     @wp.func
     def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):

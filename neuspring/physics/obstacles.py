@@ -1,9 +1,9 @@
 """Motion among static obstacles, with or without a ground plane z = 0, and its adjoint. Used only where there are obstacles.
 
 A node at x with velocity v that would pass a surface inwards within the substep is reflected at its time of impact, as by the
-ground (position.py). With n the outward normal, d the distance of x from the surface along n, and s = v . n < 0,
+ground (motion.py). With n the outward normal, d the distance of x from the surface along n, and s = v . n < 0,
 
-    toi = -d / s,   x' = x + v toi + v' (dt - toi),   v' = a (v - s n) - e s n    (contact.py, with the ground's e and mu).
+    toi = -d / s,   x' = x + v toi + v' (dt - toi),   v' = a (v - s n) - e s n    (with the ground's e and mu).
 
 The surface is that of the box's face through which the node enters (inside already: of the nearest face), or the sphere's tangent
 plane nearest to x. Of several contacts, the ground among them, the one that is first in time acts.
@@ -17,10 +17,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from neuspring.physics import contact
 from neuspring.physics.arrays import Buffers
 from neuspring.physics.lanes import lanes
-from neuspring.physics.position import Functions
+from neuspring.physics.motion import APPROACH, MIN_TANGENT, Position
 
 NEVER = 1e30
 """s; the time of an impact that does not come."""
@@ -34,14 +33,14 @@ def allocate(b: Buffers) -> None:
 
 
 @functools.cache
-def functions(real: Any, width: int) -> Functions:
-    """Functions for a scalar type and a number of lanes: those of position.py, with obstacles [O, 16] as a last argument."""
+def position(real: Any, width: int) -> Position:
+    """Functions for a scalar type and a number of lanes: those of motion.py, with obstacles [O, 16] as a last argument."""
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
     Table: Any = wp.array2d(dtype=real)
     zero, one, never = wp.constant(real(0.0)), wp.constant(real(1.0)), wp.constant(real(NEVER))
-    approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
+    approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
     @wp.func
     def count() -> int:
@@ -190,4 +189,4 @@ def functions(real: Any, width: int) -> Functions:
                 adj_mu[q] = gmu
         return adj_x, adj_v, adj_e, adj_mu
 
-    return Functions(moved, moved_adjoint)
+    return Position(moved, moved_adjoint)

@@ -12,8 +12,8 @@ from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.obstacles import Obstacle
-from neuspring.physics.contact import APPROACH, MIN_TANGENT
 from neuspring.physics.lanes import MIN_LENGTH
+from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 
 @dataclass(frozen=True)

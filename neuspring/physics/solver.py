@@ -1,47 +1,33 @@
-"""One frame of simulation, forward and backward, of one twin or of several at once: a launch on a CPU, a captured graph on CUDA.
+"""A frame of simulation as a differentiable function of torch tensors, of one twin or of several at once.
 
-Memory is substeps x nodes x twins and does not grow with the number of frames: longer gradients run each frame again from its
-stored start (see `autograd.py`).
+`FrameSolver` is a frame forward and backward: a launch on a CPU, a captured graph on CUDA. Its memory is substeps x nodes x twins.
+`simulate_frame` is the same for autograd. Chained frames give gradients over any horizon: only the states between frames are kept,
+and a frame whose substeps are no longer in the solver's buffers is simulated again from its start before its backward pass.
+
+Several twins of the same nodes and controllers may have topologies of their own (`union`). A twin's spring that another one lacks
+is there for both, and has no stiffness and no dashpot in the other: it adds nothing. The springs of a node are summed in the order
+of its partners, so that a twin moves, bit for bit, as in a solver of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
-from neuspring.core.artifacts import Simulation
+from neuspring.core.artifacts import Simulation, Topology, Twin
 from neuspring.core.device import load
 from neuspring.core.errors import InputError
-from neuspring.physics import collision, contact, frame, obstacles, position, springs, velocity
+from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
-from neuspring.physics.controllers import Grips, begins
+from neuspring.physics.controllers import Grips, begins, begun
+from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """What may differ between the simulations of one solver; it does not read the last."""
-
-
-class Parameters(NamedTuple):
-    """Physical parameters as the kernels take them, tensors of the solver's dtype and device. Made by `pack`.
-
-    Several twins have a leading axis [B].
-    """
-
-    springs: torch.Tensor
-    """[S, 3]: stiffness [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent."""
-    decay: torch.Tensor
-    """[1]: exp(-substep * drag)."""
-    ground: torch.Tensor
-    """[2]: elasticity in [0, 1], friction in [0, 2]."""
-    contact: torch.Tensor
-    """[2]: the same between nodes."""
-    distance: torch.Tensor
-    """[1]: contact distance, m. No gradient: it only selects pairs."""
-    inverse_mass: torch.Tensor
-    """[N], 1/kg, or [1] for all nodes. No gradient: masses are not trained."""
 
 
 def _check(simulations: Sequence[Simulation]) -> None:
@@ -84,9 +70,10 @@ class FrameSolver:
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
         threads = device != "cpu" if threads is None else threads
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
+        self.buffers.add_parameters(len(spring_pairs))
         springs.allocate(self.buffers, spring_pairs)
-        for term in (velocity, collision, position, obstacles):
-            term.allocate(self.buffers)
+        collision.allocate(self.buffers)
+        obstacles.allocate(self.buffers)
         self._kernels = frame.kernels(self.buffers.real, self.buffers.width, bool(self.simulation.obstacles))
         self._graphs = Graphs(device)
         self.grips = Grips(spring_pairs, nodes, device)
@@ -102,16 +89,12 @@ class FrameSolver:
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Copy packed parameters into the solver's buffers."""
-        b, values = self.buffers, Parameters(*map(self._stacked, parameters))
-        springs.fill(b, values.springs)
-        self._plain, self._factor, self._held = values.springs.detach(), None, None
-        velocity.fill(b, values.decay)
-        for kind in ("ground", "contact"):
-            contact.fill(b, kind, getattr(values, kind))
-        b.set_numbers("distance", values.distance[:, 0])
-        velocity.fill_masses(b, values.inverse_mass)
+        values = {name: self._stacked(parameters[name]) for name in PARAMETERS}
+        for name, value in values.items():
+            self.buffers.set_parameter(name, value)
+        self._plain, self._factor, self._held = values["springs"].detach(), None, None
         if self.simulation.self_collision:
-            self._reach = float(values.distance.max())
+            self._reach = float(values["distance"].max())
 
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
@@ -161,7 +144,7 @@ class FrameSolver:
             self._factor[:, self.grips.springs, 0] = acting  # Y
             self._factor[:, self.grips.springs, 2] = acting  # gamma
         own = self.grips.applied(self._plain, self._held)
-        springs.fill(self.buffers, own if self._factor is None else own * self._factor)
+        self.buffers.set_parameter("springs", own if self._factor is None else own * self._factor)
 
     def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
         """Hold what was held after the frames of `rows` [T, C, K] of waypoints, in which the nodes were at `positions` [N, 3], m.
@@ -185,26 +168,25 @@ class FrameSolver:
         return self.buffers.slot(self.buffers.substeps)
 
     def run(
-        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
+        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: Parameters
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """`forward` with these `Parameters`."""
-        self.set_parameters(Parameters(*packed))
+        """`forward` with these parameters."""
+        self.set_parameters(parameters)
         return self.forward(x, v, begin, end)
 
-    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Adjoints of the last forward frame: of x, v and each of `Parameters`; None for contact distance and masses."""
-        assert self._held is None, "gradients of a grip need its rest lengths among the parameters: autograd.simulate_frame"
+    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, Parameters]:
+        """Adjoints of the last forward frame: of x, of v, and of each parameter that is trained, by name."""
+        assert self._held is None, "gradients of a grip need its rest lengths among the parameters: simulate_frame"
         b = self.buffers
         self.clear_adjoints()
         b.set_vectors("adj_x", self._stacked(adj_x))
         b.set_vectors("adj_v", self._stacked(adj_v))
         self._run("backward", self.launch_backward)
-        state = (b.get_vectors("adj_x", count=self.nodes), b.get_vectors("adj_v", count=self.nodes))
-        of_springs = springs.gradient(b)
+        gradients = b.gradients()
         if self._factor is not None:
-            of_springs = of_springs * self._factor
-        own = (of_springs, velocity.gradient(b), *(contact.gradient(b, kind) for kind in ("ground", "contact")))
-        return *map(self._one, (*state, *own)), None, None
+            gradients["springs"] *= self._factor
+        x, v = (self._one(b.get_vectors(name, count=self.nodes)) for name in ("adj_x", "adj_v"))
+        return x, v, {name: self._one(gradient) for name, gradient in gradients.items()}
 
     def clear_adjoints(self) -> None:
         """Set all adjoints to zero."""
@@ -274,3 +256,89 @@ class FrameSolver:
             elif step == b.substeps - 1:
                 b.launch(k.settle, size, *arguments, step)
             b.launch(k.pull, size, *arguments, step)
+
+
+class Frame(torch.autograd.Function):
+    """A frame of any solver that has the three members used here.
+
+    `run(begin, end, x, v, parameters)` simulates a frame and returns (x, v). `backward(adj_x, adj_v)` returns the adjoints of x
+    and v in the last frame, and those of parameters by name. `frame_token` counts the frames.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, solver: Any, names: Sequence[str], *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+        """(x, v) after the frame, from begin, end, x, v, and the parameters of these names."""
+        ctx.solver, ctx.names = solver, names
+        state = Frame._run(ctx, inputs)
+        ctx.token = solver.frame_token
+        ctx.save_for_backward(*inputs)
+        return state
+
+    @staticmethod
+    def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+        """Adjoints of the inputs; none of the controllers' path."""
+        if ctx.solver.frame_token != ctx.token:
+            Frame._run(ctx, ctx.saved_tensors)
+        x, v, gradients = ctx.solver.backward(adj_x, adj_v)
+        return None, None, None, None, x, v, *(gradients.get(name) for name in ctx.names)
+
+    @staticmethod
+    def _run(ctx: Any, inputs: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        state: tuple[torch.Tensor, torch.Tensor] = ctx.solver.run(*inputs[:4], dict(zip(ctx.names, inputs[4:], strict=True)))
+        return state
+
+
+def simulate_frame(
+    solver: Any, parameters: Parameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`, solvers as in `Frame`.
+
+    Rest lengths are those of the parameters: where grips begin later than frame 0, put theirs there first (`controllers.Grips`).
+    """
+    inputs = begun(begin), end, x, v, *parameters.values()
+    state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, tuple(parameters), *inputs)  # type: ignore[no-untyped-call]
+    return state
+
+
+def solver_for(
+    twins: Twin | Sequence[Twin], device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True
+) -> FrameSolver:
+    """A solver with parameters set: of a twin, or of several of the same nodes and controllers, whose tensors have an axis [B]."""
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
+    first = twins.topology if isinstance(twins, Twin) else twins[0].topology
+    if isinstance(twins, Twin):
+        solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)
+        solver.set_parameters(packed(twins, device, dtype))
+        return solver
+    pairs, places = union([twin.topology for twin in twins])
+    solver = FrameSolver(pairs, len(first.nodes), len(first.controllers), [twin.simulation for twin in twins], **options)
+    solver.set_parameters(stacked([packed(twin, device, dtype) for twin in twins], places, len(pairs)))
+    return solver
+
+
+def union(topologies: Sequence[Topology]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """All springs [S, 2] of several topologies, and for each topology where its own springs stand among them."""
+    total = len(topologies[0].nodes) + len(topologies[0].controllers)
+    codes = [np.sort(t.springs.astype(np.int64), axis=1) @ np.array([total, 1]) for t in topologies]
+    every = np.unique(np.concatenate(codes))
+    return np.stack([every // total, every % total], axis=1).astype(np.int32), [np.searchsorted(every, c) for c in codes]
+
+
+def stacked(each: Sequence[Parameters], places: Sequence[np.ndarray], springs: int) -> Parameters:
+    """The parameters of several twins with a leading axis [B], their springs put where they stand among all `springs`."""
+    result = {}
+    for name, parameter in PARAMETERS.items():
+        values = [one[name] for one in each]
+        if parameter.per == "spring":
+            own, values = values, [value.new_zeros((springs, *value.shape[1:])) for value in values]
+            for target, value, place in zip(values, own, places, strict=True):
+                target[torch.as_tensor(place, device=target.device)] = value
+        # Masses of all nodes at once and of each node may meet.
+        result[name] = torch.stack(torch.broadcast_tensors(*values))
+    return result
+
+
+def unstacked(gradients: Parameters, lane: int, place: np.ndarray) -> Parameters:
+    """The gradients of one of several twins, whose springs stand at `place` among all springs."""
+    index = torch.as_tensor(place, device=gradients["springs"].device)
+    return {name: each[lane][index] if PARAMETERS[name].per == "spring" else each[lane] for name, each in gradients.items()}

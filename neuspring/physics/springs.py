@@ -11,11 +11,9 @@ partners in ascending order both ways, so both give the same numbers.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 import warp as wp
 
 from neuspring.physics.arrays import Buffers, structs
@@ -74,30 +72,10 @@ class Graph(NamedTuple):
         )
 
 
-def pack(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """Parameters [S, 3] of springs: Y [N], 1 / l0 [1/m], gamma [N s/m]."""
-    stiffness = values["stiffness"]
-    return torch.stack([stiffness, 1.0 / values["rest_lengths"], values["dashpot"].expand_as(stiffness)], dim=-1)
-
-
 def allocate(b: Buffers, pairs: np.ndarray) -> None:
     """Springs between `pairs` [S, 2] of points."""
     graph = Graph.of(pairs, b.nodes)
     b.add_integers(**{name: getattr(graph, name) for name in Graph._fields})
-    b.add_vectors(springs=(len(pairs),), adj_springs=(len(pairs),))
-
-
-def fill(b: Buffers, packed: torch.Tensor) -> None:
-    """Take parameters [B, S, 3]."""
-    b.set_vectors("springs", packed.index_select(1, b.indices["order"]))
-
-
-def gradient(b: Buffers) -> torch.Tensor:
-    """dL/d(packed parameters) [B, S, 3]."""
-    ordered, own = b.get_vectors("adj_springs"), b.get_vectors("springs")
-    # The kernels leave the factor Y of dL/d(1 / l0) to the end.
-    ordered[..., 1] *= own[..., 0]
-    return ordered.index_select(1, b.indices["ranks"])
 
 
 @functools.cache

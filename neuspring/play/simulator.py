@@ -14,9 +14,8 @@ import torch
 
 from neuspring.core.artifacts import Twin
 from neuspring.physics import stability
-from neuspring.physics.autograd import solver_for
 from neuspring.physics.controllers import BEGINS
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.rollout import FAR, Diverged
 
 REST = 1e-6

@@ -10,17 +10,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from neuspring.physics.population import stacked, union
-from neuspring.physics.solver import FrameSolver, Parameters
+from neuspring.physics.solver import FrameSolver, stacked, union, unstacked
 
 T = TypeVar("T")
-Results = tuple[torch.Tensor | None, ...]
+Results = tuple[Any, ...]
+"""(x, v) of a frame, or the adjoints of x, v and of parameters by name."""
 
 
 class Seat:
@@ -33,7 +33,7 @@ class Seat:
         """Changes with every frame that the shared solver simulates: tells whether it still holds a given one."""
         self.collision_overflow = 0
         """Collision candidates of this twin that did not fit the lists so far."""
-        self.request: tuple[str, Sequence[torch.Tensor]] | None = None
+        self.request: tuple[str, Sequence[Any]] | None = None
         self.answer: Results | BaseException | None = None
 
     def sit(self, twin: Twin) -> Seat:
@@ -41,7 +41,7 @@ class Seat:
         self.company.seat(self, twin)
         return self
 
-    def run(self, *inputs: torch.Tensor) -> Results:
+    def run(self, *inputs: Any) -> Results:
         """As `FrameSolver.run`."""
         return self.company.ask(self, "run", inputs)
 
@@ -86,7 +86,7 @@ class Company:
             self._end = reason
             self._turn.notify_all()
 
-    def ask(self, seat: Seat, what: str, inputs: Sequence[torch.Tensor]) -> Results:
+    def ask(self, seat: Seat, what: str, inputs: Sequence[Any]) -> Results:
         """Wait for the launch that serves a request."""
         with self._turn:
             seat.request, seat.answer = (what, inputs), None
@@ -117,15 +117,15 @@ class Company:
                 for seat, answer in zip(asking, serve(asking, inputs), strict=True):
                     seat.request, seat.answer = None, answer
 
-    def _run(self, asking: list[Seat], inputs: Sequence[Sequence[torch.Tensor]]) -> list[Results]:
+    def _run(self, asking: list[Seat], inputs: Sequence[Sequence[Any]]) -> list[Results]:
         if self._stale or self._solver is None:
             self._solver = self._made()
         solver, lanes = self._solver, [self._members.index(seat) for seat in asking]
         # A lane that nobody asks for repeats the first that is asked for.
         source = [lanes.index(lane) if lane in lanes else 0 for lane in range(len(self._members))]
-        begin, end, x, v, *_ = (torch.stack([inputs[k][place] for k in source]) for place in range(4))
+        begin, end, x, v = (torch.stack([inputs[k][place] for k in source]) for place in range(4))
         places = [self._places[lanes[k]] for k in source]
-        parameters = stacked([Parameters(*inputs[k][4:]) for k in source], places, self._springs)
+        parameters = stacked([inputs[k][4] for k in source], places, self._springs)
         before = solver.overflows if solver.simulation.self_collision else None
         solver.set_parameters(parameters)
         after = solver.forward(x, v, begin, end)
@@ -136,7 +136,7 @@ class Company:
                 seat.collision_overflow += solver.overflows[lane] - before[lane]
         return [(after[0][lane].clone(), after[1][lane].clone()) for lane in lanes]
 
-    def _backward(self, asking: list[Seat], inputs: Sequence[Sequence[torch.Tensor]]) -> list[Results]:
+    def _backward(self, asking: list[Seat], inputs: Sequence[Sequence[Any]]) -> list[Results]:
         solver = self._solver
         assert solver is not None
         zero = torch.zeros_like(inputs[0][0])
@@ -144,15 +144,8 @@ class Company:
         adj_x, adj_v = (
             torch.stack([given[lane][place] if lane in given else zero for lane in range(len(self._members))]) for place in (0, 1)
         )
-        x, v, springs, *rest = solver.backward(adj_x, adj_v)
-        assert x is not None
-        assert v is not None
-        assert springs is not None
-        results = []
-        for lane in given:
-            own = springs[lane][torch.as_tensor(self._places[lane], device=springs.device)]
-            results.append((x[lane], v[lane], own, *(None if values is None else values[lane] for values in rest)))
-        return results
+        x, v, gradients = solver.backward(adj_x, adj_v)
+        return [(x[lane], v[lane], unstacked(gradients, lane, self._places[lane])) for lane in given]
 
     def _made(self) -> FrameSolver:
         """A solver of all active seats."""

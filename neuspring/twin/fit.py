@@ -31,9 +31,9 @@ from neuspring.core.checkpoint import Checkpoint
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
-from neuspring.physics.autograd import simulate_frame, solver_for
 from neuspring.physics.controllers import Grips, waypoints
-from neuspring.physics.solver import FrameSolver, Parameters
+from neuspring.physics.parameters import Parameters
+from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
 from neuspring.twin.company import Seat
 from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.motion import initial_velocity
@@ -211,7 +211,7 @@ class TwinFit:
         `max_substeps`) and the bound is passed.
         """
         packed = self.parameters.pack(self.twin.simulation.substep)
-        springs = packed.springs.detach().double().cpu().numpy()
+        springs = packed["springs"].detach().double().cpu().numpy()
         if not np.isfinite(springs).all():
             raise NonFinite("a spring's stiffness, rest length or dashpot is not finite")
         count = self._needed_substeps(springs[:, 0] * springs[:, 1], springs[:, 2])
@@ -301,7 +301,7 @@ class TwinFit:
         x, v, lengths = state
         lengths = self.grips.taken(lengths, x, self.hands[frame - 1])
         if lengths is not None:
-            packed = packed._replace(springs=self.grips.applied(packed.springs, lengths))
+            packed = packed | {"springs": self.grips.applied(packed["springs"], lengths)}
         return *simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame]), lengths
 
     def _simulate(self, state: _Motion, window: range, packed: Parameters) -> tuple[_Motion, torch.Tensor]:

@@ -28,13 +28,11 @@ from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.physics import contact
-from neuspring.physics.autograd import pack, twin_tensors
-from neuspring.physics.solver import Parameters
+from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
 from neuspring.twin.unloaded import UnloadedShape
 
-CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction")
+CONTACT_SCALARS = tuple(LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
 """Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
 SPRING_FACTORS = ("stiffness", "dashpot")
@@ -177,7 +175,7 @@ class TwinParameters(nn.Module):
         return factor
 
     def physical(self) -> dict[str, torch.Tensor]:
-        """Every physical parameter, with the keyword names of `autograd.pack`."""
+        """Every physical parameter, with the keyword names of `physics.parameters.pack`."""
         s, values, raw = self.settings, dict(self.start), self.raw()
         stiffness = self.start["stiffness"] * (self.deviation(raw["stiffness"]) * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
@@ -230,8 +228,7 @@ class TwinParameters(nn.Module):
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
         material: dict[str, Any] = {}
         for name in (f.name for f in fields(twin.material) if f.name not in UNTRAINED):
-            limits = contact.RANGES.get(name.rpartition("_")[2], (-np.inf, np.inf))
-            value = np.clip(values[name], *limits)
+            value = np.clip(values[name], *LIMITS.get(name, (-np.inf, np.inf)))
             material[name] = value if value.ndim else float(value)
         topology = twin.topology
         if self.settings.rest_length_bound or self.unloaded is not None:

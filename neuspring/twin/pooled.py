@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.physics.solver import Parameters
+from neuspring.physics.parameters import Parameters
 from neuspring.twin.company import Seat
 from neuspring.twin.fit import FitProblem, TwinFit
 from neuspring.twin.recordings import on_recording, require_pool

@@ -9,9 +9,8 @@ import torch
 
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.physics import stability
-from neuspring.physics.autograd import solver_for
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.solver import FrameSolver, solver_for
 
 FAR = 1e3
 """A node this far from the origin has left any plausible scene, m."""

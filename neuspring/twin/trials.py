@@ -16,8 +16,7 @@ import warp as wp
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
-from neuspring.physics.population import solver_of
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.trial_kernels import Kernels, kernels
 
@@ -41,7 +40,7 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 
     hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them; or those of each twin, [T, B, C, 3].
     """
-    solver = solver_of(twins, device, differentiable=False)
+    solver = solver_for(twins, device, differentiable=False)
     count = len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
@@ -62,7 +61,7 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], or
     [T, B, C, 3] of each twin, on the CPU."""
-    solver, count = solver_of(twins, device, differentiable=False), len(twins)
+    solver, count = solver_for(twins, device, differentiable=False), len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
     every = _of_each(hands, count)

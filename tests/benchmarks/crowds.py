@@ -15,7 +15,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
 from neuspring.physics import frame
 from neuspring.physics.lanes import WIDTHS
-from neuspring.physics.population import union
+from neuspring.physics.solver import union
 from neuspring.twin import trial_kernels
 from neuspring.twin.search import SearchProblem, SearchResult, search
 from tests.benchmarks.plush import problem

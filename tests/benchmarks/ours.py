@@ -10,9 +10,8 @@ from torch.nn.functional import smooth_l1_loss
 
 from neuspring.core.artifacts import Twin
 from neuspring.physics import reference
-from neuspring.physics.autograd import simulate_frame, solver_for
-from neuspring.physics.population import packed, solver_of, stacked, union
-from neuspring.physics.solver import Parameters
+from neuspring.physics.parameters import Parameters, packed
+from neuspring.physics.solver import simulate_frame, solver_for, stacked, union
 from tests.benchmarks.simulators import Frame
 
 
@@ -43,13 +42,13 @@ class Ours:
         last: list[torch.Tensor] = []
 
         def run() -> None:
-            parameters.springs.grad = None
+            parameters["springs"].grad = None
             last[:] = simulate_frame(solver, parameters, x, v, begin, end)
             smooth_l1_loss(last[0], torch.zeros_like(last[0])).backward()
 
         def gradient() -> np.ndarray:
-            assert parameters.springs.grad is not None
-            return of_log_stiffness(parameters.springs.grad, parameters.springs)
+            assert parameters["springs"].grad is not None
+            return of_log_stiffness(parameters["springs"].grad, parameters["springs"])
 
         return Frame(run, lambda: last[0].detach().cpu().numpy(), gradient)
 
@@ -58,7 +57,7 @@ class Ours:
 
         Their topologies may differ. Positions [N, 3] and gradient [S] of the frame are those of the first twin.
         """
-        solver = solver_of(twins, self.device, differentiable=gradient)
+        solver = solver_for(twins, self.device, differentiable=gradient)
         pairs, places = union([twin.topology for twin in twins])
         parameters = stacked([packed(twin, self.device) for twin in twins], places, len(pairs))
         x, v, begin, end = (values.expand(len(twins), -1, -1).contiguous() for values in self._start(twins[0], hands))
@@ -68,17 +67,17 @@ class Ours:
             last[:] = solver.forward(x, v, begin, end)
 
         def learn() -> None:
-            parameters.springs.grad = None
+            parameters["springs"].grad = None
             last[:] = simulate_frame(solver, parameters, x, v, begin, end)
             # The loss is a mean over the coordinates of a twin.
             loss = smooth_l1_loss(last[0], torch.zeros_like(last[0]), reduction="sum") / last[0][0].numel()
             loss.backward()
 
         def along() -> np.ndarray:
-            assert parameters.springs.grad is not None
-            return of_log_stiffness(parameters.springs.grad[0], parameters.springs[0])[places[0]]
+            assert parameters["springs"].grad is not None
+            return of_log_stiffness(parameters["springs"].grad[0], parameters["springs"][0])[places[0]]
 
-        parameters.springs.requires_grad_(gradient)
+        parameters["springs"].requires_grad_(gradient)
         return Frame(learn if gradient else run, lambda: last[0][0].detach().cpu().numpy(), along if gradient else None)
 
     def chain(self, twin: Twin, path: np.ndarray) -> Callable[[], object]:
@@ -89,7 +88,7 @@ class Ours:
         parameters = self._packed(twin)
 
         def run() -> None:
-            parameters.springs.grad = None
+            parameters["springs"].grad = None
             x, v = start, rest
             for k in range(len(steps) - 1):
                 x, v = simulate_frame(solver, parameters, x, v, steps[k], steps[k + 1])
@@ -105,7 +104,7 @@ class Ours:
 
     def _packed(self, twin: Twin) -> Parameters:
         parameters = packed(twin, self.device)
-        parameters.springs.requires_grad_()
+        parameters["springs"].requires_grad_()
         return parameters
 
 

@@ -27,7 +27,8 @@ from neuspring.baselines.spring_gaus.predict import roll_out as roll_out_anchors
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.device import resolve_device
-from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
+from neuspring.physics.parameters import pack, twin_tensors
+from neuspring.physics.solver import simulate_frame, solver_for
 from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View

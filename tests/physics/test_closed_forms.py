@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neuspring.physics.contact import APPROACH
+from neuspring.physics.motion import APPROACH
 from tests.support.scenes import ENGINES, Engine, no_hands, scene
 
 # Rounding of float64 accumulated over up to 10^4 substeps at meters and meters per second.

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from neuspring.physics import reference, stability
-from neuspring.physics.autograd import pack, simulate_frame, solver_for, twin_tensors
+from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.reference import Scene
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
 from neuspring.twin.losses import acceleration
 from tests.support import scenes
 from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
@@ -54,7 +54,7 @@ class Frame(NamedTuple):
     grad_collide: np.ndarray
 
 
-def solver_of(name: str, device: str, dtype: torch.dtype, differentiable: bool, threads: bool) -> FrameSolver:
+def clip_solver(name: str, device: str, dtype: torch.dtype, differentiable: bool, threads: bool) -> FrameSolver:
     """A clip's solver, a new one each time: it keeps the parameters that were last set, whichever test set them."""
     twin = clip(name).twin
     if threads == (device != "cpu"):
@@ -68,7 +68,7 @@ def rollout(
     name: str, device: str, dtype: torch.dtype, differentiable: bool, restart: bool, threads: bool | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """States x, v [F, N, 3] at frame ends; `restart` starts every frame from the record, `threads` is None for the device's way."""
-    c, solver = clip(name), solver_of(name, device, dtype, differentiable, device != "cpu" if threads is None else threads)
+    c, solver = clip(name), clip_solver(name, device, dtype, differentiable, device != "cpu" if threads is None else threads)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
@@ -84,7 +84,7 @@ def rollout(
 @cache
 def optimized_frames(name: str, device: str, dtype: torch.dtype, restart: bool, threads: bool | None = None) -> list[Frame]:
     """Every frame as in the released first-order stage: state detached between frames, gradient of the frame's loss."""
-    c, solver = clip(name), solver_of(name, device, dtype, True, device != "cpu" if threads is None else threads)
+    c, solver = clip(name), clip_solver(name, device, dtype, True, device != "cpu" if threads is None else threads)
     frames = []
 
     def tensor(values: np.ndarray) -> torch.Tensor:

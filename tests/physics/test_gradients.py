@@ -10,9 +10,9 @@ import torch
 
 from neuspring.core.artifacts import Simulation
 from neuspring.physics import reference
-from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.parameters import PARAMETERS, pack
+from neuspring.physics.solver import FrameSolver, simulate_frame
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import VARIANTS, packed, random_scene, scene, solver_for, tensors, with_values
 
@@ -107,7 +107,7 @@ def test_recomputed_frames_equal_the_chain_of_single_frames() -> None:
     adj_x, adj_v, springs_ = torch.zeros(body.nodes, 3).double(), torch.zeros(body.nodes, 3).double(), 0.0
     for k in (3, 2, 1):
         adj = solvers[k - 1].backward(adj_x + torch.tensor(weight[0, k]), adj_v + torch.tensor(weight[1, k]))
-        adj_x, adj_v, springs_ = adj[0], adj[1], springs_ + adj[2]
+        adj_x, adj_v, springs_ = adj[0], adj[1], springs_ + adj[2]["springs"]
     chain = {"x": adj_x.numpy(), "v": adj_v.numpy(), "stiffness": springs_[:, 0].numpy(), "dashpot": springs_[:, 2].numpy()}
     assert_gradients(got, chain, EXACT)
 
@@ -151,8 +151,23 @@ def test_no_gradient_beyond_the_clamps(name: str, value: float) -> None:
     assert loss_gradient(moved, x, v, hands, weights(4, 6))[name] == 0.0
     low, high = (0.0, 1.0) if name.endswith("elasticity") else (0.0, 2.0)
     bound = with_values(body, {name: low if value < low else high})
-    for got, wanted in zip(packed(moved), packed(bound), strict=True):
-        assert torch.equal(got, wanted)
+    for name, wanted in packed(bound).items():
+        assert torch.equal(packed(moved)[name], wanted)
+
+
+def test_gradients_follow_names_not_places() -> None:
+    """Parameters in another order: each gets the gradient it has by its name, and only those that are trained get one."""
+    body, x, v, hands = lively("self-collision")
+    motion, found = torch.tensor(hands), []
+    for names in (list(PARAMETERS), list(reversed(PARAMETERS))):
+        inputs = {name: packed(body)[name].requires_grad_() for name in names}
+        after, _ = simulate_frame(solver_for(body, 2), inputs, torch.tensor(x), torch.tensor(v), motion[0], motion[1])
+        after.square().sum().backward()
+        found.append({name: value.grad for name, value in inputs.items()})
+    assert {name for name, gradient in found[0].items() if gradient is not None} == {n for n, p in PARAMETERS.items() if p.trained}
+    for name, gradient in found[0].items():
+        assert gradient is None or torch.equal(gradient, found[1][name])
+        assert gradient is None or gradient.any(), name
 
 
 def test_contact_distance_only_selects() -> None:

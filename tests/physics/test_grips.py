@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.physics import autograd, reference
-from neuspring.physics.autograd import pack, simulate_frame
+from neuspring.physics import reference
+from neuspring.physics import solver as frame_solver
 from neuspring.physics.controllers import Grips, waypoints
+from neuspring.physics.parameters import pack
+from neuspring.physics.solver import simulate_frame
 from neuspring.twin.rollout import frames, roll_out
 from neuspring.twin.trials import motions
 from tests.support.differences import assert_gradients, differences
@@ -99,7 +101,7 @@ def simulated(body, rows, x, v, values):
     parameters, lengths = pack(**values, substep=body.simulation.substep), None
     for begin, end in pairwise(rows):
         lengths = grips.taken(lengths, x, begin)
-        held = parameters._replace(springs=grips.applied(parameters.springs, lengths))
+        held = parameters | {"springs": grips.applied(parameters["springs"], lengths)}
         x, v = simulate_frame(solver, held, x, v, begin, end)
     return x
 
@@ -149,7 +151,7 @@ def test_all_ways_to_roll_out_take_the_same_grips():
     double = torch.tensor(hands), torch.tensor(x), torch.tensor(v)
     fitted = simulated(body, waypoints(double[0], valid), *double[1:], tensors(body))
     assert np.abs(fitted.numpy() - alone[-1]).max() < 1e-5
-    solver = autograd.solver_for(twin, differentiable=False)
+    solver = frame_solver.solver_for(twin, differentiable=False)
     solver.resume(rows[:5], list(alone))
     later = frames(twin, solver, rows[5:], speeds[4, 0].numpy(), positions=alone[5])
     np.testing.assert_array_equal(np.stack([at.numpy() for _, at, _ in later]), alone[6:])
@@ -158,7 +160,7 @@ def test_all_ways_to_roll_out_take_the_same_grips():
 def test_stiffness_per_length_stays_however_near_the_hand():
     """So the substep that was checked for the lengths of frame 0 stays safe."""
     body, x, _, _, _ = late_scene()
-    grips, springs = Grips(body.springs, body.nodes, "cpu"), pack(**tensors(body), substep=1e-3).springs
+    grips, springs = Grips(body.springs, body.nodes, "cpu"), pack(**tensors(body), substep=1e-3)["springs"]
     controllers = int(body.springs.max()) + 1 - body.nodes
     row = torch.zeros(controllers, 4, dtype=torch.float64)
     row[:, :3] = torch.tensor(x[int(grips.nodes[0])])

@@ -9,8 +9,8 @@ import pytest
 import torch
 import warp as wp
 
-from neuspring.physics.autograd import pack, simulate_frame
-from neuspring.physics.solver import FrameSolver
+from neuspring.physics.parameters import pack
+from neuspring.physics.solver import FrameSolver, simulate_frame
 from tests.support.scenes import random_scene, solver_for, tensors
 
 VECTOR = 3 * 4

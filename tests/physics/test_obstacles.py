@@ -14,7 +14,8 @@ from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.obstacles import Obstacle
 from neuspring.physics import reference
-from neuspring.physics.autograd import pack, simulate_frame
+from neuspring.physics.parameters import pack
+from neuspring.physics.solver import simulate_frame
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.trials import motions
 from tests.support.differences import assert_gradients, differences

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from neuspring.physics import reference
-from neuspring.physics.autograd import pack, simulate_frame
 from neuspring.physics.controllers import waypoints
+from neuspring.physics.parameters import pack
+from neuspring.physics.solver import simulate_frame
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.trials import motions
 from tests.support.differences import assert_gradients, differences

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.physics import contact, reference, springs
+from neuspring.physics import reference
 from neuspring.physics.arrays import Buffers
+from neuspring.physics.motion import APPROACH
 from tests.support import terms
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import scene, solver_for
@@ -60,7 +61,7 @@ def fill_net(values: Arrays) -> Buffers:
         points = np.concatenate([values[name], np.broadcast_to(hand, (b.width, 1, 3))], axis=1)
         b.set_vectors(name, torch.tensor(points), slot=0)
     columns = values["stiffness"], 1 / values["rest_length"], values["dashpot"]
-    springs.fill(b, torch.tensor(np.stack(columns, axis=-1)))
+    b.set_parameter("springs", torch.tensor(np.stack(columns, axis=-1)))
     return b
 
 
@@ -80,7 +81,7 @@ def force_adjoints(values: Arrays, weight: np.ndarray, way: str, times: int = 1)
     b.set_vectors("adj_force", torch.tensor(weight), slot=0)
     for _ in range(times):
         launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments())
-    stiffness, inverse_length, dashpot = springs.gradient(b).numpy().transpose(2, 0, 1)
+    stiffness, inverse_length, dashpot = b.gradients()["springs"].numpy().transpose(2, 0, 1)
     state = {name: b.get_vectors(f"adj_{name}", count=b.nodes).numpy() for name in ("x", "v")}
     # d(1 / l0) = -d(l0) / l0^2
     return state | {"stiffness": stiffness, "rest_length": -inverse_length / values["rest_length"] ** 2, "dashpot": dashpot}
@@ -267,7 +268,8 @@ def fill_crowd(values: Arrays) -> Buffers:
     b, listed = crowd_buffers(len(values["x"])), values["listed"]
     b.set_vectors("x", torch.tensor(values["x"]), slot=0)
     b.set_vectors("after", torch.tensor(values["v"]), slot=0)
-    contact.fill(b, "contact", torch.tensor(np.stack([values["e"], values["mu"]], axis=-1)))
+    for name in ("e", "mu"):
+        b.set_numbers(f"contact_{name}", torch.tensor(values[name]))
     bits = (listed << np.arange(b.width)[:, None, None]).sum(axis=0)
     for i, row in enumerate(bits):
         partners = np.flatnonzero(row)
@@ -290,7 +292,7 @@ def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
             tensor.zero_()
     b.set_vectors("adj_moving", torch.tensor(weight))
     launch(terms.kernels(b.width).collide_adjoint, (6, 1), *b.arguments())
-    e, mu = contact.gradient(b, "contact").numpy().T
+    e, mu = (b.get_numbers(f"adj_contact_{name}").sum(dim=1).numpy() for name in ("e", "mu"))
     return {"x": b.get_vectors("adj_x", count=b.nodes).numpy(), "v": b.get_vectors("adj_after").numpy(), "e": e, "mu": mu}
 
 
@@ -331,7 +333,7 @@ def assert_lively(at: Arrays, friction: float) -> None:
     i, j = np.triu_indices(6, 1)
     dx, u = at["x"][j] - at["x"][i], at["v"][j] - at["v"][i]
     length = np.linalg.norm(dx, axis=1)
-    hit = (length < DISTANCE) & ((dx * u).sum(axis=1) < -contact.APPROACH)
+    hit = (length < DISTANCE) & ((dx * u).sum(axis=1) < -APPROACH)
     normal = (dx * u).sum(axis=1) / length
     tangent = np.linalg.norm(u - dx * (normal / length)[:, None], axis=1)
     left = reference.response(normal, tangent, 0.4, friction)[hit]

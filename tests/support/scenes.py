@@ -13,10 +13,10 @@ import torch
 
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
-from neuspring.physics.autograd import pack
 from neuspring.physics.controllers import waypoints
+from neuspring.physics.parameters import Parameters, pack
 from neuspring.physics.reference import Scene
-from neuspring.physics.solver import FrameSolver, Parameters
+from neuspring.physics.solver import FrameSolver
 from tests.support.devices import CUDA
 from tests.support.devices import DEVICES as DEVICES
 
@@ -121,7 +121,8 @@ def solver_for(
         solver.set_parameters(packed(scene, device, dtype))
         return solver
     solver = FrameSolver(scene[0].springs, scene[0].nodes, controllers, [body.simulation for body in scene], **options)
-    solver.set_parameters(Parameters(*map(torch.stack, zip(*(packed(body, device, dtype) for body in scene), strict=True))))
+    each = [packed(body, device, dtype) for body in scene]
+    solver.set_parameters({name: torch.stack([one[name] for one in each]) for name in each[0]})
     return solver
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import warp as wp
 
 from neuspring.core.device import load, start_warp
-from neuspring.physics import collision, position, springs, velocity
+from neuspring.physics import collision, springs
 from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import lanes
+from neuspring.physics.motion import position, velocity
 
 
 class Kernels(NamedTuple):
@@ -38,8 +39,8 @@ def kernels(width: int) -> Kernels:
     vectors: Any = wp.array(dtype=lane.Vector)
     numbers: Any = wp.array(dtype=lane.Number)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)[2:]
-    _, updated, updated_adjoint = velocity.functions(real, width)
-    moved, moved_adjoint = position.functions(real, width)
+    _, updated, updated_adjoint = velocity(real, width)
+    moved, moved_adjoint = position(real, width)
     collided, collided_adjoint = collision.functions(real, width)
 
     def rows(model: Model, state: State):

@@ -12,7 +12,7 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
-from neuspring.physics.autograd import twin_tensors
+from neuspring.physics.parameters import twin_tensors
 from neuspring.stages import fit as fit_stage
 from neuspring.stages import fits, rollout
 from neuspring.stages import search as search_stage

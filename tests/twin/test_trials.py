@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Topology, Twin
-from neuspring.physics import population
-from neuspring.physics.autograd import solver_for
+from neuspring.physics.parameters import packed
+from neuspring.physics.solver import solver_for, stacked, union
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR, Diverged, frames
 from neuspring.twin.search import SearchProblem, candidate, judge
@@ -144,7 +144,7 @@ def test_a_shared_list_has_room_for_the_partners_of_every_twin():
         """Velocities of node 0 after a frame, and overflows."""
         twins = [replace(twin, material=replace(twin.material, stiffness=0 * twin.material.stiffness, drag=0.0)) for _ in members]
         twins = [replace(one, material=replace(one.material, dashpot=0 * one.material.dashpot)) for one in twins]
-        solver = population.solver_of(twins, differentiable=False)
+        solver = solver_for(twins, differentiable=False)
         still = hands.expand(len(members), -1, -1)
         _, v = solver.forward(places[members], velocities[members], still, still)
         return v[:, 0].numpy(), solver.overflows
@@ -237,7 +237,7 @@ def test_a_node_that_comes_back_has_left():
     """The first frame stays noted, of each twin its own."""
     problem = small.search_problem()
     twins = candidates(problem, 3)
-    solver = population.solver_of(twins, differentiable=False)
+    solver = solver_for(twins, differentiable=False)
     sums = LossSums(solver, loss_of(problem), torch.tensor(problem.velocity))
     near = torch.tensor(twins[0].topology.nodes).expand(len(twins), -1, -1)
     for frame, gone in enumerate([(), (1,), (0, 1), ()], start=1):
@@ -275,7 +275,7 @@ def topology(springs: np.ndarray) -> Topology:
 
 @given(graphs(), st.randoms(use_true_random=False))
 def test_the_union_has_every_spring_once_and_knows_where(each, random):
-    pairs, places = population.union([topology(springs) for springs in each])
+    pairs, places = union([topology(springs) for springs in each])
     ends = {frozenset(pair) for pair in pairs.tolist()}
     assert len(ends) == len(pairs)
     assert ends == {frozenset(pair) for springs in each for pair in springs.tolist()}
@@ -286,7 +286,7 @@ def test_the_union_has_every_spring_once_and_knows_where(each, random):
     for springs in random.sample(each, len(each)):
         turned = [pair[::-1] if random.random() < 0.5 else pair for pair in random.sample(springs.tolist(), len(springs))]
         others.append(topology(np.array(sorted(turned, key=lambda pair: max(pair) >= 5), np.int32)))
-    again, _ = population.union(others)
+    again, _ = union(others)
     np.testing.assert_array_equal(again, pairs)
 
 
@@ -294,11 +294,10 @@ def test_the_union_has_every_spring_once_and_knows_where(each, random):
 def test_springs_that_a_twin_lacks_have_no_strength_in_it(each):
     """Its own stand where the union says."""
     rng = np.random.default_rng(0)
-    pairs, places = population.union([topology(springs) for springs in each])
+    pairs, places = union([topology(springs) for springs in each])
     problem = small.search_problem()
-    packed = population.packed(candidate(problem, small.start_values()))
-    own = [packed._replace(springs=torch.tensor(rng.uniform(1.0, 2.0, (len(springs), 3)))) for springs in each]
-    stacked = population.stacked(own, places, len(pairs)).springs
-    for parameters, springs, got in zip(own, each, stacked, strict=True):
-        values = {frozenset(pair): row for pair, row in zip(springs.tolist(), parameters.springs.tolist(), strict=True)}
+    one = packed(candidate(problem, small.start_values()))
+    own = [one | {"springs": torch.tensor(rng.uniform(1.0, 2.0, (len(springs), 3)))} for springs in each]
+    for parameters, springs, got in zip(own, each, stacked(own, places, len(pairs))["springs"], strict=True):
+        values = {frozenset(pair): row for pair, row in zip(springs.tolist(), parameters["springs"].tolist(), strict=True)}
         assert got.tolist() == [values.get(frozenset(pair), [0.0, 0.0, 0.0]) for pair in pairs.tolist()]

@@ -12,7 +12,7 @@ from neuspring.baselines.spring_gaus.graph import AnchorGraph
 from neuspring.baselines.spring_gaus.kernels import kernels
 from neuspring.core.device import start_warp
 from neuspring.physics.arrays import Graphs
-from neuspring.physics.autograd import Frame
+from neuspring.physics.solver import simulate_frame
 
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them, see `AnchorParameters.tensors`."""
@@ -49,9 +49,10 @@ class AnchorParameters:
     friction: torch.Tensor
     """phi: the fraction of the velocity along the ground that remains after each substep on it."""
 
-    def tensors(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(self) -> dict[str, torch.Tensor]:
         """As the kernels take them: stiffness [N], soft [K], scalars (damping, friction) [2]."""
-        return self.stiffness, self.soft, torch.stack([self.damping.reshape(()), self.friction.reshape(())])
+        scalars = torch.stack([self.damping.reshape(()), self.friction.reshape(())])
+        return {"stiffness": self.stiffness, "soft": self.soft, "scalars": scalars}
 
 
 class AnchorSolver:
@@ -96,16 +97,15 @@ class AnchorSolver:
         self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(x, v) [N, 3] one frame later, differentiable in x, v and parameters; controllers [C, 3] go from `begin` to `end`."""
-        result: tuple[torch.Tensor, torch.Tensor] = Frame.apply(self, begin, end, x, v, *parameters.tensors())  # type: ignore[no-untyped-call]
-        return result
+        return simulate_frame(self, parameters.tensors(), x, v, begin, end)
 
     def run(
-        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, *packed: torch.Tensor
+        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: dict[str, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(x, v) after a frame; `packed` are the kernel's stiffness, soft vector and scalars."""
+        """(x, v) after a frame with parameters as the kernels take them."""
         b = self._buffers
-        for name, value in zip(PACKED, packed, strict=True):
-            b[name].copy_(value)
+        for name in PACKED:
+            b[name].copy_(parameters[name])
         # Controllers after the last that holds an anchor do not matter.
         b["begin"].copy_(begin[: len(b["begin"])])
         b["end"].copy_(end[: len(b["end"])])
@@ -114,14 +114,14 @@ class AnchorSolver:
         self.frame_token += 1
         return b["x"][-1].clone(), b["v"][-1].clone()
 
-    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> list[torch.Tensor]:
-        """Adjoints of the last forward frame: dL/d(x, v, stiffness, soft, scalars)."""
+    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """Adjoints of the last forward frame: of x, of v, and of parameters by name."""
         b = self._buffers
         for name in ("x", "v", *PACKED):
             b[f"adj_{name}"].zero_()
         b["adj_x"][-1], b["adj_v"][-1] = adj_x, adj_v
         self._launch(backward=True)
-        return [b["adj_x"][0].clone(), b["adj_v"][0].clone(), *(b[f"adj_{name}"].clone() for name in PACKED)]
+        return b["adj_x"][0].clone(), b["adj_v"][0].clone(), {name: b[f"adj_{name}"].clone() for name in PACKED}
 
     def _launch(self, *, backward: bool) -> None:
         kernel = self._kernels.adjoint if backward else self._kernels.substep

@@ -1,7 +1,16 @@
-"""Motion, with or without a ground plane z = 0, and its adjoint.
+"""Motion: controllers, the velocity update, and positions with or without a ground plane z = 0 (the paper's equation 4); adjoints.
 
-x' = x + dt v (the paper's equation 4). With ground, a node that would be below at the end of the substep and moves down is
-reflected at its time of impact toi = -z / v_z: x' = x + v toi + v' (dt - toi), with v' by the response of contact.py.
+    x_c = begin + (end - begin) (k + 1) / n in substep k of n
+    v' = (v + dt (f / m + g)) delta,   delta = exp(-dt drag)
+    x' = x + dt v'
+
+Drag is dv/dt = -drag v; its exact solution is taken over a substep, so any value is stable. The mass m is 1 kg if none is given.
+
+With ground, a node that would be below at the end of the substep and moves down is reflected at its time of impact toi = -z / v_z:
+x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.py, obstacles.py), an impulse with elasticity e in
+[0, 1] and friction mu in [0, 2]: a relative velocity u = u_n + u_t (normal, tangential) becomes
+
+    -e u_n + a u_t,   a = max(0, 1 - mu (1 + e) |u_n| / |u_t|).
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -10,13 +19,27 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuspring.physics import contact
-from neuspring.physics.arrays import Buffers
+from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import lanes
 
+APPROACH = 1e-4
+"""Slower approaches do not collide (m/s for the ground; m^2/s, distance times speed, for pairs)."""
+MIN_TANGENT = 1e-6
+"""Tangential speeds are floored here when dividing, m/s."""
 
-class Functions(NamedTuple):
-    """Functions of this file for one scalar type and width."""
+
+class Velocity(NamedTuple):
+    """Controllers and velocities, for one scalar type and width."""
+
+    move_controller: Any
+    updated: Any
+    """(v, force, gravity, dt, delta, 1 / m) -> v'."""
+    updated_adjoint: Any
+    """(v', dL/dv', dt, delta, 1 / m) -> dL/d(v), dL/d(force), dL/d(delta)."""
+
+
+class Position(NamedTuple):
+    """Positions, for one scalar type and width."""
 
     moved: Any
     """(x, v, dt, up, e, mu) -> x', v'."""
@@ -24,19 +47,46 @@ class Functions(NamedTuple):
     """(x, v, dt, up, e, mu, dL/dx', dL/dv') -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)."""
 
 
-def allocate(b: Buffers) -> None:
-    """The response, and its adjoints per node."""
-    b.add_numbers(ground_e=None, ground_mu=None, adj_ground_e=b.nodes, adj_ground_mu=b.nodes)
+@functools.cache
+def velocity(real: Any, width: int) -> Velocity:
+    """Functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+    lane = lanes(real, width)
+    Number, Vector, dot, scaled = lane.Number, lane.Vector, lane.dot, lane.scaled
+    Model, State, _ = structs(real, width)
+    one = wp.constant(real(1.0))
+
+    @wp.func
+    def move_controller(model: Model, state: State, step: int, slot: int, c: int, g: int):
+        """Put a controller where it is at the end of a substep."""
+        travel = state.end[c, g] - state.begin[c, g]
+        fraction = Number()
+        for q in range(width):
+            fraction[q] = wp.min(real(step + 1) / model.counts[g][q], one)
+        state.x[slot, model.nodes + c, g] = state.begin[c, g] + scaled(travel, fraction)
+        state.v[slot, model.nodes + c, g] = scaled(travel, model.inverse_time[g])
+
+    @wp.func
+    def updated(v: Vector, force: Vector, gravity: Vector, dt: Number, decay: Number, light: Number) -> Vector:
+        return scaled(v + scaled(scaled(force, light) + gravity, dt), decay)
+
+    @wp.func
+    def updated_adjoint(after: Vector, adj_after: Vector, dt: Number, decay: Number, light: Number):
+        # In terms of v' alone: the substep keeps neither the force nor the velocity before the drag.
+        adj_decay = wp.cw_div(dot(adj_after, after), decay)
+        adj_v = scaled(adj_after, decay)
+        return adj_v, scaled(scaled(adj_v, dt), light), adj_decay
+
+    return Velocity(move_controller, updated, updated_adjoint)
 
 
 @functools.cache
-def functions(real: Any, width: int) -> Functions:
-    """Functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def position(real: Any, width: int) -> Position:
+    """Functions for a scalar type and a number of lanes."""
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
-    approach, floor = wp.constant(real(contact.APPROACH)), wp.constant(real(contact.MIN_TANGENT))
+    approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
     @wp.func
     def count() -> int:
@@ -109,4 +159,4 @@ def functions(real: Any, width: int) -> Functions:
                     adj_mu[q] = gmu
         return adj_x, adj_v, adj_e, adj_mu
 
-    return Functions(moved, moved_adjoint)
+    return Position(moved, moved_adjoint)

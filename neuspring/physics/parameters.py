@@ -1,0 +1,87 @@
+"""Physical parameters: what the kernels take, how each follows from a material, and whether it has a gradient.
+
+Each is declared once, in `PARAMETERS`. Kernels' arguments (arrays.py), buffers, gradients and twins side by side (solver.py) follow
+from that by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Literal, NamedTuple
+
+import torch
+
+from neuspring.core.artifacts import Twin
+
+Values = Mapping[str, torch.Tensor]
+"""Fields of `Material` by name, and rest_lengths [S], m."""
+Parameters = dict[str, torch.Tensor]
+"""What `pack` makes: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
+LIMITS = {
+    f"{kind}_{name}": limits
+    for kind in ("ground", "contact")
+    for name, limits in {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}.items()
+}
+"""Fields of `Material` that are clamped on use, as in the released simulator."""
+
+
+class Parameter(NamedTuple):
+    """One argument of the kernels."""
+
+    per: Literal["spring", "node", "twin"]
+    """A Vector per spring, a Number per node, or a Number of the twin."""
+    pack: Callable[[Values, float | torch.Tensor], torch.Tensor]
+    """(values of the material, substep, s) -> [S, 3], [N] or []."""
+    trained: bool = True
+    """Whether gradients reach it."""
+
+
+def _springs(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
+    stiffness = values["stiffness"]
+    return torch.stack([stiffness, 1.0 / values["rest_lengths"], values["dashpot"].expand_as(stiffness)], dim=-1)
+
+
+def _inverse_mass(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
+    mass = values.get("mass")
+    return values["drag"].detach().new_ones(1) if mass is None or not len(mass) else 1.0 / mass
+
+
+def _clamped(name: str) -> Callable[[Values, float | torch.Tensor], torch.Tensor]:
+    return lambda values, substep: values[name].clamp(*LIMITS[name])
+
+
+PARAMETERS = {
+    # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent.
+    "springs": Parameter("spring", _springs),
+    # The factor of velocities that drag leaves in a substep.
+    "decay": Parameter("twin", lambda values, substep: torch.exp(-substep * values["drag"])),
+    "ground_e": Parameter("twin", _clamped("ground_elasticity")),
+    "ground_mu": Parameter("twin", _clamped("ground_friction")),
+    "contact_e": Parameter("twin", _clamped("contact_elasticity")),
+    "contact_mu": Parameter("twin", _clamped("contact_friction")),
+    # m. It only selects pairs.
+    "distance": Parameter("twin", lambda values, substep: values["contact_distance"], trained=False),
+    # 1/kg; [1] where all nodes have 1 kg. Masses are not trained.
+    "inverse_mass": Parameter("node", _inverse_mass, trained=False),
+}
+
+
+def pack(*, substep: float | torch.Tensor, **values: torch.Tensor) -> Parameters:
+    """Pack physical parameters, differentiably, for a substep in s.
+
+    `values` are the fields of `Material`, of which those with a default may be left out, and rest_lengths [S], m; dashpot may be
+    one number for all springs.
+    """
+    return {name: parameter.pack(values, substep) for name, parameter in PARAMETERS.items()}
+
+
+def packed(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Parameters:
+    """A twin's parameters, packed."""
+    return pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep)
+
+
+def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
+    """A twin's physical parameters as tensors, with the keyword names of `pack`."""
+    values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)} | {"rest_lengths": twin.topology.rest_lengths}
+    return {name: torch.tensor(value, dtype=dtype, device=device) for name, value in values.items()}
