@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.artifacts import Artifact, Trajectory
-from neuspring.core.checkpoint import Checkpoint
-from neuspring.core.training import TrainingLoop
+from neuspring.core.checkpoint import Checkpoint, TrainingLoop
 
 LIMIT = 10.0
 """m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""

@@ -25,7 +25,7 @@ def fetch_options(parser: ArgumentParser) -> None:
 
 def fetch(a: Namespace) -> int:
     """`neuspring fetch`: exit status 2 if a fetched file is damaged."""
-    from neuspring.data.fetch import fetch
+    from neuspring.data import fetch
     from neuspring.scores.released.check_data import check
 
     departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)

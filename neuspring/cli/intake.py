@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from neuspring.data.intake.raw import Raw
-    from neuspring.data.intake.views import View
+    from neuspring.data.intake.images import CameraFeed
+    from neuspring.data.intake.recordings import Raw
 
 
 def make_capture_options(parser: ArgumentParser) -> None:
@@ -46,7 +46,7 @@ def make_capture_options(parser: ArgumentParser) -> None:
 
 def make_capture(a: Namespace) -> int:
     """`neuspring make-capture`: print what was found, and the next command."""
-    from neuspring.data.intake.charuco import Board
+    from neuspring.data.intake.lenses import Board
     from neuspring.data.intake.make import Intake, make_capture
 
     views, raw = _views(a)
@@ -78,12 +78,11 @@ def make_capture(a: Namespace) -> int:
     return 0
 
 
-def _views(a: Namespace) -> tuple[list[View], Raw | None]:
+def _views(a: Namespace) -> tuple[list[CameraFeed], Raw | None]:
     """The cameras of the one source that is given. Raises InputError."""
     from neuspring.core.errors import InputError
-    from neuspring.data.intake.bag import Bag
-    from neuspring.data.intake.raw import Raw
-    from neuspring.data.intake.views import pairs
+    from neuspring.data.intake.images import pairs
+    from neuspring.data.intake.recordings import Bag, Raw
 
     given = [name for name, value in (("--color", a.color), ("--bag", a.bag), ("--phystwin-raw", a.phystwin_raw)) if value]
     if len(given) != 1:

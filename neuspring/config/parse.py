@@ -13,7 +13,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from neuspring.core.errors import InputError
-from neuspring.core.uri import masked
+from neuspring.core.text import masked
 
 T = TypeVar("T")
 REMOVED = "removed; commit 7308a7b is the last that has it"

@@ -18,7 +18,7 @@ from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses
 from neuspring.config.types import Count, Name, Section
-from neuspring.core.uri import refuse_password
+from neuspring.core.text import refuse_password
 
 
 def _seed_list(value: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints
 
 from neuspring.config.types import Count, Name, Section
-from neuspring.core.uri import refuse_password
+from neuspring.core.text import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]
 Number = int | Annotated[float, Field(allow_inf_nan=False)]

@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Literal, Self, get_args, get_type_hints
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.core.npz import DamagedFile, read_npz, write_npz
-from neuspring.core.obstacles import Obstacle, obstacles_of
+from neuspring.core.files import DamagedFile, read_npz, write_npz
+from neuspring.core.geometry import Obstacle, obstacles_of
 
 FORMAT_VERSION = 1
 Up = Literal["+z", "-z"]

@@ -1,23 +1,30 @@
-"""Checkpoints from which a killed stage continues: named arrays and plain values, valid for one key.
+"""Checkpoints from which a killed stage continues, and what every resumable training shares: its epochs with a history, and Adam's
+state as arrays.
 
-The key says what a checkpoint was made with: inputs, settings, kind of device, code. One with another key is left alone.
+A checkpoint is named arrays and plain values, valid for one key, which says what it was made with: inputs, settings, kind of
+device, code. One with another key is left alone.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neuspring.core import provenance
-from neuspring.core.npz import DamagedFile, read_npz, write_npz
+from neuspring.core.files import DamagedFile, read_npz, write_npz
 from neuspring.core.records import canonical
+from neuspring.core.text import Progress
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -58,3 +65,76 @@ def checkpoint_key(inputs: Mapping[str, str], settings: Mapping[str, Any], devic
     """What a checkpoint must match to be continued from: inputs, settings, device kind and the code of a module."""
     values = [dict(inputs), dict(settings), device.partition(":")[0], provenance.code_digest(module)]
     return hashlib.sha256(canonical(values).encode()).hexdigest()
+
+
+class TrainingLoop:
+    """The epochs that are left of a training which may have been killed before.
+
+    The user restores `restored`, iterates over the loop, and calls `record` and then `save` in each epoch. A continued training
+    equals an uninterrupted one if its checkpoints hold all that an epoch depends on.
+    """
+
+    def __init__(
+        self, what: str, label: str, epochs: int, every: int, partial: Path | None, key: str, *, share: float = 1.0
+    ) -> None:
+        """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
+        `every` epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the part of
+        the time that counts for this training, where several run together."""
+        self._share, self._alone = share, share == 1.0
+        self._begun = time.monotonic()
+        self._epochs, self._every, self._partial, self._key = epochs, every, partial, key
+        self._progress = Progress(label, epochs)
+        self.history: list[dict[str, Any]] = []
+        """A row per epoch."""
+        self.attempts = 1
+        """1, plus one for every time that the training continued from a checkpoint of a killed one."""
+        self.earlier_seconds = 0.0
+        """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
+        self.epochs_together = 0
+        """How many epochs ran together with those of other trainings."""
+        self.restored = Checkpoint.load(partial, key, what)
+        """The checkpoint to continue from."""
+        if self.restored:
+            run = self.restored.values.pop("run")
+            self.history, self.earlier_seconds, self.epochs_together = run["history"], run["seconds"], run["epochs_together"]
+            # To go on alone after what was planned to run together is no second attempt.
+            self.attempts = run["attempts"] + (self.epochs_together < len(self.history) or not self._alone)
+            print(f"continuing {what} after epoch {len(self.history) - 1}")
+
+    def __iter__(self) -> Iterator[int]:
+        """Numbers of the epochs that are left."""
+        while len(self.history) < self._epochs:
+            yield len(self.history)
+
+    def record(self, row: dict[str, Any], note: str) -> None:
+        """Add the row of a finished epoch to the history, and show progress."""
+        self.history.append(row)
+        self.epochs_together += not self._alone
+        self._progress.update(len(self.history), note)
+
+    def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
+        """Save the training's own state, with the history, if a checkpoint is due."""
+        done = len(self.history)
+        if self._partial is None or (done % self._every and done < self._epochs):
+            return
+        state = checkpoint()
+        seconds = self.earlier_seconds + self._share * (time.monotonic() - self._begun)
+        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds, "epochs_together": self.epochs_together}
+        Checkpoint(state.arrays, {**state.values, "run": run}).save(self._partial, self._key)
+
+
+def adam_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
+    """Adam's state as copied arrays named `<index of the parameter>.<moment>`; none before the first step."""
+    state = optimizer.state_dict()["state"]
+    return {f"{index}.{moment}": value.cpu().numpy().copy() for index, slots in state.items() for moment, value in slots.items()}
+
+
+def restore_adam(optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]) -> None:
+    """Set Adam's state to that of `adam_arrays`; learning rates and other options stay."""
+    import torch
+
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, array in arrays.items():
+        index, _, moment = name.partition(".")
+        state.setdefault(int(index), {})[moment] = torch.from_numpy(array.copy())
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": state})

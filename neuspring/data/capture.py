@@ -31,16 +31,16 @@ from neuspring.config import parse
 from neuspring.config.types import STRICT, Finite, Name, Positive
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
-from neuspring.core.obstacles import Obstacle
+from neuspring.core.files import load_json, write_text
+from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
-from neuspring.data.calibration import TEXT_TOLERANCE, intrinsics_departures, pose_departures
 from neuspring.data.departure import Departure, broken, refuse
-from neuspring.data.json_file import load_json
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
+TEXT_TOLERANCE = 1e-4
+"""Allowed departure from R^T R = 1 in JSON, where matrices may have five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 
@@ -355,6 +355,29 @@ def description_departures(path: Path, description: Description) -> list[Departu
             departures.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
         if 0 in camera.missing:
             departures.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+    return departures
+
+
+def intrinsics_departures(file: Path, key: str, matrix: np.ndarray, size: tuple[int, int] | None) -> list[Departure]:
+    """K [3, 3], pixels: its form, and (cx, cy) within the image of `size` (width, height), where that is known."""
+    fixed = matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.array_equal(fixed, [0, 0, 0, 0, 1])):
+        return [broken(file, key, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 is required", matrix.tolist())]
+    if size is not None and not (0 <= matrix[0, 2] < size[0] and 0 <= matrix[1, 2] < size[1]):
+        return [broken(file, key, f"(cx, cy) must lie in the {size[0]} x {size[1]} image", matrix.tolist())]
+    return []
+
+
+def pose_departures(file: Path, key: str, pose: np.ndarray, tolerance: float) -> list[Departure]:
+    """Camera to world [4, 4], m: a rotation and a translation."""
+    departures = []
+    rotation = pose[:3, :3]
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if not error <= tolerance or np.linalg.det(rotation) < 0 or not np.isfinite(pose).all():
+        rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
+        departures.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1, or a mirror image"))
+    if not np.array_equal(pose[3], [0, 0, 0, 1]):
+        departures.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
     return departures
 
 

@@ -1,30 +1,64 @@
-"""Processed PhysTwin cases (`data/different_types/{case}/`) -> Observations. Layout: the released PhysTwin data.
+"""PhysTwin's folders `data/different_types/{case}/`: processed -> Observations, raw -> a capture folder; the table of its 22 cases.
 
-Each `*_departures` function lists everything in one file that the reader refuses (errors) or that departs from the released
-layout without harm (warnings); `read` raises the first error, `neuspring check-data` prints them all.
+Layout: the released PhysTwin data. Each `*_departures` function lists everything in one file that the reader refuses (errors) or
+that departs from the released layout without harm (warnings); `read` and `convert` raise the first error, `neuspring check-data`
+prints them all. Of raw cases images are linked where the file system allows it, else copied; masks are put together from one image
+per detection.
 """
 
 from __future__ import annotations
 
+import csv
+import os
+import shutil
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from neuspring.config import ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.core.files import load_json
 from neuspring.core.records import digest_file
+from neuspring.data.capture import (
+    HANDS,
+    OBJECT,
+    Camera,
+    Capture,
+    Description,
+    Writer,
+    intrinsics_departures,
+    make_way,
+    pose_departures,
+    read_image,
+)
 from neuspring.data.departure import Departure, broken, refuse, unusual
-from neuspring.data.json_file import load_json
 from neuspring.data.unpickle import load_pickle
 
+
+@cache
+def released_cases() -> dict[str, dict[str, str]]:
+    """The table of the 22 released cases: case -> column -> text, empty where unknown."""
+    text = resources.files("neuspring.data.tables").joinpath("phystwin22.csv").read_text(encoding="utf-8")
+    return {row["case"]: row for row in csv.DictReader(text.splitlines())}
+
+
 FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
+CALIBRATION = "calibrate.pkl"
 FILES = (FINAL_DATA, SPLIT, TRACKS, METADATA)
-"""The files that the reader looks for in a case's folder."""
+"""The files that the reader looks for in a processed case's folder."""
+RAW_FILES = (METADATA, CALIBRATION, SPLIT, TRACKS)
+"""The files beside images that the importer looks for in a raw case's folder."""
 RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 MAX_FRAME_RATE = 1e6
+BINARY_TOLERANCE = 1e-5
+"""Allowed departure from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
 
 
 @dataclass(frozen=True)
@@ -252,3 +286,171 @@ def frame_rate_departures(path: Path, metadata: Any) -> list[Departure]:
     if fps != RELEASED_FRAME_RATE:
         return [unusual(path, "fps", f"released recordings have {RELEASED_FRAME_RATE:g} frames per second", fps)]
     return []
+
+
+HAND_PHRASE = "hand"
+"""The detected phrase of hands. The one detection of a camera with another phrase is the object."""
+
+
+def has_images(case: Path) -> bool:
+    """Whether a case's folder holds what a capture with masks needs: images, masks and calibration."""
+    files = all((Path(case) / name).is_file() for name in (METADATA, CALIBRATION))
+    return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
+
+
+def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
+    """Write `case` as a capture folder. Raises InputError naming file and key."""
+    case = Path(case)
+    metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
+    refuse(raw_departures(case, metadata, poses))
+    frames = int(metadata["frame_num"])
+    has_masks = (case / "mask").is_dir()
+    description = Description(
+        format=1,
+        name=row.scenario,
+        category=row.category,
+        frame_count=frames,
+        frame_rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
+        cameras=tuple(camera.entry() for camera in cameras_of(metadata, poses)),
+        depth_unit=0.001,
+        depth_format="npy",
+        up="-z",
+        train_end=train_end_of(case, frames),
+        masks=has_masks,
+        provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
+    )
+    writer = Writer(folder, description)
+    capture = writer.capture
+    for name, camera in capture.cameras.items():
+        ids = detections(case, name) if has_masks else {}
+        for frame in range(frames):
+            _link(case / "color" / name / f"{frame}.png", capture.path("color", name, frame))
+            _link(case / "depth" / name / f"{frame}.npy", capture.path("depth", name, frame))
+            if has_masks:
+                writer.mask(name, frame, labels_of(case, camera, frame, ids))
+    return writer.finish(annotated(case, frames))
+
+
+def camera_count(case: Path) -> int:
+    """How many cameras metadata.json declares. Raises InputError."""
+    path = Path(case) / METADATA
+    metadata = load_json(path)
+    intrinsics = metadata.get("intrinsics") if isinstance(metadata, dict) else None
+    if not isinstance(intrinsics, list) or not intrinsics:
+        raise InputError(path, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
+    return len(intrinsics)
+
+
+def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
+    """Frame rate, frame count and calibration in metadata.json and calibrate.pkl."""
+    path = case / METADATA
+    departures = frame_rate_departures(path, metadata)
+    if not isinstance(metadata, dict):
+        return departures
+    count, intrinsics = metadata.get("frame_num"), metadata.get("intrinsics")
+    if type(count) is not int or count < 5:
+        departures.append(broken(path, "frame_num", "at least 5 frames are required", count))
+    departures += metadata_departures(path, metadata)
+    return departures + poses_departures(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
+
+
+def metadata_departures(file: Path, metadata: dict[str, Any], cameras: int | None = None) -> list[Departure]:
+    """Image size and intrinsics of metadata.json. `cameras` is the required number of cameras; None allows any but zero."""
+    departures = []
+    size: Any = metadata.get("WH")
+    has_size = isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)
+    if not has_size:
+        departures.append(broken(file, "WH", "two positive whole numbers [width, height] are required", size))
+    try:
+        intrinsics = np.asarray(metadata.get("intrinsics"), dtype=np.float64)
+    except (TypeError, ValueError):
+        intrinsics = np.zeros(0)
+    count = cameras or max(len(intrinsics) if intrinsics.ndim else 0, 1)
+    if intrinsics.shape != (count, 3, 3) or not np.isfinite(intrinsics).all():
+        rule = f"{cameras or 'one or more'} finite 3 x 3 matrices are required"
+        return [*departures, broken(file, "intrinsics", rule, f"shape {intrinsics.shape}")]
+    for index, matrix in enumerate(intrinsics):
+        key = f"intrinsics, camera {index}"
+        departures += intrinsics_departures(file, key, matrix, (size[0], size[1]) if has_size else None)
+    return departures
+
+
+def poses_departures(file: Path, poses: Any, cameras: int | None) -> list[Departure]:
+    """The matrices of calibrate.pkl. `cameras` is the required number of cameras; None skips the comparison."""
+    if not isinstance(poses, (list, tuple)) or (cameras is not None and len(poses) != cameras):
+        received = f"{type(poses).__name__} of {len(poses)}" if isinstance(poses, (list, tuple)) else type(poses).__name__
+        return [broken(file, "", f"a list of {cameras or ''} camera-to-world matrices is required".replace("  ", " "), received)]
+    departures = []
+    for index, pose in enumerate(poses):
+        key = f"camera {index}"
+        if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or pose.dtype.kind != "f":
+            received = f"{pose.shape} {pose.dtype}" if isinstance(pose, np.ndarray) else type(pose).__name__
+            departures.append(broken(file, key, "a (4, 4) floating point matrix is required", received))
+            continue
+        if pose.dtype != np.float64:
+            departures.append(unusual(file, key, "the released dtype is float64", pose.dtype))
+        departures += pose_departures(file, key, pose, BINARY_TOLERANCE)
+    return departures
+
+
+def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera]:
+    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_departures` must have no errors."""
+    width, height = metadata["WH"]
+    intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
+    return [
+        Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
+        for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
+    ]
+
+
+def detections(case: Path, camera: str) -> dict[int, list[str]]:
+    """Label -> ids of its detections. Exactly one detection is not a hand."""
+    path = case / "mask" / f"mask_info_{camera}.json"
+    info = load_json(path)
+    if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
+        raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
+    objects = [key for key, phrase in info.items() if phrase != HAND_PHRASE]
+    if len(objects) != 1:
+        rule = f"exactly one detection must not be {HAND_PHRASE!r}: the object"
+        raise InputError(path, rule, info, "Remove the others from this file, or give them the phrase 'hand'.")
+    return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
+
+
+def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
+    """Mask [H, W] uint8 of one frame, put together from the images of its detections. Raises InputError."""
+    labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    for label, names in sorted(ids.items()):
+        for name in names:
+            mask = read_image(case / "mask" / camera.name / name / f"{frame}.png", camera, cv2.IMREAD_GRAYSCALE)
+            labels[mask > 0] = label
+    return labels
+
+
+def annotated(case: Path, frames: int) -> np.ndarray | None:
+    """Annotated tracks [T, K, 3], m, if there are any. Raises InputError."""
+    path = case / TRACKS
+    if not path.exists():
+        return None
+    tracks = load_pickle(path)
+    refuse(tracks_departures(path, tracks, frames))
+    return np.asarray(tracks, dtype=float)
+
+
+def train_end_of(case: Path, frames: int) -> int | None:
+    """Training frames are [0, this), if split.json says so. Raises InputError."""
+    path = case / SPLIT
+    if not path.exists():
+        return None
+    split = load_json(path)
+    refuse(split_departures(path, split, frames))
+    return int(split["train"][1])
+
+
+def _link(source: Path, target: Path) -> None:
+    if not source.is_file():
+        raise InputError(source, "this image must exist", "no such file")
+    make_way(target)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

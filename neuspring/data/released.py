@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.files import load_json
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera, read_array, read_image
 from neuspring.data.departure import Departure, broken, refuse, unusual
-from neuspring.data.json_file import load_json
-from neuspring.data.phystwin_raw import CALIBRATION, cameras_of, raw_departures
+from neuspring.data.phystwin import CALIBRATION, cameras_of, raw_departures
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
@@ -141,9 +141,9 @@ def parameter_departures(path: Path, parameters: Any) -> list[Departure]:
             departures.append(broken(path, key, "this key is missing"))
         elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
             departures.append(broken(path, key, "a finite number is required", value))
-        elif key.endswith("neighbors") and value != int(value):
+        elif key.endswith("neighbours") and value != int(value):
             departures.append(broken(path, key, "a whole number is required", value))
-        elif key.endswith(("neighbors", "radius")) and value <= 0:
+        elif key.endswith(("neighbours", "radius")) and value <= 0:
             departures.append(broken(path, key, "a positive number is required", value))
     departures += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
     return departures
@@ -157,7 +157,7 @@ def read_parameters(path: Path) -> dict[str, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Checkpoint:
+class ReleasedCheckpoint:
     """What training left. The springs themselves are not stored: they follow from the parameters."""
 
     object_springs: int
@@ -168,7 +168,7 @@ class Checkpoint:
     """The scalars of `CONTACT_KEYS` under our names, as stored: the simulator clamps them. None where they are not all there."""
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
+def read_checkpoint(path: Path) -> ReleasedCheckpoint:
     """Read best_{epoch}.pth: tensors and plain values only."""
     import torch  # slow to import, and needed for this file alone
 
@@ -187,7 +187,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise InputError(path, "spring_Y [S] of floating point numbers and 0 <= num_object_springs <= S are required", received)
     if not (np.isfinite(stiffness).all() and np.isfinite(list((contact or {}).values())).all()):
         raise InputError(path, "every number must be finite")
-    return Checkpoint(object_springs=springs, stiffness=stiffness, contact=contact)
+    return ReleasedCheckpoint(object_springs=springs, stiffness=stiffness, contact=contact)
 
 
 def prediction_departures(path: Path, positions: Any, frames: int, nodes: int) -> list[Departure]:

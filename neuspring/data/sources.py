@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
-from neuspring.data import capture, phystwin, phystwin_raw
+from neuspring.data import capture, phystwin
 
 if TYPE_CHECKING:
     from neuspring.core.artifacts import Observations
@@ -143,7 +143,7 @@ def _required_capture(folder: Path) -> None:
 
 
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
-    return tuple(map(str, range(phystwin_raw.camera_count(folder))))
+    return tuple(map(str, range(phystwin.camera_count(folder))))
 
 
 def _described(folder: Path, config: Config) -> tuple[str, ...]:
@@ -180,11 +180,11 @@ SOURCES = {
         cameras=_described,
     ),
     "phystwin_raw": Source(
-        module="neuspring.data.phystwin_raw",
+        module="neuspring.data.phystwin",
         reads=("data_root",),
         films=True,
         write_capture=_phystwin_capture,
-        capture_files=phystwin_raw.FILES,
+        capture_files=phystwin.RAW_FILES,
         cameras=_counted,
     ),
     "phystwin": Source(
@@ -193,9 +193,8 @@ SOURCES = {
         observations=_phystwin,
         files=phystwin.FILES,
         write_capture=_phystwin_capture,
-        capture_module="neuspring.data.phystwin_raw",
-        capture_files=phystwin_raw.FILES,
-        images_beside=phystwin_raw.has_images,
+        capture_files=phystwin.RAW_FILES,
+        images_beside=phystwin.has_images,
         cameras=_counted,
     ),
 }

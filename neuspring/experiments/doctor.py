@@ -22,7 +22,7 @@ from neuspring.config import Config
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
-from neuspring.core.uri import masked
+from neuspring.core.text import masked
 from neuspring.core.weights import hub_folder
 from neuspring.experiments import needs
 from neuspring.experiments.tracking import store

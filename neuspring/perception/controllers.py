@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
-from neuspring.core.points import farthest
+from neuspring.core.geometry import farthest
 
 HAND_GAP = 0.04
 """m: a point nearer than this to a point of a hand belongs to that hand."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from neuspring.core.findings import Finding, Level, finding
 from neuspring.data.capture import OBJECT, Capture
-from neuspring.data.plausible.masks import REMEDY, mask_findings
-from neuspring.data.plausible.things import Sample, depth_findings, hand_findings, sampled
+from neuspring.data.plausible_masks import REMEDY, mask_findings
+from neuspring.data.plausible_world import Sample, depth_findings, hand_findings, sampled
 from neuspring.perception.mask_facts import shown_by
 
 HANDS_INSIDE = 0.25

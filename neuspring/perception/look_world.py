@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.findings import Finding, finding
-from neuspring.data.plausible.things import place_findings
+from neuspring.data.plausible_world import place_findings
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 VOLUME = 0.012

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.plausible.masks import Shown
+from neuspring.data.plausible_masks import Shown
 
 STILL = 6
 """Change of gray below which a pixel did not change."""

@@ -26,7 +26,7 @@ NEVER = 1e30
 
 
 def allocate(b: Buffers) -> None:
-    """The obstacles [O, 16] of the simulation (core/obstacles.py)."""
+    """The obstacles [O, 16] of the simulation (core/geometry.py)."""
     rows = np.array([obstacle.row() for obstacle in b.simulation.obstacles], np.float64).reshape(-1, 16)
     b.constants["obstacles"] = torch.tensor(rows, dtype=b.dtype, device=b.device)
     b.views["obstacles"] = wp.from_torch(b.constants["obstacles"], dtype=b.real)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
-from neuspring.core.obstacles import Obstacle
+from neuspring.core.geometry import Obstacle
 from neuspring.physics.lanes import MIN_LENGTH
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 

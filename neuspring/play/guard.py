@@ -7,8 +7,7 @@ import zipfile
 from pathlib import Path
 
 from neuspring.core.errors import InputError
-from neuspring.core.npz import META, DamagedFile
-from neuspring.core.npz_head import read_head
+from neuspring.core.files import META, DamagedFile, read_head
 
 MOST_BYTES = 2 * 1024**3
 """Largest file, unpacked, that is opened."""

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.core.markdown import markdown
 from neuspring.core.records import canonical
+from neuspring.core.text import markdown
 from neuspring.report.explain import Behind, Explanation
 from neuspring.report.tables.render import our_change, paper_change
 from neuspring.scores.failures import left_out_lines

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.scores.metrics import DASH, METRICS, TASKS, averages, headings_of
 
 LeftOut = Mapping[str, Collection[str]]

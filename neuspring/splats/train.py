@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.progress import Progress
+from neuspring.core.text import Progress
 from neuspring.splats import harmonics
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss

@@ -19,8 +19,8 @@ from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_table
-from neuspring.core.progress import Progress
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.text import Progress
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import masks_of_cameras
 from neuspring.report.figures import images as figures

@@ -27,9 +27,8 @@ import torch
 from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.checkpoint import Checkpoint
+from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
 from neuspring.physics import stability
 from neuspring.physics.controllers import Grips, waypoints
 from neuspring.physics.parameters import Parameters

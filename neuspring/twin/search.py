@@ -25,7 +25,7 @@ from neuspring import config
 from neuspring.config.search import HANDS, LENGTHS
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.progress import Progress
+from neuspring.core.text import Progress
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.lanes import COST, WIDTHS, width_for

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from torch import nn
 
 from neuspring.core.artifacts import Topology
-from neuspring.core.points import farthest
+from neuspring.core.geometry import farthest
 from neuspring.twin.spacing import node_spacing
 
 

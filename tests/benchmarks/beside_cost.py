@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.job_records import read_jobs
-from neuspring.core.markdown import markdown
 from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.text import markdown
 from tests.benchmarks.beside_data import Run
 from tests.benchmarks.beside_tables import in_order
 

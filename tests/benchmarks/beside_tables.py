@@ -10,7 +10,7 @@ import pandas as pd
 from scipy import stats
 
 from neuspring.config.parse import read_yaml
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from tests.benchmarks.beside_data import LEFT_OUT, METHODS, PHYSTWIN, STILL
 
 COLUMNS = ("case", "method", "seed", "part", "frame", "metric", "value", "key")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.data.capture import CAPTURE, Camera, Capture, Description, Writer
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.perception.marks.marks import MARKS as MARKS_FILE
 from tests.benchmarks.footage import VIDEOS, Points, carried, film
 from tests.benchmarks.masks import MARKS

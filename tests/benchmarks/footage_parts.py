@@ -17,8 +17,8 @@ import pandas as pd
 
 from neuspring.config import Config, parse, read_yaml
 from neuspring.core.artifacts import Observations, Trajectory
-from neuspring.core.markdown import markdown
 from neuspring.core.run_record import RunRecord
+from neuspring.core.text import markdown
 from neuspring.data.capture import Camera
 from tests.benchmarks.beside_tables import DASH, differences
 

@@ -26,8 +26,8 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.markdown import markdown
 from neuspring.core.records import StageRecord
+from neuspring.core.text import markdown
 from neuspring.data.capture import Capture, Writer
 from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.truth import Truth, truth_of

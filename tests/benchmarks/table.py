@@ -11,7 +11,7 @@ from typing import Any
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = "results/published/bench"

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.core.checkpoint import Checkpoint
-from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 
 
 def test_arrays_come_back_in_their_groups_and_values_as_they_were(tmp_path):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.artifacts import Observations
-from neuspring.core.npz import DamagedFile
-from neuspring.core.npz_head import read_head
+from neuspring.core.files import DamagedFile, read_head
 from tests.support.scenarios import observations
 
 

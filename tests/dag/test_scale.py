@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from neuspring.core.job_records import read_jobs
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.experiments.jobs import gpus
 from tests.support.filmed import film, write_raw
 from tests.support.project import SCENE, add_scenario, copy_workflow, jobs_in, output_of, run, start

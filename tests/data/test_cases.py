@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 
 
 def test_the_table_of_released_cases() -> None:

@@ -12,10 +12,10 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, OBJECT, POINTS, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
-from neuspring.data.intake.charuco import Board
+from neuspring.data.intake.images import pairs
+from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
-from neuspring.data.intake.views import pairs
-from neuspring.data.plausible.alone import on_table
+from neuspring.data.plausible_world import on_table
 from neuspring.perception import segment_opencv
 from neuspring.perception.annotate.annotations import Annotations, Click, Point
 from neuspring.perception.annotate.tracks import Pointing, tracks_of

@@ -26,9 +26,9 @@ from filelock import FileLock
 
 from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
+from neuspring.data import hub as fetch_hub
 from neuspring.data import phystwin
-from neuspring.data.fetch import hub as fetch_hub
-from neuspring.data.fetch.fetch import LOCK, RECORD, fetch
+from neuspring.data.fetch import LOCK, RECORD, fetch
 from neuspring.scores.released.check_data import check
 from tests.support.phystwin_case import write_case
 
@@ -456,7 +456,7 @@ def test_no_telemetry_is_sent_and_a_token_only_where_the_environment_has_one(ser
     (tmp_path / "token").write_text("hf_stored")
     environment = os.environ | {"HF_ENDPOINT": server.endpoint, "HF_HOME": str(tmp_path), "HF_TOKEN": token, "HF_HUB_OFFLINE": ""}
     environment.pop("HF_HUB_DISABLE_TELEMETRY", None)
-    code = "import sys; from neuspring.data.fetch.fetch import fetch; fetch(sys.argv[1], [sys.argv[2]], dry_run=True)"
+    code = "import sys; from neuspring.data.fetch import fetch; fetch(sys.argv[1], [sys.argv[2]], dry_run=True)"
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "root"), CASE], env=environment, check=True, capture_output=True)
     allowed = ("/api/datasets/Jianghanxiao/PhysTwin/", "/datasets/Jianghanxiao/PhysTwin/resolve/", "/cdn/")
     assert server.paths

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config import Mocap, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
-from neuspring.data.grips import circle, clamps, transport
+from neuspring.data.mocap import circle, clamps, transport
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
 RADIUS, COUNT = 0.006, 3

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
-from neuspring.core.points import farthest
+from neuspring.core.geometry import farthest
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import choose_controllers, fill_rigidly, hands_of, rigid_motion

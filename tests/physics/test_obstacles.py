@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError
-from neuspring.core.obstacles import Obstacle
+from neuspring.core.geometry import Obstacle
 from neuspring.physics import reference
 from neuspring.physics.parameters import pack
 from neuspring.physics.solver import simulate_frame

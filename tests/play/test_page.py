@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 from neuspring.core.artifacts import Trajectory
-from neuspring.core.npz import read_npz, write_npz
+from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
 from neuspring.play.page import Page
 from neuspring.play.results import find

@@ -12,7 +12,7 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.report.tables import cells as tables_cells
 from neuspring.report.tables import render as tables_render
 from neuspring.report.tables import study as tables_paper

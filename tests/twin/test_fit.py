@@ -11,8 +11,8 @@ from scipy.stats import pearsonr
 
 from neuspring import config
 from neuspring.core.artifacts import SCALARS, Observations, Twin
+from neuspring.core.checkpoint import adam_arrays
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.training import adam_arrays
 from neuspring.physics import stability
 from neuspring.twin import fit as module
 from neuspring.twin.fit import LOWEST_RATE, FitProblem, NonFinite, TwinFit, fit

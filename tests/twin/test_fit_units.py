@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuspring import config
-from neuspring.core.training import adam_arrays
+from neuspring.core.checkpoint import adam_arrays
 from neuspring.twin.fit import FitProblem, TwinFit, fit
 from neuspring.twin.unloaded import topology_spacing
 from tests.support import small

@@ -8,7 +8,7 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.core.obstacles import Obstacle
+from neuspring.core.geometry import Obstacle
 from neuspring.twin.fit import fit
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.search import search

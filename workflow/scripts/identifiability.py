@@ -44,7 +44,7 @@ from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.data.synthetic import toy
 from neuspring.experiments.benchmark import read_scenarios
 from neuspring.report.figures import twin as figures_twin

@@ -10,7 +10,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from neuspring.baselines.gs_dynamics.rules import Rules
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.core.artifacts import Observations, Up
-from neuspring.core.points import farthest
+from neuspring.core.geometry import farthest
 
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
 """Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""

@@ -23,8 +23,7 @@ from neuspring.baselines.gs_dynamics.windows import Windows, executed
 from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.core.artifacts import Observations
-from neuspring.core.checkpoint import Checkpoint
-from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 
 METRICS = ("loss", "position_loss", "length_loss")
 

@@ -20,8 +20,7 @@ from neuspring.baselines.results import LIMIT, Trained, TrainingStopped, run_epo
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.baselines.spring_gaus.solver import AnchorSolver
 from neuspring.config.spring_gaus import SpringGaus
-from neuspring.core.checkpoint import Checkpoint
-from neuspring.core.training import TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(epoch, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""

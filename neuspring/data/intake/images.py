@@ -1,14 +1,16 @@
-"""Pictures of one kind (color or depth) of one camera, in the order of time: a folder of images, or a video."""
+"""What one camera gave: pictures of one kind (color or depth) from a folder of images or a video, in the order of time; and color
+and depth in pairs, or color alone, with what the files say about the camera.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeAlias
 
 import av
 import cv2
@@ -26,7 +28,7 @@ GAP = 1.5
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
 
-class Images(Protocol):
+class ImageSource(Protocol):
     """What one camera saw, of one kind."""
 
     @property
@@ -48,12 +50,12 @@ class Images(Protocol):
         """The files that hold them."""
 
 
-def open_images(path: Path, kind: Kind) -> Images:
+def open_images(path: Path, kind: Kind) -> ImageSource:
     """A folder or a video. Raises InputError for anything else."""
     if path.is_dir():
-        return Folder(path, kind)
+        return ImageFolder(path, kind)
     if path.is_file() and path.suffix.lower() in VIDEOS:
-        return Film(path, kind)
+        return VideoFile(path, kind)
     received = "nothing there" if not path.exists() else f"a {path.suffix or 'plain'} file"
     raise InputError(path, f"a folder of {kind} images ({' '.join(PICTURES[kind])}) or a video ({' '.join(VIDEOS)})", received)
 
@@ -64,7 +66,7 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 @dataclass(frozen=True)
-class Folder:
+class ImageFolder:
     """Images in one folder, in the order of their names."""
 
     path: Path
@@ -96,7 +98,7 @@ class Folder:
         return None
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
-        """See `Images`. Raises InputError for a damaged image or one of the wrong kind."""
+        """See `ImageSource`. Raises InputError for a damaged image or one of the wrong kind."""
         for place in places:
             yield self._picture(self.paths[place])
 
@@ -118,7 +120,7 @@ class Folder:
 
 
 @dataclass(frozen=True)
-class Film:
+class VideoFile:
     """A video; depth needs a gray one of 16 bits."""
 
     path: Path
@@ -161,7 +163,7 @@ class Film:
         return int(np.round(steps[steps > GAP * np.median(steps)] / np.median(steps) - 1).sum()) if len(steps) else 0
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
-        """See `Images`. The video is decoded from its beginning. Raises InputError where it ends early."""
+        """See `ImageSource`. The video is decoded from its beginning. Raises InputError where it ends early."""
         wanted = list(places)
         with _opened(self.path) as container:
             try:
@@ -209,3 +211,152 @@ def _opened(path: Path) -> av.container.InputContainer:
         container.close()
         raise InputError(path, "this file must have a video stream", "none")
     return container
+
+
+Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
+"""RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
+COMMON = 0.5
+"""Color and depth are paired by their numbers if this part of them is common, else by their order."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """A camera's intrinsics."""
+
+    matrix: np.ndarray
+    """K [3, 3], pixels."""
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Coefficients of OpenCV's model (4, 5, 8, 12 or 14); none: no distortion."""
+    size: tuple[int, int] | None = None
+    """(width, height) for which it holds, where it is said."""
+
+
+class CameraFeed(Protocol):
+    """One camera's pairs of pictures, and what is known of it."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the capture."""
+
+    @property
+    def path(self) -> Path:
+        """For messages."""
+
+    @property
+    def numbers(self) -> list[int]:
+        """The number of every pair, ascending."""
+
+    @property
+    def rate(self) -> float | None:
+        """Frames per second, where the source knows."""
+
+    @property
+    def unit(self) -> float | None:
+        """Meters per count of depth, where the source knows."""
+
+    @property
+    def lens(self) -> Lens | None:
+        """Intrinsics, where the source knows."""
+
+    @property
+    def pose(self) -> np.ndarray | None:
+        """Camera to world [4, 4], m, where the source knows."""
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the user should know about the files."""
+
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
+        """The pairs at ascending places: with depth all of them, or none."""
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """The files that hold them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Paired:
+    """Color and depth of two folders or videos, or color alone."""
+
+    name: str
+    color: ImageSource
+    depth: ImageSource | None
+    unit: float | None = None
+    lens: Lens | None = None
+    pose: np.ndarray | None = None
+
+    @property
+    def path(self) -> Path:
+        """That of color."""
+        return self.color.path
+
+    @cached_property
+    def _pairs(self) -> list[tuple[int, int, int]]:
+        """(number, place of color, place of depth). Raises InputError where they cannot be paired."""
+        if self.depth is None:
+            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
+        left, right = ({number: place for place, number in enumerate(images.numbers)} for images in (self.color, self.depth))
+        common = sorted(left.keys() & right.keys())
+        if len(common) >= COMMON * max(len(left), len(right)) and len(common):
+            return [(number, left[number], right[number]) for number in common]
+        if len(left) == len(right):
+            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
+        rule = f"camera {self.name} needs as many depth images as color images, or the same numbers in their names"
+        remedy = "Where both have time stamps for names, copy the nearest pairs to two folders first."
+        raise InputError(self.depth.path, rule, f"{len(right)} for {len(left)}, {len(common)} numbers in common", remedy)
+
+    @property
+    def numbers(self) -> list[int]:
+        """See `CameraFeed`."""
+        return [number for number, *_ in self._pairs]
+
+    @property
+    def rate(self) -> float | None:
+        """That of the color video."""
+        return self.color.rate
+
+    @cached_property
+    def remarks(self) -> list[str]:
+        """Images without a partner, dropped pictures of a video."""
+        found, sources = [], [images for images in (self.color, self.depth) if images is not None]
+        alone = max(len(images.numbers) for images in sources) - len(self._pairs)
+        if alone:
+            found.append(f"camera {self.name}: {alone} images without their partner are left out")
+        for images in sources:
+            if isinstance(images, VideoFile) and (dropped := images.dropped()):
+                found.append(f"{images.path}: about {dropped} pictures were dropped when it was filmed; time jumps there")
+        return found
+
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
+        """See `CameraFeed`."""
+        pairs = [self._pairs[place] for place in places]
+        colors = self.color.read([left for _, left, _ in pairs])
+        if self.depth is None:
+            return zip(colors, [None] * len(pairs), strict=True)
+        return zip(colors, self.depth.read([right for *_, right in pairs]), strict=True)
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """See `CameraFeed`."""
+        pairs = [self._pairs[place] for place in places]
+        deep = [] if self.depth is None else self.depth.files([right for *_, right in pairs])
+        return self.color.files([left for _, left, _ in pairs]) + deep
+
+
+def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[CameraFeed]:
+    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
+
+    Raises InputError.
+    """
+    if len(colors) > 1 and not depths:
+        rule = "without depth one camera is required: color alone is of one view"
+        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
+    if not colors or (depths and len(colors) != len(depths)):
+        rule = "as many folders or videos of depth as of color are required, one each per camera"
+        raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
+    names = names or tuple(map(str, range(len(colors))))
+    if len(names) != len(colors) or len(set(names)) < len(names):
+        raise InputError("--cameras", f"{len(colors)} different names are required", " ".join(names))
+    deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
+    views: list[CameraFeed] = [
+        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
+    ]
+    return views

@@ -1,31 +1,45 @@
-"""From what cameras gave to a capture folder."""
+"""From what cameras gave to a capture folder; never over another one, and from where it was interrupted."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.core.progress import Progress
+from neuspring.core.files import load_json, write_text
 from neuspring.core.records import digest_file
-from neuspring.data.capture import Camera, Capture, Description, Writer, description_departures
+from neuspring.core.text import Progress
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, Capture, Description, Writer, description_departures
 from neuspring.data.departure import refuse
-from neuspring.data.intake.charuco import Board
-from neuspring.data.intake.choice import Choice, choose
-from neuspring.data.intake.lenses import Straightener, read_lenses, read_poses
-from neuspring.data.intake.look import Seen, look, meters_of, plain, require_aligned, stored_as, straightened
-from neuspring.data.intake.poses import Placed, by_board, by_table, given_alone, stand
-from neuspring.data.intake.raw import Raw
-from neuspring.data.intake.store import close, prepare, written
-from neuspring.data.intake.units import Unit, find_rate
-from neuspring.data.intake.views import Paired, View
+from neuspring.data.intake.depth import Unit, find_rate
+from neuspring.data.intake.images import CameraFeed, Paired
+from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.data.intake.poses import (
+    FrameChoice,
+    Placed,
+    SampledCamera,
+    by_board,
+    by_table,
+    choose,
+    given_alone,
+    look,
+    meters_of,
+    plain,
+    require_aligned,
+    stand,
+    stored_as,
+    straightened,
+)
+from neuspring.data.intake.recordings import Raw
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -41,7 +55,7 @@ class Intake:
     name: str
     category: str
     """Kind of object: cloth, rope, package, ..."""
-    views: Sequence[View]
+    views: Sequence[CameraFeed]
     """One per camera: `views.pairs`, `bag.Bag`, `raw.Raw.views`. Color alone, without depth, is of one."""
     rate: float | None = None
     """Frames per second at which it was filmed; None: that of the video."""
@@ -141,7 +155,7 @@ def _require_for_color_alone(intake: Intake) -> None:
         raise InputError("--poses", "color alone needs the pose of the camera, in a world with the table at z = 0", "none", remedy)
 
 
-def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit | None) -> tuple[Placed, str]:
+def _place(intake: Intake, seen: Mapping[str, SampledCamera], unit: Unit | None) -> tuple[Placed, str]:
     """Poses of all cameras, and where they come from. Raises InputError."""
     names, level, top_down = list(seen), intake.level, intake.top_down
     given = {view.name: view.pose for view in intake.views if view.pose is not None}
@@ -176,7 +190,7 @@ def _place(intake: Intake, seen: Mapping[str, Seen], unit: Unit | None) -> tuple
 
 
 def _describe(
-    intake: Intake, choice: Choice, rate: float, unit: Unit | None, seen: Mapping[str, Seen], placed: Placed
+    intake: Intake, choice: FrameChoice, rate: float, unit: Unit | None, seen: Mapping[str, SampledCamera], placed: Placed
 ) -> dict[str, Any]:
     """The entries of capture.json."""
     entries = []
@@ -201,7 +215,9 @@ def _describe(
     }
 
 
-def _write(intake: Intake, made: Description, choice: Choice, unit: Unit | None, seen: Mapping[str, Seen], placed: Placed) -> None:
+def _write(
+    intake: Intake, made: Description, choice: FrameChoice, unit: Unit | None, seen: Mapping[str, SampledCamera], placed: Placed
+) -> None:
     recipe = TypeAdapter(Description).dump_python(made, mode="json")
     recipe["distortion"] = {name: view.lens.distortion.tolist() for name, view in seen.items()}
     begun = prepare(intake.folder, recipe, intake.force)
@@ -240,3 +256,51 @@ def _digest(files: Sequence[Path]) -> str:
     for path in dict.fromkeys(files):
         digest.update(f"{path.name} {digest_file(path)}\n".encode())
     return f"sha256:{digest.hexdigest()}"
+
+
+RECIPE = ".make-capture.json"
+"""What an unfinished folder is made of. It is removed at the end."""
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS)
+"""Work of people and of hours, which --force does not remove."""
+
+
+def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
+    """Make `folder` ready for a capture made by `recipe`; returns whether it holds a part of it already.
+
+    Raises InputError for a folder with anything else in it, unless `force` replaces the images of a capture.
+    """
+    path = folder / RECIPE
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "--output must be a folder", "a file")
+    if path.exists() and not (folder / CAPTURE).exists() and load_json(path) == recipe:
+        return True
+    if folder.is_dir() and any(folder.iterdir()):
+        ours = (folder / CAPTURE).exists() or path.exists()
+        what = "a capture" if (folder / CAPTURE).exists() else "an unfinished capture from other input" if ours else "other files"
+        if not (force and ours):
+            remedy = "Choose another folder" + (", or give --force, which replaces its images." if ours else ".")
+            raise InputError(folder, "--output must be a new or empty folder", what, remedy)
+        kept = [name for name in PRECIOUS if (folder / name).exists()]
+        if kept:
+            raise InputError(
+                folder, "--force does not remove masks, marks, clicks or tracks", " and ".join(kept), "Move them away first."
+            )
+        (folder / CAPTURE).unlink(missing_ok=True)
+        for kind in ("color", "depth"):
+            if (folder / kind).is_dir():
+                shutil.rmtree(folder / kind)
+    write_text(path, json.dumps(recipe, indent=1) + "\n")
+    return False
+
+
+def written(writer: Writer, camera: str, frames: list[int]) -> set[int]:
+    """The frames of an interrupted folder that are complete: all with their images, but the last, which may be half written."""
+    capture = writer.capture
+    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth") if capture.has_depth else ("color",)
+    there = [f for f in frames if all(capture.path(kind, camera, f).is_file() for kind in kinds)]
+    return set(there[:-1])
+
+
+def close(folder: Path) -> None:
+    """The capture is complete."""
+    (folder / RECIPE).unlink(missing_ok=True)

@@ -1,9 +1,13 @@
-"""Poses of the cameras, from a ChArUco board or the table alone, and how they stand on the table that the cameras see."""
+"""Before anything is written: which frames are kept, what cameras saw in a few of them (sizes, kinds, intrinsics, unit of depth),
+and where the cameras are, by given poses, a ChArUco board or the table alone.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +16,187 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Camera
 from neuspring.data.departure import refuse
-from neuspring.data.intake.charuco import Board, Sighting, depth_ratio, sight
-from neuspring.data.intake.images import open_images
-from neuspring.data.intake.lenses import Straightener
-from neuspring.data.intake.look import Seen
-from neuspring.data.intake.plane import Plane, cloud, planes
-from neuspring.data.intake.world import center_of, common_plane, find_table, levelling, pose_on
-from neuspring.data.plausible.alone import alone_departures
-from neuspring.data.plausible.table import table_departures
+from neuspring.data.intake.depth import (
+    Plane,
+    Unit,
+    center_of,
+    cloud,
+    common_plane,
+    find_table,
+    find_unit,
+    levelling,
+    planes,
+    pose_on,
+)
+from neuspring.data.intake.images import CameraFeed, Lens, Pair, open_images
+from neuspring.data.intake.lenses import Board, Sighting, Straightener, depth_ratio, require_lens, sight
+from neuspring.data.plausible_world import alone_departures, table_departures
+
+FEWEST = 5
+"""Frames of a capture."""
+SYNTAX = re.compile(r"(\d+)(?:(-)(\d*))?(?:/(\d+))?")
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """The frames of a capture."""
+
+    numbers: list[int]
+    """Of the source, per frame of the capture."""
+    places: dict[str, dict[int, int]]
+    """Camera -> frame of the capture -> place in its view; a frame that the camera lacks is absent."""
+    step: int
+    """Every so many frames of the source are kept; the rate falls by it."""
+    jumps: int
+    """Places where more numbers are left out: there time jumps."""
+
+    def missing(self, camera: str) -> tuple[int, ...]:
+        """Frames that the camera lacks."""
+        return tuple(frame for frame in range(len(self.numbers)) if frame not in self.places[camera])
+
+    def text(self) -> str:
+        """Which they are, in one line."""
+        stride = f", one in {self.step}" if self.step > 1 else ""
+        return f"{len(self.numbers)} frames, numbers {self.numbers[0]} to {self.numbers[-1]} of the source{stride}"
+
+
+def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
+    """The members of ascending `numbers` that `wanted` names: `250-335`, `0-`, `0-300/2`, `1,5,9-20`; both ends count.
+
+    Raises InputError for another syntax, or where nothing is left.
+    """
+    if not wanted:
+        return list(numbers)
+    kept: set[int] = set()
+    for part in wanted.split(","):
+        match = SYNTAX.fullmatch(part.strip())
+        if not match or (match[4] and int(match[4]) < 1) or (match[4] and not match[2]):
+            raise InputError("--frames", "ranges like 250-335, 0-, 0-300/2 or 1,5,9-20 are required", repr(part))
+        first = int(match[1])
+        last = first if not match[2] else int(match[3]) if match[3] else max(numbers, default=first)
+        kept |= {number for number in numbers if first <= number <= last and (number - first) % int(match[4] or 1) == 0}
+    return sorted(kept)
+
+
+def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
+    """The frames of all cameras that are kept.
+
+    Cameras with equally many frames go by their order, others by the numbers in the names of their images; a number that the first
+    camera has and another lacks is a missing frame. Raises InputError for too few frames.
+    """
+    first = views[0]
+    alike = all(len(view.numbers) == len(first.numbers) for view in views)
+    kept = chosen(wanted, first.numbers)
+    received = f"{len(kept)} of the numbers {first.numbers[0]} to {first.numbers[-1]}" if first.numbers else "none"
+    if len(kept) < FEWEST:
+        raise InputError("--frames", f"a capture needs at least {FEWEST} frames", received)
+    places: dict[str, dict[int, int]] = {}
+    for view in views:
+        where = {number: place for place, number in enumerate(first.numbers if alike else view.numbers)}
+        places[view.name] = {frame: where[number] for frame, number in enumerate(kept) if number in where}
+        if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
+            rule = f"camera {view.name} must have the frames of camera {first.name}: the first of them, and half of the others"
+            remedy = "Name the images of all cameras by the same frame numbers, or give --frames."
+            raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
+    of_first = [place for _, place in sorted(places[first.name].items())]
+    # The rate is that of the files that are there; a number that is not there is a moment that is missing.
+    step = min(after - before for before, after in pairwise(of_first))
+    gaps = [after - before for before, after in pairwise(kept)]
+    return FrameChoice(kept, places, step, sum(gap != min(gaps) for gap in gaps))
+
+
+SAMPLED = 5
+"""Frames per camera, evenly spaced, in which the unit of depth and the table are looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampledCamera:
+    """What a camera saw in a few frames."""
+
+    path: Path
+    size: tuple[int, int]
+    """(width, height)."""
+    lens: Lens
+    colors: list[np.ndarray]
+    """[H, W, 3] uint8 RGB, without distortion."""
+    depths: list[np.ndarray]
+    """[H, W], m, without distortion; none with color alone."""
+    unit: float | None
+    """m per count of its images; None where they are floating point, or there are none."""
+
+
+def look(
+    views: Sequence[CameraFeed], choice: FrameChoice, listed: Mapping[str, Lens], file: Path | None, given_unit: float | None
+) -> tuple[dict[str, SampledCamera], Unit | None]:
+    """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
+
+    `listed` are the intrinsics of `file`; those of the source count where there are none. Raises InputError.
+    """
+    samples: dict[str, list[Pair]] = {}
+    lenses: dict[str, Lens] = {}
+    for view in views:
+        frames = sorted(choice.places[view.name])
+        picked = sorted({frames[k] for k in np.linspace(0, len(frames) - 1, SAMPLED).astype(int)})
+        samples[view.name] = list(view.read([choice.places[view.name][frame] for frame in picked]))
+        lens = listed.get(view.name) or view.lens
+        if lens is None:
+            remedy = "Give a JSON file with fx, fy, cx, cy."
+            raise InputError("--intrinsics", f"intrinsics of camera {view.name} are required", "none", remedy)
+        lenses[view.name] = lens
+        color, depth = samples[view.name][0]
+        require_aligned(view.path, view.name, color, depth)
+        require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
+    depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
+    if len({stored_as(depth) for depth in depths}) > 1:
+        raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
+    known = {view.unit for view in views}
+    if len(known) > 1 and given_unit is None:
+        raise InputError("--depth-unit", "all cameras must have one unit of depth", " and ".join(sorted(map(str, known))))
+    unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None) if depths else None
+    return {view.name: straightened(view, samples[view.name], lenses[view.name], unit) for view in views}, unit
+
+
+def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None) -> SampledCamera:
+    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
+    differ."""
+    size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
+    for color, depth in pairs:
+        require_aligned(view.path, view.name, color, depth, size)
+    straight = Straightener(lens, size)
+    colors = [straight.color(color) for color, _ in pairs]
+    if unit is None:
+        return SampledCamera(view.path, size, lens, colors, [], None)
+    depths = [depth for _, depth in pairs if depth is not None]
+    meters = [meters_of(straight.depth(plain(depth)), unit) for depth in depths]
+    return SampledCamera(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
+
+
+def require_aligned(
+    where: Path, name: str, color: np.ndarray, depth: np.ndarray | None, size: tuple[int, int] | None = None
+) -> None:
+    """Raise InputError unless depth, where there is any, has the size of color, which is `size`."""
+    if depth is not None and color.shape[:2] != depth.shape:
+        received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
+        remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
+        raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)
+    if size is not None and color.shape[1::-1] != size:
+        raise InputError(where, f"camera {name}: all images must be {size[0]} x {size[1]}", f"{color.shape[1]} x {color.shape[0]}")
+
+
+def stored_as(depth: np.ndarray) -> str:
+    """How the capture stores it: 16-bit counts as png, anything else as npy in meters."""
+    return "png" if depth.dtype == np.uint16 else "npy"
+
+
+def plain(depth: np.ndarray) -> np.ndarray:
+    """Counts, or floating point without what is no depth."""
+    return depth if depth.dtype == np.uint16 else np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(0)
+
+
+def meters_of(depth: np.ndarray, unit: Unit) -> np.ndarray:
+    """Depth in meters, of counts."""
+    return (depth * unit.meters).astype(np.float32)
+
 
 RATIO = 0.04
 """Depth may differ by this part from the distance of the board by its printed size."""
@@ -40,7 +217,7 @@ class Placed:
     """Of the report."""
 
 
-def by_table(name: str, seen: Seen, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
+def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
     """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `world.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
@@ -50,7 +227,7 @@ def by_table(name: str, seen: Seen, *, top_down: bool, at: tuple[float, float] |
     return Placed(poses={name: pose}, table=text, lines=lines)
 
 
-def by_board(board: Board, seen: Mapping[str, Seen], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
+def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Poses by a board that lies still: in `images`, an image or a folder of them per camera, else in the frames themselves.
 
     Returns them with lines of the report. Raises InputError where the board is not seen, or depth contradicts its size.
@@ -69,7 +246,12 @@ def by_board(board: Board, seen: Mapping[str, Seen], images: Sequence[Path]) -> 
 
 
 def stand(
-    poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], *, level: bool, top_down: bool = False, up: str | None = None
+    poses: Mapping[str, np.ndarray],
+    seen: Mapping[str, SampledCamera],
+    *,
+    level: bool,
+    top_down: bool = False,
+    up: str | None = None,
 ) -> Placed:
     """Given poses against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
@@ -110,7 +292,7 @@ def stand(
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 
 
-def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], where: Path) -> Placed:
+def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamera], where: Path) -> Placed:
     """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
 
     Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible.table`.
@@ -123,7 +305,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, Seen], where
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=lines)
 
 
-def _point(seen: Seen, at: tuple[float, float]) -> np.ndarray:
+def _point(seen: SampledCamera, at: tuple[float, float]) -> np.ndarray:
     """The point [3], m, in the camera's coordinates, at pixel (x, y): the median around it. Raises InputError without depth."""
     x, y = round(at[0]), round(at[1])
     if not (0 <= x < seen.size[0] and 0 <= y < seen.size[1]):
@@ -134,7 +316,7 @@ def _point(seen: Seen, at: tuple[float, float]) -> np.ndarray:
     return np.asarray(np.median(around[around > 0]) * (np.linalg.inv(seen.lens.matrix) @ [x, y, 1.0]))
 
 
-def _pictures(path: Path, view: Seen) -> list[np.ndarray]:
+def _pictures(path: Path, view: SampledCamera) -> list[np.ndarray]:
     """Images of a board, without distortion."""
     source = open_images(path if path.is_dir() else path.parent, "color")
     places = [k for k, file in enumerate(source.files(range(len(source.numbers)))) if path.is_dir() or file == path]
@@ -149,7 +331,7 @@ def _pictures(path: Path, view: Seen) -> list[np.ndarray]:
     return pictures
 
 
-def _compare(path: Path, sighting: Sighting, view: Seen) -> str:
+def _compare(path: Path, sighting: Sighting, view: SampledCamera) -> str:
     """The board's distance by depth. Raises InputError where it contradicts the board's size."""
     ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
     if not ratios:

@@ -12,9 +12,9 @@ from neuspring.config import ScenarioRow
 from neuspring.config.data import Synthetic
 from neuspring.core.device import quiet
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.points import farthest
-from neuspring.core.progress import Progress
+from neuspring.core.geometry import farthest
 from neuspring.core.records import digest_file
+from neuspring.core.text import Progress
 from neuspring.data.capture import Camera, Capture, Description, Writer
 from neuspring.data.synthetic.bodies import SoftBody
 from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle

@@ -18,7 +18,7 @@ import pandas as pd
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.experiments.tracking.query import LoggedRun, logged_runs
 from neuspring.scores.metrics import METRICS, TASKS, UNITS
 from neuspring.scores.statistics import paired_differences

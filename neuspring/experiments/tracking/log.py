@@ -19,7 +19,7 @@ from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.core.uri import masked
+from neuspring.core.text import masked
 from neuspring.experiments.tracking.payload import Payload, cut, milliseconds, payload
 from neuspring.experiments.tracking.query import AGAIN, is_complete, search
 from neuspring.experiments.tracking.store import ARTIFACTS, connect, default_uri, lock, lock_path, prepare, uri_of

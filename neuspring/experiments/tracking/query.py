@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
-from neuspring.core.uri import masked
+from neuspring.core.text import masked
 from neuspring.experiments.tracking.store import find, uri_of
 
 if TYPE_CHECKING:

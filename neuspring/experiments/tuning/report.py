@@ -27,9 +27,9 @@ from neuspring import config
 from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_atomically, write_table, write_text
-from neuspring.core.markdown import markdown
 from neuspring.core.records import canonical
 from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
+from neuspring.core.text import markdown
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan, labels
 from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, Store, slots

@@ -19,9 +19,8 @@ from pydantic import Field, StringConstraints
 from neuspring.config import parse, plain
 from neuspring.config.types import STRICT, Finite
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
+from neuspring.core.files import load_json, write_text
 from neuspring.data.capture import Capture
-from neuspring.data.json_file import load_json
 
 ANNOTATIONS = "annotations.json"
 MOST_POINTS, MOST_CLICKS = 500, 5000

@@ -8,7 +8,7 @@ import numpy as np
 from neuspring.config.perception import ColorSettings
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
-from neuspring.core.points import farthest
+from neuspring.core.geometry import farthest
 from neuspring.data.capture import NOTHING, OBJECT, Capture
 from neuspring.perception.color.first_frame import FirstFrame
 from neuspring.perception.color.hands import follow_hands, grips

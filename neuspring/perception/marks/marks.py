@@ -25,9 +25,8 @@ from pydantic import Field
 from neuspring.config import parse, plain
 from neuspring.config.types import STRICT, Finite, Name
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
+from neuspring.core.files import load_json, write_text
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.data.json_file import load_json
 
 MARKS = "marks.json"
 """Its name in a capture's folder."""

@@ -23,10 +23,9 @@ from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.config.types import STRICT, Name
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_atomically, write_text
+from neuspring.core.files import load_json, write_atomically, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, Capture, images_digest
-from neuspring.data.json_file import load_json
 from neuspring.perception.marks.carry import Carried, carry
 from neuspring.perception.marks.marks import Mark, marks_digest
 from neuspring.perception.marks.sheet import save_sheet

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from neuspring.core.markdown import markdown
 from neuspring.core.run_record import RunRecord, flat
+from neuspring.core.text import markdown
 
 NOT_SETTINGS = ("seed", "device", "description", "batch")
 """Recorded beside the settings, without being one of the method."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
 from neuspring.core.records import StageRecord
+from neuspring.core.text import markdown
 
 COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),

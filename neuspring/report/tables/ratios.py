@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.config.settings import Aim
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.scores.metrics import DASH, HEADINGS, METRICS, SHORT, TRANSFER_HEADINGS, Headings, published
 from neuspring.scores.ratios import LEAST_OBJECTS, Objects, judged_aims, ratios, seed_spread
 from neuspring.scores.runs import Collected, finished_scores

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.report.tables.cells import ORACLE_LINE, in_order
 from neuspring.report.tables.differing import ABOUT, Differing
 from neuspring.scores import paper

@@ -21,8 +21,8 @@ import pandas as pd
 from neuspring.config import parse
 from neuspring.config.types import STRICT, Name
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
 from neuspring.core.records import RECORD_FORMAT, read_json
+from neuspring.core.text import markdown
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.tables.cells import LEAST_SCENARIOS, accounted, cells, counted, of_study
 from neuspring.report.tables.differing import differing, differing_markdown

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.files import write_atomically, write_text
-from neuspring.core.markdown import markdown
+from neuspring.core.text import markdown
 from neuspring.report.figures.clusters import NAME as CLUSTERS
 from neuspring.report.figures.clusters import cluster_methods, clusters_figure
 from neuspring.report.figures.ratios import NAME as RATIOS

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.errors import InputError
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import METRICS, TASKS, UNITS, averages
 

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from neuspring.config.images import ImageQuirks, Images
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.core.progress import Progress
+from neuspring.core.text import Progress
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera
-from neuspring.data.phystwin_raw import CALIBRATION
+from neuspring.data.phystwin import CALIBRATION
 from neuspring.data.released import (
     Released,
     depth_image,

@@ -9,10 +9,10 @@ import numpy as np
 from neuspring.config import Fit
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
-from neuspring.core.progress import Progress
+from neuspring.core.text import Progress
 from neuspring.data import phystwin
-from neuspring.data.cases import released_cases
-from neuspring.data.released import Checkpoint, Released, read_checkpoint, read_parameters, read_prediction
+from neuspring.data.phystwin import released_cases
+from neuspring.data.released import Released, ReleasedCheckpoint, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
 from neuspring.scores.released.findings import Finding, Tools, of_scores, require
 from neuspring.twin.rollout import simulate
@@ -115,7 +115,7 @@ def simulator(case: Released, observations: Observations, tools: Tools) -> list[
     return findings
 
 
-def released_twin(observations: Observations, parameters: dict[str, float], checkpoint: Checkpoint, case: Released) -> Twin:
+def released_twin(observations: Observations, parameters: dict[str, float], checkpoint: ReleasedCheckpoint, case: Released) -> Twin:
     """The checkpoint as a twin with the searched dampings. Raises InputError if springs and checkpoint do not belong together."""
     springs = _springs(observations, parameters)
     if len(springs.springs) != len(checkpoint.stiffness):

@@ -15,10 +15,9 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
-from neuspring.core.markdown import markdown
-from neuspring.core.progress import Progress
+from neuspring.core.text import Progress, markdown
 from neuspring.data import phystwin
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured

@@ -12,10 +12,9 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
-from neuspring.data.intake.charuco import Board
-from neuspring.data.intake.make import Intake, make_capture
-from neuspring.data.intake.store import RECIPE
-from neuspring.data.intake.views import pairs
+from neuspring.data.intake.images import pairs
+from neuspring.data.intake.lenses import Board
+from neuspring.data.intake.make import RECIPE, Intake, make_capture
 from tests.support import realsense
 from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.departures import serious

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.plane import cloud, planes
-from neuspring.data.intake.world import center_of, common_plane, find_table, levelling, pose_on
+from neuspring.data.intake.depth import center_of, cloud, common_plane, find_table, levelling, planes, pose_on
 from tests.support.desk import RADIUS, SIZE, TARGET, K, camera, looking, seen
 
 NOISE = 0.001

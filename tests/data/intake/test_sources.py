@@ -5,15 +5,14 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.choice import choose, chosen
-from neuspring.data.intake.images import Film, Folder
-from neuspring.data.intake.views import pairs
+from neuspring.data.intake.images import ImageFolder, VideoFile, pairs
+from neuspring.data.intake.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
 
 
 def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
     root = write_folders(tmp_path, frames=12, first=5)
-    folder = Folder(root / "color_0", "color")
+    folder = ImageFolder(root / "color_0", "color")
     assert folder.numbers == list(range(5, 17))
     assert [path.stem for path in folder.paths][-1] == "frame_16"
     np.testing.assert_array_equal(next(folder.read([10])), seen(camera(), 10)[0])
@@ -22,7 +21,7 @@ def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
 def test_names_without_a_common_form_count_from_zero(tmp_path):
     for name in ("12.10", "9.3", "12.9"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4, 3), np.uint8))
-    folder = Folder(tmp_path, "color")
+    folder = ImageFolder(tmp_path, "color")
     assert folder.numbers == [0, 1, 2]
     assert [path.name for path in folder.paths] == ["9.3.png", "12.9.png", "12.10.png"]
 
@@ -49,13 +48,13 @@ def image_of(value, ending=".png"):
 def test_what_is_no_folder_of_images_is_refused(tmp_path, write, kind, message):
     write(tmp_path)
     with pytest.raises(InputError) as caught:
-        list(Folder(tmp_path, kind).read(range(len(Folder(tmp_path, kind).numbers))))
+        list(ImageFolder(tmp_path, kind).read(range(len(ImageFolder(tmp_path, kind).numbers))))
     assert message in str(caught.value)
 
 
 def test_a_depth_video_keeps_every_count(tmp_path):
     depths = [counts(seen(camera(), frame)[1]) for frame in range(4)]
-    film = Film(write_video(tmp_path / "depth.mkv", depths, "ffv1", "gray16le"), "depth")
+    film = VideoFile(write_video(tmp_path / "depth.mkv", depths, "ffv1", "gray16le"), "depth")
     assert film.numbers == [0, 1, 2, 3]
     for found, depth in zip(film.read([1, 3]), [depths[1], depths[3]], strict=True):
         np.testing.assert_array_equal(found, depth)
@@ -71,13 +70,13 @@ def test_a_depth_video_that_loses_depth_is_refused(tmp_path, codec, stored, mess
     images = [np.zeros((48, 64, 3), np.uint8) if stored == "yuv420p" else np.zeros((48, 64), np.uint16)] * 2
     path = write_video(tmp_path / "depth.mkv", images, codec, stored)
     with pytest.raises(InputError, match="a depth video must be") as caught:
-        list(Film(path, "depth").numbers)
+        list(VideoFile(path, "depth").numbers)
     assert message in str(caught.value)
 
 
 def test_a_video_in_whole_milliseconds_knows_its_rate(tmp_path):
     frames = [np.full((16, 16, 3), 8 * k, np.uint8) for k in range(31)]
-    film = Film(write_video(tmp_path / "color.mkv", frames, "mpeg4", "yuv420p", rate=30), "color")
+    film = VideoFile(write_video(tmp_path / "color.mkv", frames, "mpeg4", "yuv420p", rate=30), "color")
     assert film.rate == pytest.approx(30, rel=1e-3)
     assert len(film.numbers) == 31 and film.dropped() == 0
     dark, light = film.read([2, 30])
@@ -87,7 +86,7 @@ def test_a_video_in_whole_milliseconds_knows_its_rate(tmp_path):
 def test_a_damaged_video_is_refused(tmp_path):
     (tmp_path / "color.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="this file must be a readable video"):
-        list(Film(tmp_path / "color.mp4", "color").numbers)
+        list(VideoFile(tmp_path / "color.mp4", "color").numbers)
 
 
 def test_color_and_depth_pair_by_their_numbers_and_else_by_their_order(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.data.cases import released_cases
+from neuspring.data.phystwin import released_cases
 from neuspring.data.released import (
     Released,
     depth_image,

@@ -1,9 +1,31 @@
-"""Progress of long work: one updating line on a terminal, a line now and then in a log."""
+"""What is printed: Markdown tables, addresses of stores without their passwords, the line of progress of long work."""
 
 from __future__ import annotations
 
+import re
 import sys
 import time
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> list[str]:
+    """Lines of a table whose columns are as wide as their widest cell."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+
+    def line(cells: list[str]) -> str:
+        return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+
+    return [line(header), "|" + "|".join("-" * (width + 2) for width in widths) + "|", *map(line, rows)]
+
+
+def masked(text: str) -> str:
+    """Text without the user and password of any URI in it."""
+    return re.sub(r"://[^/@\s]+@", "://***@", text)
+
+
+def refuse_password(key: str, uri: str, instead: str) -> None:
+    """Raise ValueError if a URI holds a password: command lines and logs of jobs would show it."""
+    if ":" in uri.partition("://")[2].partition("/")[0].rpartition("@")[0]:
+        raise ValueError(f"{key}: a password would be shown by ps and in logs; set {instead} instead")
 
 
 class Progress:

@@ -1,4 +1,8 @@
-"""RealSense .bag files, through pyrealsense2, which is imported only here. Depth is aligned to color by it."""
+"""Recordings that say more about their cameras than folders of images do.
+
+- RealSense .bag files, through pyrealsense2, which is imported only here. Depth is aligned to color by it.
+- PhysTwin's raw layout: images, calibration, and masks, tracks and split where they are there.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,13 @@ import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.views import Lens
+from neuspring.core.files import load_json
+from neuspring.data import phystwin
+from neuspring.data.capture import Camera
+from neuspring.data.departure import refuse
+from neuspring.data.intake.images import CameraFeed, Lens, Paired, open_images
+from neuspring.data.phystwin import CALIBRATION, annotated, cameras_of, detections, labels_of, raw_departures, train_end_of
+from neuspring.data.unpickle import load_pickle
 
 MODULE = "pyrealsense2"
 PATIENCE = 5000
@@ -77,11 +87,11 @@ class Bag:
 
     @property
     def remarks(self) -> list[str]:
-        """See `View`."""
+        """See `CameraFeed`."""
         return [self._about[4]] if self._about[4] else []
 
     def read(self, places: Sequence[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """See `View`. Raises InputError where the file ends early."""
+        """See `CameraFeed`. Raises InputError where the file ends early."""
         wanted = list(places)
         for place, (_, color, depth) in enumerate(self._play(False)):
             if not wanted:
@@ -143,3 +153,51 @@ def _library() -> Any:
     except ImportError as error:
         remedy = f"Run `pip install {MODULE}`, or export the recording to folders (rs-convert) and use --color and --depth."
         raise InputError("--bag", f"the package {MODULE} is required to read a .bag file", "not installed", remedy) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """A case in PhysTwin's raw layout."""
+
+    case: Path
+    views: list[CameraFeed]
+    cameras: dict[str, Camera]
+    rate: float
+    train_end: int | None
+    """Of all its frames."""
+    tracks: np.ndarray | None
+    """[T, K, 3], m, in its world."""
+    ids: dict[str, dict[int, list[str]]]
+    """Detections of each label, by camera; empty without masks."""
+
+    @classmethod
+    def open(cls, case: Path) -> Raw:
+        """Read its calibration. Raises InputError."""
+        metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
+        refuse(raw_departures(case, metadata, poses))
+        cameras = {camera.name: camera for camera in cameras_of(metadata, poses)}
+        views: list[CameraFeed] = [
+            Paired(
+                name,
+                open_images(case / "color" / name, "color"),
+                open_images(case / "depth" / name, "depth"),
+                unit=0.001,
+                lens=Lens(matrix=camera.intrinsics, size=(camera.width, camera.height)),
+                pose=camera.camera_to_world,
+            )
+            for name, camera in cameras.items()
+        ]
+        frames = int(metadata["frame_num"])
+        return cls(
+            case,
+            views,
+            cameras,
+            float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
+            train_end_of(case, frames),
+            annotated(case, frames),
+            {name: detections(case, name) for name in cameras} if (case / "mask").is_dir() else {},
+        )
+
+    def labels(self, camera: str, number: int) -> np.ndarray:
+        """Mask [H, W] uint8 of a camera's frame with this number in its name. Raises InputError."""
+        return labels_of(self.case, self.cameras[camera], number, self.ids[camera])
