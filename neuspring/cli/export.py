@@ -9,14 +9,14 @@ from pathlib import Path
 from neuspring.core.errors import InputError
 
 FORMATS = {
-    "npz": ("neuspring.export.plain", "", "{name}_npz"),
-    "ply": ("neuspring.export.ply", "0", "{name}"),
-    "spz": ("neuspring.export.spz", "0", "{name}"),
-    "newton": ("neuspring.export.newton", "", "{name}_newton"),
-    "mujoco": ("neuspring.export.mujoco", "", "{name}_mujoco"),
-    "usd": ("neuspring.export.usd", "", "{name}.usdc"),
+    "npz": ("plain.write", "", "{name}_npz"),
+    "ply": ("ply.write", "0", "{name}"),
+    "spz": ("spz.write", "0", "{name}"),
+    "newton": ("simulators.write_newton", "", "{name}_newton"),
+    "mujoco": ("simulators.write_mujoco", "", "{name}_mujoco"),
+    "usd": ("usd.write", "", "{name}.usdc"),
 }
-"""Format -> module, frames by default (all where empty), what is written by default."""
+"""Format -> module and function of neuspring.export, frames by default (all where empty), what is written by default."""
 
 
 def export_options(parser: ArgumentParser) -> None:
@@ -32,12 +32,13 @@ def export(a: Namespace) -> None:
     """`neuspring export`."""
     from neuspring.export.source import chosen_frames, read_source
 
-    module, default, name = FORMATS[a.to]
+    writer, default, name = FORMATS[a.to]
+    module, _, function = writer.partition(".")
     if a.rate is not None and a.to != "usd":
         raise InputError("--rate", "is for usd", f"--to {a.to}", "Leave it out: the files say the time of each frame.")
     source = read_source(a.twin)
     frames = chosen_frames(a.frames, source, default)
     output = a.output or Path("export") / name.format(name=source.name)
     own = {"rate": a.rate} if a.to == "usd" else {}
-    for path in importlib.import_module(module).write(source, frames, output, **own):
+    for path in getattr(importlib.import_module(f"neuspring.export.{module}"), function)(source, frames, output, **own):
         print(f"Wrote {path}")

@@ -51,6 +51,11 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, op
     return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
 
 
+def number(unit: str, doc: str) -> Any:
+    """Declare a number: unit, meaning."""
+    return field(metadata={"unit": unit, "doc": doc})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Artifact:
     """Base of all artifacts: validation against the declaration, `save` and `load`."""
@@ -407,14 +412,12 @@ class Material(Artifact):
     kind: ClassVar[str] = "material"
     stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")
     dashpot: np.ndarray = array("S", np.float32, "N s/m", "damping along the spring")
-    drag: float
-    """Exponential velocity decay, 1/s."""
-    ground_elasticity: float
-    ground_friction: float
-    contact_elasticity: float
-    contact_friction: float
-    contact_distance: float
-    """Distance below which approaching nodes collide, m."""
+    drag: float = number("1/s", "exponential decay of velocity")
+    ground_elasticity: float = number("1", "part of the normal speed that is left")
+    ground_friction: float = number("1", "Coulomb's coefficient")
+    contact_elasticity: float = number("1", "as ground_elasticity, between nodes")
+    contact_friction: float = number("1", "as ground_friction, between nodes")
+    contact_distance: float = number("m", "distance below which approaching nodes collide")
     mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
 
     def check(self) -> None:
@@ -432,14 +435,8 @@ class Material(Artifact):
             raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
 
 
-SCALARS = (
-    "drag",
-    "ground_elasticity",
-    "ground_friction",
-    "contact_elasticity",
-    "contact_friction",
-    "contact_distance",
-)
+SCALARS = tuple(spec.name for spec in dataclasses.fields(Material) if "shape" not in spec.metadata)
+"""Fields of the material that are one number."""
 
 
 @dataclass(frozen=True, kw_only=True)

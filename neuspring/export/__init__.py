@@ -3,7 +3,7 @@
 | what | modules |
 |---|---|
 | what is exported: a run's folder or a twin | `source` |
-| arrays and a JSON description | `plain`, `equations` |
+| arrays and a JSON description | `plain` |
 | viewers | `ply`, `usd`, `spz` |
-| simulators | `newton`, with `newton_twin` (the script that is exported); `mujoco` |
+| simulators: Newton, MuJoCo | `simulators`; `newton_twin` is the script that is exported |
 """

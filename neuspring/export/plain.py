@@ -13,7 +13,6 @@ import numpy as np
 from neuspring import __version__
 from neuspring.core.artifacts import SCALARS, Artifact, Material, Topology
 from neuspring.core.files import write_atomically, write_text
-from neuspring.export.equations import EQUATIONS
 from neuspring.export.source import Source
 from neuspring.splats.model import Splats
 
@@ -39,28 +38,53 @@ SETTINGS: dict[str, tuple[str, str]] = {
     "ground": ("1", "whether the plane z = 0 is the ground"),
     "self_collision": ("1", "whether nodes collide with each other"),
     "controller_velocity": ("1", "whether dashpots see the velocity of controllers"),
-    "drag": ("1/s", "exponential decay of velocity"),
-    "ground_elasticity": ("1", "part of the normal speed that is left"),
-    "ground_friction": ("1", "Coulomb's coefficient"),
-    "contact_elasticity": ("1", "as ground_elasticity, between nodes"),
-    "contact_friction": ("1", "as ground_friction, between nodes"),
-    "contact_distance": ("m", "distance below which approaching nodes collide"),
+}
+SETTINGS |= {
+    spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in dataclasses.fields(Material) if spec.name in SCALARS
 }
 MOTION: dict[str, tuple[str, str, str]] = {
     "frame": ("F", "1", "number of the frame; frame 0 is where the motion starts"),
     "time": ("F", "s", "since frame 0"),
-    "positions": ("F,N,3", "m", "predicted nodes; of a mean over seeds or a corrected prediction, not this twin's own rollout"),
+    "positions": ("F,N,3", "m", "predicted nodes"),
     "hands": ("F,C,3", "m", "controllers"),
     "holds": ("F,C", "1", "whether each controller holds the object"),
     "velocity": ("N,3", "m/s", "of the nodes in frame 0"),
     "mass": ("N", "kg", "of each node"),
 }
+EQUATIONS = """
+Per frame there are `substeps` steps of dt = frame_time / substeps. Step k = 0, 1, ... of a frame does, in this order:
+
+1. Controllers are at begin + (end - begin) u, u = (k + 1) / substeps, with begin and end the rows of `hands` of this frame and of
+the next. Nodes are where the step before left them.
+
+2. Spring (i, j): d = (x_j - x_i) / l, l = |x_j - x_i|; force on i: (stiffness (l / rest_length - 1) + dashpot (v_j - v_i) . d) d,
+its negative on j. An index of N or more is controller index - N. Its velocity is 0; if controller_velocity is true, that of its
+path.
+
+3. A controller whose `holds` is false in this frame or in the next has springs without force in it.
+
+4. w = v + dt (force / mass + (0, 0, -gravity up_sign)).
+
+5. Drag: v' = w exp(-dt drag).
+
+6. If self_collision: pairs of nodes that were closer than contact_distance at the begin of the frame, are so now, and approach
+(dx . dv < 0) change their velocity. With n = dx / |dx|, u = v_j - v_i = u_n + u_t, u_n along n, a = max(0, 1 - contact_friction
+(1 + contact_elasticity) |u_n| / |u_t|), node i loses the mean over its partners of mass_j / (mass_i + mass_j) (-(1 +
+contact_elasticity) u_n + (a - 1) u_t).
+
+7. x' = x + dt v'. If ground, and the step would take a node that moves down below z = 0 (z up_sign < 0): it moves to z = 0, its
+velocity becomes (a v_x, a v_y, -ground_elasticity v_z), a = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|),
+and it goes on for the rest of dt.
+"""
+"""A step of the simulator, in its order, for readers who have only the exported files; a paragraph each."""
 
 
 def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz and description.json of these frames to the folder `output`."""
     arrays, described = arrays_of(source, frames)
-    values = settings_of(source)
+    simulation = source.twin.simulation
+    values = dataclasses.asdict(simulation) | {"up_sign": int(simulation.up_sign)}
+    values |= {name: float(getattr(source.twin.material, name)) for name in SCALARS}
     text = {
         "format": FORMAT,
         "version": VERSION,
@@ -72,18 +96,16 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         "sizes": SIZES,
         "arrays": described,
         "settings": {name: {"value": values[name], "unit": unit, "about": about} for name, (unit, about) in SETTINGS.items()},
-        "equations": EQUATIONS,
+        "equations": [" ".join(paragraph.split()) for paragraph in EQUATIONS.strip().split("\n\n")],
     }
-    write_atomically(output / ARRAYS, lambda path: _save(path, arrays))
+
+    def save(path: Path) -> None:
+        with path.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+    write_atomically(output / ARRAYS, save)
     write_text(output / DESCRIPTION, json.dumps(text, indent=1, allow_nan=False) + "\n")
     return [output / DESCRIPTION, output / ARRAYS]
-
-
-def settings_of(source: Source) -> dict[str, Any]:
-    """Settings and scalars of the material, by name."""
-    simulation = source.twin.simulation
-    values = dataclasses.asdict(simulation) | {"up_sign": int(simulation.up_sign)}
-    return values | {name: float(getattr(source.twin.material, name)) for name in SCALARS}
 
 
 def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -114,8 +136,3 @@ def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarr
     if source.splats is not None:
         declared(Splats, source.splats, "splat_")
     return arrays, described
-
-
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    with path.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]

@@ -37,27 +37,8 @@ def points(source: Source, frame: int) -> np.ndarray:
     return np.concatenate([source.positions[frame], source.hands[frame]])
 
 
-def strains(source: Source, frame: int) -> np.ndarray:
-    """l / l0 - 1 of each spring [S]."""
-    topology, placed = source.twin.topology, points(source, frame)
-    ends = placed[topology.springs]
-    strain: np.ndarray = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / topology.rest_lengths - 1
-    return strain
-
-
-def node_stiffness(source: Source) -> np.ndarray:
-    """The mean stiffness of the springs of each node and controller [N + C], N; 0 where there are none."""
-    springs, stiffness = source.twin.topology.springs, source.twin.material.stiffness
-    count = len(points(source, 0))
-    total, springs_of = np.zeros(count), np.bincount(springs.ravel(), minlength=count)
-    for end in springs.T:
-        np.add.at(total, end, stiffness)
-    mean: np.ndarray = total / np.maximum(springs_of, 1)
-    return mean
-
-
 def vertices(source: Source, frame: int) -> np.ndarray:
-    """A row per node, then per controller; a controller has no mass and region -1."""
+    """A row per node, then per controller; a controller has no mass and region -1. Stiffness is 0 where there are no springs."""
     nodes, placed = len(source.positions[frame]), points(source, frame)
     table = np.zeros(len(placed), VERTEX)
     table["x"], table["y"], table["z"] = placed.T
@@ -65,7 +46,9 @@ def vertices(source: Source, frame: int) -> np.ndarray:
     table["region"] = -1
     table["region"][:nodes] = source.twin.topology.labels
     table["controller"][nodes:] = 1
-    table["stiffness"] = node_stiffness(source)
+    springs, count = source.twin.topology.springs, len(placed)
+    total = np.bincount(springs.ravel(), np.repeat(source.twin.material.stiffness, 2), count)
+    table["stiffness"] = total / np.maximum(np.bincount(springs.ravel(), minlength=count), 1)
     return table
 
 
@@ -75,7 +58,9 @@ def edges(source: Source, frame: int) -> np.ndarray:
     table = np.zeros(len(topology.springs), EDGE)
     table["vertex1"], table["vertex2"] = topology.springs.T
     table["stiffness"], table["dashpot"], table["rest_length"] = material.stiffness, material.dashpot, topology.rest_lengths
-    table["strain"], table["bending"] = strains(source, frame), topology.is_bending
+    ends = points(source, frame)[topology.springs]
+    table["strain"] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / topology.rest_lengths - 1
+    table["bending"] = topology.is_bending
     return table
 
 

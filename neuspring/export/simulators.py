@@ -1,8 +1,4 @@
-"""MuJoCo: nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, in one MJCF file.
-
-A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. Slides damp as
-our drag does, and its ground is soft.
-"""
+"""A twin for other simulators, beside the plain export: the script that makes Newton's model of it, and MuJoCo's MJCF file."""
 
 from __future__ import annotations
 
@@ -13,24 +9,43 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.export import plain
-from neuspring.export.newton import require_start
 from neuspring.export.source import Source
 
+SCRIPT = Path(__file__).with_name("newton_twin.py")
 MODEL = "twin.xml"
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write_newton(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+    """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
+    require_start(frames)
+    write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
+    return [*plain.write(source, frames, output), output / SCRIPT.name]
+
+
+def write_mujoco(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     """Write twin.xml, and arrays.npz and description.json for the hands' motion, to the folder `output`."""
     require_start(frames)
     write_text(output / MODEL, mjcf(source))
     return [output / MODEL, *plain.write(source, frames, output)]
 
 
+def require_start(frames: Sequence[int]) -> None:
+    """Raise InputError unless the frames are 0, 1, 2, ...: a simulator needs the hands from the start on."""
+    if list(frames) != list(range(len(frames))):
+        rule = "a simulator needs the hands of all frames from 0 on"
+        raise InputError("--frames", rule, f"{frames[0]} to {frames[-1]}, {len(frames)} frames", "Take 0:STOP, or leave it out.")
+
+
 def mjcf(source: Source) -> str:
-    """The model as MJCF, with our time step; bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ..."""
+    """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
+
+    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. Slides damp
+    as our drag does. MuJoCo's ground is soft. Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+    """
     twin = source.twin
     simulation, material, topology = twin.simulation, twin.material, twin.topology
     radius = material.contact_distance / 2

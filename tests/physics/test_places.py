@@ -1,0 +1,54 @@
+"""Which files know a force's parameter by name: what has to be touched to add another one."""
+
+import ast
+from pathlib import Path
+
+import neuspring
+
+PACKAGE = Path(neuspring.__file__).parent
+MOST = 8
+PLACES = {
+    "core/artifacts.py": "the field of Material: unit, meaning, rule",
+    "physics/parameters.py": "what the kernels take of it, and whether it has a gradient",
+    "physics/motion.py": "the term and its adjoint",
+    "physics/frame.py": "where a frame calls them",
+    "physics/reference.py": "the specification",
+    "config/search.py": "range, scale and start",
+    "twin/parameters.py": "how it is trained",
+    "export/plain.py": "the equation in words",
+}
+"""Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
+VALUES = {
+    "data/synthetic/toy.py": "the drag of the toy's truth",
+    "experiments/doctor.py": "the drag of its small net",
+    "scores/released/physics.py": "the released files' drag",
+    "twin/search.py": "the released rounding of drag",
+    "export/simulators.py": "drag in MuJoCo",
+    "export/newton_twin.py": "drag in Newton",
+}
+"""Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
+OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "play/panel.py"}
+"""Drag of another simulator; dragging with a mouse."""
+
+
+def words(text: str) -> set[str]:
+    """Words of a module's code: names, and words of its texts, but not of its docstrings."""
+    tree = ast.parse(text)
+    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        found |= {value for key in ("id", "attr", "arg", "name") if isinstance(value := getattr(node, key, None), str)}
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
+            found |= {word.strip("():,.") for word in node.value.split()}
+    return found
+
+
+def test_a_force_with_one_trained_parameter_has_few_places() -> None:
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        name, text = path.relative_to(PACKAGE).as_posix(), path.read_text(encoding="utf-8")
+        wanted = {"drag", "decay"} if name.startswith("physics/") else {"drag"}
+        if any(word in text for word in wanted) and words(text) & wanted:
+            found.add(name)
+    assert found == PLACES.keys() | VALUES.keys() | OTHERS
+    assert len(PLACES) <= MOST
