@@ -3,16 +3,16 @@
 `BASELINES` declares them; a method row's `model` names one. PhysTwin is not here: it is a row of the method table, made of the
 platform's own search and fit.
 
-To add a baseline: its package with a module `entry`, its settings in neuspring/config (a field of `Baselines`), its line here, and
-its row in config/methods.yaml.
+To add a baseline: its package, its settings in neuspring/config (a field of `Baselines`), its line here, and its row in
+config/methods.yaml.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Config
@@ -29,7 +29,7 @@ class Pictures:
     """What a model that is trained on silhouettes reads."""
 
     folder: Path
-    """Of the capture."""
+    """The capture's."""
     masks: Sequence[Path]
     """Records of the masks of every camera, in the capture's order."""
     splats: Path
@@ -38,14 +38,14 @@ class Pictures:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRequest:
-    """Everything that `entry.train` of a baseline is given."""
+    """Everything that the training of a baseline is given."""
 
     observations: Observations
     settings: Config
     """With the method's own settings in the model's section."""
     seed: int
     device: str
-    partial: Path
+    partial: Path | None
     """Checkpoint, from which a killed training continues."""
     key: Callable[..., str]
     """The key of the checkpoint, from further facts that it depends on."""
@@ -54,11 +54,14 @@ class TrainingRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """What is known of a baseline before it runs. Its modules are imported when they are used."""
+    """What is known of a baseline before it runs. Its functions are named as `module:name` and imported when they are called."""
 
-    module: str
-    """Has `predict(observations, model, splats, device)`, and `train(request)` where the model is trained."""
-    trained: bool = True
+    prediction: str
+    """(model or None, observations, centers of splats or None, device) -> Prediction."""
+    training: str = ""
+    """TrainingRequest -> Trained; empty: it learns nothing."""
+    model: str = ""
+    """The artifact that is trained."""
     section: str = ""
     """Its settings: a field of `config.Baselines`."""
     takes_pictures: Callable[[Any], bool] = lambda section: False
@@ -72,14 +75,26 @@ class Baseline:
     features: Callable[[Any], str] = lambda section: "none"
     """Whether optional weights are there, so that training runs again when they come. Raises InputError for wrong ones."""
 
+    @property
+    def trained(self) -> bool:
+        """Whether it is trained."""
+        return bool(self.training)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The modules whose code its results depend on, with all that they import."""
+        return tuple(sorted({name.partition(":")[0] for name in (self.training, self.prediction) if name}))
+
     def train(self, request: TrainingRequest) -> Trained[Any]:
         """Train. Raises NumericalFailure where there is nothing to train."""
-        result: Trained[Any] = importlib.import_module(self.module).train(request)
+        result: Trained[Any] = resolve_name(self.training)(request)
         return result
 
     def predict(self, observations: Observations, model: Path | None, splats: np.ndarray | None, device: str) -> Prediction:
         """Open-loop rollout over all frames; `splats` are the centers [G, 3], m, of the model's own splats in frame 0."""
-        result: Prediction = importlib.import_module(self.module).predict(observations, model, splats, device)
+        assert (model is None) != self.trained, "stage predict requires the record of a training"
+        learned = resolve_name(self.model).load(model) if model else None
+        result: Prediction = resolve_name(self.prediction)(learned, observations, splats, device)
         return result
 
 
@@ -90,16 +105,18 @@ def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
 
 
 def _vgg16(section: Any) -> str:
-    from neuspring.baselines.spring_gaus.vgg16_weights import find
+    from neuspring.baselines.spring_gaus.vgg import find_weights
 
-    return "absent" if isinstance(find(section.vgg16), str) else "found"
+    return "absent" if isinstance(find_weights(section.vgg16), str) else "found"
 
 
 REFERENCES = ("static", "controller_lbs")
 """Methods that learn nothing: what others must be better than."""
 BASELINES = {
     "spring_gaus": Baseline(
-        module="neuspring.baselines.spring_gaus.entry",
+        training="neuspring.baselines.spring_gaus.train:train",
+        prediction="neuspring.baselines.spring_gaus.predict:predict",
+        model="neuspring.baselines.spring_gaus.model:SpringGausModel",
         section="spring_gaus",
         takes_pictures=lambda section: bool(section.supervision == "masks"),
         reads=_spring_gaus_reads,
@@ -107,10 +124,11 @@ BASELINES = {
         features=_vgg16,
     ),
     "gs_dynamics": Baseline(
-        module="neuspring.baselines.gs_dynamics.entry",
+        training="neuspring.baselines.gs_dynamics.train:train",
+        prediction="neuspring.baselines.gs_dynamics.predict:predict",
+        model="neuspring.baselines.gs_dynamics.model:GsDynamicsModel",
         section="gs_dynamics",
         transfers=True,
     ),
-    "static": Baseline(module="neuspring.baselines.static", trained=False),
-    "controller_lbs": Baseline(module="neuspring.baselines.controller_lbs", trained=False),
+    **{name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
 }

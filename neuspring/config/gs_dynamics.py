@@ -9,10 +9,6 @@ from pydantic import Field
 
 from neuspring.config.types import Count, NonNegative, Positive, Section
 
-NodeInput = Literal["full", "short"]
-Tools = Literal["points", "centroids"]
-Propagation = Literal["all", "nearest"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamics(Section):
@@ -33,25 +29,12 @@ class GsDynamics(Section):
     """Weight lambda of the length loss. rope 0.1, animals 0.05, cloth 0.1."""
     batch: Count | None = None
     """Windows per update. rope 16, animals 64, cloth 64."""
-    connect_all: bool | None = None
-    """Join each tool to each particle; false: only within the radius. null: true with `tools: centroids`, otherwise false."""
-    node_input: NodeInput | None = None
-    """full: kind, heights, displacements and action of a node. short: kind and action. null: short for rope, full for the
-    others."""
-    tools: Tools = "points"
-    """points: every controller is a tool node. centroids: one tool node per hand, at the mean of its controllers."""
     width: Count = 512
     """Units of all hidden layers."""
-    rounds: Count = 3
-    """Rounds of message passing, which share their weights."""
-    history: Count = 3
-    """Steps that the network sees, the present one included."""
     future: Count = 5
     """Steps that training predicts in a row."""
     step: Positive = 0.01
     """Motion of the tools that makes a step, m."""
-    last_accepted: Annotated[float, Field(gt=0, le=1)] = 0.75
-    """Part of a step that suffices for the last training frame to end a step."""
     coverage: NonNegative = 0.03
     """Distance, m: no more particles are added once every point lies within it of a particle."""
     dense_points: Count = 1000
@@ -72,19 +55,6 @@ class GsDynamics(Section):
     """Optimizer steps per epoch, each on windows drawn at random."""
     learning_rate: Positive = 1e-3
     """Adam's learning rate."""
-    faithful_length_loss: bool = False
-    """As published, count edges to tools in the length loss with the distance of the particle from the world's origin, which
-    penalizes motion; false: leave these edges out."""
-    padded_mean: bool = False
-    """As published, count unused particles in the mean of squared errors, up to `particles` per window; false: count only particles
-    that exist."""
-    propagation: Propagation = "all"
-    """How structure points follow particles: by all of them, as published, or by the nearest."""
-    nearest: Count = 16
-    """Number of particles that a structure point follows with `propagation: nearest`."""
-    interpolate: bool = True
-    """Move structure points on straight lines between steps, which needs the next step and so works offline only; false: they
-    wait."""
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
 

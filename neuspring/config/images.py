@@ -23,10 +23,9 @@ class Appearance(Section):
     fixed_radius: Positive | None = None
     """Standard deviation of every splat, m, which is then not trained; null: it is trained, and starts from the distance to the
     nearest splats."""
-    start: Literal["seen", "shape_prior", "alpha"] = "seen"
+    start: Literal["seen", "shape_prior"] = "seen"
     """Where the first splats are. seen: points that were seen, and the shape prior's points where nothing was seen. shape_prior:
-    the surface of the prior alone; without a prior, as for seen, and the run's notes say so. alpha: gray splats at random within
-    the alpha shape of the seen points."""
+    the surface of the prior alone; without a prior, as for seen, and the run's notes say so."""
     degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics at the end."""
     degree_every: Count = 1000

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import Count, Finite, NonNegative, Positive, Section
+from neuspring.config.types import Count, NonNegative, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,21 +25,12 @@ class SpringGaus(Section):
     """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
     bound_anchors: Count = 16
     """Number of nearest anchors that a splat or a structure point follows."""
-    exponent: NonNegative = 0.5
-    """Exponent p in (1 + |e|)^p, where e is the strain of a spring."""
-    link_count: Count = 50
-    """Largest number of anchors that a controller is linked to."""
-    link_reach: Positive = 0.04
-    """Largest distance in frame 0 of a controller from an anchor that it is linked to, m."""
     link_stiffness: NonNegative = 3e4
     """Stiffness of the links, N per unit strain at 1 kg; it is not trained."""
     stiffness: Positive = 2000.0
     """Stiffness 10^kappa at the start, N at 1 kg."""
     damping: Positive = 0.2
     """Damping zeta at the start, N s at 1 kg."""
-    ground_logit: Finite = -1.0
-    """Value of rho at the start. After each substep, phi = clamp(1.2 sigmoid(rho) - 0.1, 0, 1) of the velocity along the ground is
-    left."""
     substeps: Count = 50
     """Substeps per frame at the start."""
     substeps_added: Count = 50
@@ -52,30 +43,10 @@ class SpringGaus(Section):
     """Passes over the training frames, with an optimizer step per frame."""
     stiffness_rate: Positive = 1e-3
     """Adam's learning rate of kappa."""
-    ground_rate: Positive = 1e-3
-    """Adam's learning rate of rho."""
-    soft_rate: Positive = 1e-3
-    """Adam's learning rate of s, the parameter of the soft weights."""
     damping_rate: Positive = 1e-4
     """Adam's learning rate of exp(zeta)."""
     velocity_rate: Positive = 2.5e-4
     """Adam's learning rate of the initial velocity, which all anchors share, m/s."""
-    clip_gradient_norm: NonNegative = 1.0
-    """Largest norm of the gradient of each tensor by itself; 0 disables clipping."""
-    l1: NonNegative = 0.2
-    """Weight of the mean absolute difference of silhouettes."""
-    dssim: NonNegative = 0.8
-    """Weight of 1 - SSIM."""
-    centroid: NonNegative = 1.0
-    """Weight of the distance between the silhouettes' centroids, in widths of the picture."""
-    features: NonNegative = 0.1
-    """Weight of the mean squared difference of VGG16's features; without its weights the term is left out, and tables say so."""
-    total_variation: NonNegative = 2.0
-    """Weight of the mean squared differences of neighboring pixels of the drawn silhouette."""
-    ignore_hands: bool = False
-    """Leave out of the losses what hands cover; false: the object counts as absent there, as published."""
-    negative_damping: bool = False
-    """Let zeta become negative, as published; false: it is clamped at zero."""
     vgg16: str | None = None
     """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
     downloaded."""

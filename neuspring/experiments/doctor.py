@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus import vgg16_weights
+from neuspring.baselines.spring_gaus import vgg
 from neuspring.config import Config
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.device import resolve_device, start_warp
@@ -224,8 +224,8 @@ def _checked_weights(settings: Config) -> Iterator[Finding]:
             f"{DOWNLOAD} {hub / lpips_weights.BACKBONE} {lpips_weights.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
         "VGG16 (Spring-Gaus' features)": (
-            lambda: vgg16_weights.find(settings.baselines.spring_gaus.vgg16),
-            f"{DOWNLOAD} {hub / vgg16_weights.FILE} https://download.pytorch.org/models/{vgg16_weights.FILE}",
+            lambda: vgg.find_weights(settings.baselines.spring_gaus.vgg16),
+            f"{DOWNLOAD} {hub / vgg.FILE} https://download.pytorch.org/models/{vgg.FILE}",
         ),
     }
     for subject, (find, remedy) in checked.items():

@@ -359,7 +359,7 @@ class Inputs:
             return () if source.films else (source.module,)
         method: Method | None = self.benchmark.methods.get(getattr(job, "method", ""))
         if stage in ("train", "predict", "transfer") and method and method.model:
-            return (BASELINES[method.model].module,)
+            return BASELINES[method.model].modules
         return ()
 
     def gpu(self, stage: str, job: Any) -> bool:

@@ -28,7 +28,6 @@ from neuspring.perception.lift import clean_masks, lifting_cameras
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior, masks_of_cameras
 from neuspring.report.figures import images as figures
 from neuspring.scores.images import psnr
-from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import REFERENCE_WIDTH
 from neuspring.splats.draw import COVERED, picture, turned, view_of
 from neuspring.splats.losses import Shot
@@ -40,8 +39,6 @@ from neuspring.stages.lengths import require_length
 
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
-ALPHA, ALPHA_POINTS, GRAY = 0.03, 10_000, 0.5
-"""Of `start: alpha`: radius in m, number of points, their shade, as in the public adaptation of Spring-Gaus."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -113,7 +110,7 @@ def run(
     _require_outside(capture, np.concatenate([surface.cloud, surface.prior]))
     start = images.appearance.start
     try:
-        points, colors = surface.first(start, seed)
+        points, colors = surface.first(start)
         trained = train(first_splats(points, colors, images.appearance, width), shots, images.appearance, seed, backend)
     except NumericalFailure as failure:
         record.save(failure=str(failure))
@@ -195,11 +192,8 @@ class _Surface:
     uniform: bool
     """Whether the prior's points are uniform over its surface, so that their share is one of area."""
 
-    def first(self, start: Literal["seen", "shape_prior", "alpha"], seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where splats begin, [R, 3] m, and their RGB [R, 3]. Raises NumericalFailure for a flat `alpha`."""
-        if start == "alpha":
-            points = points_within(self.cloud, ALPHA, ALPHA_POINTS, seed)
-            return points, np.full_like(points, GRAY)
+    def first(self, start: Literal["seen", "shape_prior"]) -> tuple[np.ndarray, np.ndarray]:
+        """Where splats begin, [R, 3] m, and their RGB [R, 3]."""
         distance, nearest = self._to_cloud
         if start == "shape_prior" and self.has_prior:
             return self.prior, self.colors[nearest]

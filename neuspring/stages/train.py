@@ -86,7 +86,7 @@ def run(
         return
 
     def key(**facts: Any) -> str:
-        return checkpoint_key(record.inputs, record.settings | facts, device, BASELINES[model].module)
+        return checkpoint_key(record.inputs, record.settings | facts, device, BASELINES[model].training.partition(":")[0])
 
     request = TrainingRequest(
         observations=Observations.load(observations_path),

@@ -1,20 +1,21 @@
 """GS-Dynamics: training recovers a known network, continues after a kill and ends by name; rollouts hold, step and stay rigid."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring.baselines.gs_dynamics import train
-from neuspring.baselines.gs_dynamics.graph import connect
-from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
-from neuspring.baselines.gs_dynamics.network import Dynamics, weight_count
-from neuspring.baselines.gs_dynamics.predict import predict
-from neuspring.baselines.gs_dynamics.propagate import carry, turns
-from neuspring.baselines.gs_dynamics.rules import Rules, resolve
-from neuspring.baselines.gs_dynamics.tracks import upright
+from neuspring.baselines import TrainingRequest
+from neuspring.baselines.gs_dynamics import train as training
+from neuspring.baselines.gs_dynamics.model import Dynamics, GsDynamicsModel, connect, resolve, weight_count
+from neuspring.baselines.gs_dynamics.predict import carry, predict, turns
+from neuspring.baselines.gs_dynamics.windows import upright
+from neuspring.baselines.results import Prediction, Trained
+from neuspring.config import Config
+from neuspring.config.baselines import Baselines
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -50,11 +51,21 @@ def hands(frames: int, motion: float = 0.012) -> np.ndarray:
     return (cloud(3, 1)[None] + np.cumsum(steps, axis=0)[:, None] - steps[0]).astype(np.float32)
 
 
-def pushes(amount: float, rules: Rules = RULES) -> GsDynamicsModel:
+def train(seen: Observations, settings: GsDynamics, seed: int = 0, partial: Path | None = None) -> Trained:
+    facts = {"seed": seed, "device": "cpu", "partial": partial, "key": lambda: "key"}
+    chosen = Config(baselines=Baselines(gs_dynamics=settings))
+    return training.train(TrainingRequest(observations=seen, settings=chosen, **facts))
+
+
+def rolled(model: GsDynamicsModel, seen: Observations) -> Prediction:
+    return predict(model, seen, None, "cpu")
+
+
+def pushes(amount: float) -> GsDynamicsModel:
     """A network that moves all by `amount` m along x in every step."""
-    weights = np.zeros(weight_count(rules), dtype=np.float32)
+    weights = np.zeros(weight_count(RULES), dtype=np.float32)
     weights[-3] = amount
-    return GsDynamicsModel(weights=weights, rules=rules)
+    return GsDynamicsModel(weights=weights, rules=RULES)
 
 
 def one_step(model: GsDynamicsModel, points: np.ndarray, tools: np.ndarray, frame: int) -> torch.Tensor:
@@ -96,35 +107,21 @@ def test_what_a_known_network_made_is_fitted_back():
     points, tools = taught(16)
     sizes = np.linalg.norm(np.diff(points, axis=0), axis=2)
     assert 0.005 < sizes.mean() < 0.03 and points.std(axis=1).min() > 0.01
-    trained = train.run(capture(points, tools), replace(PLAIN, epochs=15, updates_per_epoch=40), 0, "cpu")
+    trained = train(capture(points, tools), replace(PLAIN, epochs=15, updates_per_epoch=40))
     assert not trained.failure and trained.facts["windows"] == 15
     assert relative_error(trained.model, points, tools) < 0.15
-
-
-def test_one_window_is_learned_by_heart(tmp_path):
-    # Ten times as large as captures: inputs are in meters, and learning is slow where all of them are near 0.
-    points, tools = 10 * cloud(20, 0)[None].repeat(2, axis=0), 10 * hands(2)
-    points[1] += 0.1 * np.sin(2.5 * points[0])
-    seen, partial = capture(points, tools), tmp_path / "partial.npz"
-    fast = replace(PLAIN, radius=0.8, epochs=12, updates_per_epoch=50, batch=1)
-    trained = train.run(seen, fast, 0, "cpu", partial, "key")
-    assert trained.facts["windows"] == 1
-    # At a constant rate Adam's last updates jump about, differently on each processor: it goes on at a tenth of the rate.
-    settled = train.run(seen, replace(fast, epochs=18, learning_rate=3e-4), 0, "cpu", partial, "key")
-    assert settled.attempts == 2
-    assert relative_error(settled.model, points, tools) < 0.1
 
 
 def test_a_killed_training_continues_to_the_same_model(tmp_path):
     points, tools = cloud(25, 0)[None] + hands(8)[:, :1] - hands(8)[:1, :1], hands(8)
     noisy = replace(PLAIN, noise=0.002, yaw=True, length_weight=0.1, future=2)
     seen, partial = capture(points, tools), tmp_path / "partial.npz"
-    whole = train.run(seen, noisy, 3, "cpu")
-    again = train.run(seen, noisy, 3, "cpu")
+    whole = train(seen, noisy, 3)
+    again = train(seen, noisy, 3)
     np.testing.assert_array_equal(again.model.weights, whole.model.weights)
-    assert (train.run(seen, noisy, 4, "cpu").model.weights != whole.model.weights).any()
-    train.run(seen, replace(noisy, epochs=2), 3, "cpu", partial, "key")
-    continued = train.run(seen, noisy, 3, "cpu", partial, "key")
+    assert (train(seen, noisy, 4).model.weights != whole.model.weights).any()
+    train(seen, replace(noisy, epochs=2), 3, partial)
+    continued = train(seen, noisy, 3, partial)
     assert continued.attempts == 2 and continued.history.equals(whole.history)
     assert list(whole.history) == ["step", "loss", "position_loss", "length_loss"]
     np.testing.assert_array_equal(continued.model.weights, whole.model.weights)
@@ -140,10 +137,10 @@ def test_nothing_after_the_training_frames_is_learned_and_only_frame_0_is_rolled
         controller_points=np.where(later, tools - 3, tools),
         object_visibility=seen.object_visibility & ~later[..., 0],
     )
-    models = [train.run(each, PLAIN, 0, "cpu").model for each in (seen, spoiled)]
+    models = [train(each, PLAIN).model for each in (seen, spoiled)]
     np.testing.assert_array_equal(models[0].weights, models[1].weights)
     blind = replace(seen, object_points=points * (np.arange(9) == 0)[:, None, None])
-    found = [predict(models[0], each, "cpu").trajectory.positions for each in (seen, blind)]
+    found = [rolled(models[0], each).trajectory.positions for each in (seen, blind)]
     np.testing.assert_array_equal(*found)
     assert found[0].shape == (9, 27, 3) and np.ptp(found[0], axis=0).max() > 1e-4
     np.testing.assert_array_equal(found[0][0], seen.nodes)
@@ -153,17 +150,17 @@ def test_training_that_cannot_go_on_says_so_and_keeps_what_it_had():
     points, tools = cloud(25, 0)[None].repeat(4, axis=0), hands(4)
     # Hands that never move a step: nothing is to be learned, and the model's answer is to hold.
     resting = capture(points, hands(4, 0.001))
-    still = train.run(resting, PLAIN, 0, "cpu")
+    still = train(resting, PLAIN)
     assert not still.failure and len(still.history) == 0 and "loss" in still.history
-    assert np.ptp(predict(still.model, resting, "cpu").trajectory.positions, axis=0).max() == 0
+    assert np.ptp(rolled(still.model, resting).trajectory.positions, axis=0).max() == 0
     # Hands that move after the training frames alone: it never learned what to do, and still it does nothing at random.
     late = np.concatenate([hands(4, 0.001), hands(4) + np.array([0.05, 0, 0])])
     moving = capture(cloud(25, 0)[None].repeat(8, axis=0), late, train_end=4)
-    unprepared = train.run(moving, PLAIN, 0, "cpu")
+    unprepared = train(moving, PLAIN)
     assert unprepared.failure == "training did not start: no window of a tool that moves 0.01 m in 4 training frames"
-    assert np.ptp(predict(unprepared.model, moving, "cpu").trajectory.positions, axis=0).max() < 1e-6
+    assert np.ptp(rolled(unprepared.model, moving).trajectory.positions, axis=0).max() < 1e-6
     start = Dynamics.initial(RULES, 0).weights.numpy()
-    wild = train.run(capture(points, tools), replace(PLAIN, learning_rate=1e30), 0, "cpu")
+    wild = train(capture(points, tools), replace(PLAIN, learning_rate=1e30))
     assert wild.failure == "training ended early: the loss is not finite (epoch 0, update 1)"
     np.testing.assert_array_equal(wild.model.weights, start)
 
@@ -178,39 +175,23 @@ def test_a_model_survives_its_file(tmp_path):
         GsDynamicsModel(weights=np.zeros(7), rules=RULES)
 
 
-def test_a_model_of_an_earlier_version_is_read(tmp_path, monkeypatch):
-    """Rules held the gap between hands then."""
-    plain = GsDynamicsModel._flatten
-
-    def flatten(self, arrays, prefix):
-        fields = plain(self, arrays, prefix)
-        return fields | {"rules": fields["rules"] | {"hand_gap": 0.08}}
-
-    with monkeypatch.context() as patch:
-        patch.setattr(GsDynamicsModel, "_flatten", flatten)
-        pushes(0.005).save(tmp_path / "model.npz")
-    assert GsDynamicsModel.load(tmp_path / "model.npz").rules == RULES
-
-
 def test_points_wait_while_the_tools_move_less_than_a_step():
     # 4 mm per frame: steps in frames 3, 6 and 9.
     tools = cloud(3, 1)[None] + 0.004 * np.arange(12)[:, None, None] * np.array([0, 1.0, 0])
     seen = capture(cloud(25, 0)[None].repeat(12, axis=0), tools.astype(np.float32))
-    found = predict(pushes(0.006), seen, "cpu")
+    found = rolled(pushes(0.006), seen)
     along = (found.trajectory.positions - seen.nodes)[:, :, 0]
     assert found.facts["executed_steps"] == 3 and found.facts["tools"] == 3 and found.facts["particles"] == 27
     np.testing.assert_allclose(along.T - np.minimum(np.arange(12), 9) * 0.002, 0, atol=1e-7)
     assert np.abs((found.trajectory.positions - seen.nodes)[:, :, 1:]).max() < 1e-7
-    held = predict(pushes(0.006, replace(RULES, interpolate=False)), seen, "cpu").trajectory.positions
-    np.testing.assert_allclose((held - seen.nodes)[:, :, 0].T - np.arange(12) // 3 * 0.006, 0, atol=1e-7)
 
 
 def test_points_that_leave_the_scene_end_the_rollout_by_name():
     seen = capture(cloud(25, 0)[None].repeat(8, axis=0), hands(8, 0.006))
-    trajectory = predict(pushes(6.0), seen, "cpu").trajectory
+    trajectory = rolled(pushes(6.0), seen).trajectory
     assert trajectory.diverged_frame == 4 and trajectory.positions.shape == (4, 27, 3)
     assert trajectory.reason == "node 0 left the scene in frame 4" and trajectory.frame_count == 8
-    lost = predict(pushes(3e38, replace(RULES, propagation="nearest")), seen, "cpu").trajectory
+    lost = rolled(pushes(3e38), seen).trajectory
     assert lost.diverged_frame == 2 and len(lost.positions) == 2
 
 
@@ -222,19 +203,18 @@ def test_upside_down_the_same_happens():
         for name in ("object_points", "controller_points", "surface_points", "interior_points")
     }
     under = replace(seen, **turned, scenario=replace(seen.scenario, up="-z"))
-    models = [train.run(each, PLAIN, 0, "cpu").model for each in (seen, under)]
+    models = [train(each, PLAIN).model for each in (seen, under)]
     np.testing.assert_array_equal(models[0].weights, models[1].weights)
-    above, below = (predict(models[0], each, "cpu").trajectory.positions for each in (seen, under))
+    above, below = (rolled(models[0], each).trajectory.positions for each in (seen, under))
     np.testing.assert_array_equal(upright(below, "-z"), above)
 
 
-@pytest.mark.parametrize("rules", [RULES, replace(RULES, propagation="nearest", nearest=4)])
-def test_structure_points_follow_a_rigid_motion_of_particles_exactly(rules):
+def test_structure_points_follow_a_rigid_motion_of_particles_exactly():
     turn, shift = Rotation.from_rotvec([0.4, -0.8, 0.3]).as_matrix(), np.array([0.02, 0.0, -0.01])
     particles, points = cloud(20, 0) + 0.5, cloud(200, 5) + 0.5
     before, after = torch.tensor(particles), torch.tensor((particles @ turn.T + shift).astype(np.float32))
-    graph = connect(before[None], torch.ones(1, 20, dtype=torch.bool), torch.zeros(1, 1, 3), rules)
-    moved = carry(torch.tensor(points), before, turns(graph, before, after), after - before, rules)
+    graph = connect(before[None], torch.ones(1, 20, dtype=torch.bool), torch.zeros(1, 1, 3), RULES)
+    moved = carry(torch.tensor(points), before, turns(graph, before, after), after - before)
     np.testing.assert_allclose(moved.numpy(), points @ turn.T + shift, rtol=0, atol=2e-6)
 
 

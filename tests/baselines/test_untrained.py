@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.baselines.controller_lbs import predict as controller_lbs
-from neuspring.baselines.static import predict as static
-from neuspring.core.artifacts import Trajectory
+from neuspring.baselines import BASELINES, REFERENCES
+from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.scores import metrics
 from tests.support import small
 
 
+def predicted(name: str, seen: Observations) -> np.ndarray:
+    return BASELINES[name].predict(seen, None, None, "cpu").trajectory.positions
+
+
 def test_static_holds_frame_0():
     seen = small.observations()
-    found = static(seen).trajectory
-    assert found.positions.shape == (seen.scenario.frame_count, len(seen.nodes), 3)
-    assert (found.positions == seen.nodes).all()
+    found = predicted("static", seen)
+    assert found.shape == (seen.scenario.frame_count, len(seen.nodes), 3)
+    assert (found == seen.nodes).all()
 
 
 def test_controllers_that_move_as_a_body_carry_the_object_along():
@@ -28,7 +31,7 @@ def test_controllers_that_move_as_a_body_carry_the_object_along():
     flat = seen.controller_points[0]
     hand = np.concatenate([flat, flat[:3] + np.array([0.01, 0.02, 0.03])])
     moved = np.stack([turn.apply(hand) + shift for turn, shift in zip(turns, shifts, strict=True)])
-    found = controller_lbs(replace(seen, controller_points=moved)).trajectory.positions
+    found = predicted("controller_lbs", replace(seen, controller_points=moved))
     wanted = np.stack([turn.apply(seen.nodes) + shift for turn, shift in zip(turns, shifts, strict=True)])
     np.testing.assert_allclose(found, wanted, atol=2e-4)
 
@@ -41,20 +44,19 @@ def test_the_object_follows_controllers_only_while_they_hold():
     moved[:, 0] = still[:, 0] - np.arange(frames)[:, None] * np.array([0.0, 0.0, 0.02])
     valid = np.zeros((frames, hands), bool)
     valid[2:5, 1:] = True
-    found = controller_lbs(replace(seen, controller_points=moved, controller_valid=valid)).trajectory.positions
+    found = predicted("controller_lbs", replace(seen, controller_points=moved, controller_valid=valid))
     # Held from frame 2 to 4 by those that go sideways; the first one, which goes down, never holds.
     shifts = np.clip(np.arange(frames) - 2, 0, 2)[:, None, None] * np.array([0.01, 0.0, 0.0])
     np.testing.assert_allclose(found, seen.nodes + shifts, atol=2e-4)
-    every = controller_lbs(replace(seen, controller_points=moved, controller_valid=np.ones_like(valid)))
-    plain = controller_lbs(replace(seen, controller_points=moved))
-    np.testing.assert_allclose(every.trajectory.positions, plain.trajectory.positions, atol=1e-6)
+    every = predicted("controller_lbs", replace(seen, controller_points=moved, controller_valid=np.ones_like(valid)))
+    np.testing.assert_allclose(every, predicted("controller_lbs", replace(seen, controller_points=moved)), atol=1e-6)
 
 
 def test_neither_sees_more_than_frame_0_of_the_object():
     seen = small.observations()
     spoiled = replace(seen, object_points=np.concatenate([seen.object_points[:1], seen.object_points[1:] + 1.0]))
-    for method in (static, controller_lbs):
-        np.testing.assert_array_equal(method(seen).trajectory.positions, method(spoiled).trajectory.positions)
+    for name in REFERENCES:
+        np.testing.assert_array_equal(predicted(name, seen), predicted(name, spoiled))
 
 
 def test_what_ended_early_is_held_at_its_last_frame():

@@ -3,10 +3,8 @@
 import pytest
 import torch
 
-from neuspring.baselines.spring_gaus import vgg16_weights
-from neuspring.baselines.spring_gaus.silhouettes import SilhouetteLoss
-from neuspring.baselines.spring_gaus.vgg16 import Vgg16
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.baselines.spring_gaus import vgg
+from neuspring.baselines.spring_gaus.losses import FEATURES, silhouette_loss
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 
@@ -28,7 +26,7 @@ def stored(network: torch.nn.Module, folder):
 
 
 def test_features_are_those_of_the_network(network, tmp_path):
-    features = Vgg16.load(stored(network, tmp_path), "cpu")
+    features = vgg.load_features(stored(network, tmp_path), "cpu")
     pictures = torch.rand(2, 3, 20, 28, generator=torch.Generator().manual_seed(1))
     shift, scale = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     wanted = network((pictures - shift[:, None, None]) / scale[:, None, None])
@@ -37,29 +35,27 @@ def test_features_are_those_of_the_network(network, tmp_path):
 
 
 def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
-    features = Vgg16.load(stored(network, tmp_path), "cpu")
-    only = SpringGaus(l1=0, dssim=0, centroid=0, total_variation=0, features=0.5)
+    features = vgg.load_features(stored(network, tmp_path), "cpu")
     drawn = torch.rand(16, 24, generator=torch.Generator().manual_seed(2), requires_grad=True)
     mask = (drawn.detach() > 0.5).float()
-    value = SilhouetteLoss(only, features)(drawn, mask)
+    term = silhouette_loss(drawn, mask, features) - silhouette_loss(drawn, mask, None)
     found = features(torch.stack([drawn, mask])[:, None].expand(-1, 3, -1, -1))
-    torch.testing.assert_close(value, 0.5 * (found[0] - found[1]).square().mean())
-    value.backward()
+    torch.testing.assert_close(term, FEATURES * (found[0] - found[1]).square().mean(), rtol=1e-4, atol=1e-6)
+    term.backward()
     assert drawn.grad.abs().sum() > 0
-    assert SilhouetteLoss(only)(drawn, mask) == 0, "without weights the term is left out"
 
 
 def test_a_file_is_known_by_its_digest(network, tmp_path, monkeypatch):
     path = stored(network, tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
-    assert "vgg16-397923af.pth is not there" in vgg16_weights.find(None)
+    assert "vgg16-397923af.pth is not there" in vgg.find_weights(None)
     with pytest.raises(InputError, match="must be the file of VGG16 weights; received has SHA-256"):
-        vgg16_weights.find(str(path))
-    monkeypatch.setattr(vgg16_weights, "DIGEST", digest_file(path)[:8])
-    assert vgg16_weights.find(str(path)) == path
+        vgg.find_weights(str(path))
+    monkeypatch.setattr(vgg, "DIGEST", digest_file(path)[:8])
+    assert vgg.find_weights(str(path)) == path
 
 
 def test_damaged_weights_are_named(network, tmp_path):
     path = stored(network[:-2], tmp_path)
     with pytest.raises(InputError, match=r"`features\.7\.weight` must be a float tensor \[128, 128, 3, 3\]; received NoneType"):
-        Vgg16.load(path, "cpu")
+        vgg.load_features(path, "cpu")

@@ -11,10 +11,8 @@ import time
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus import reference
-from neuspring.baselines.spring_gaus.graph import AnchorGraph
-from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
+from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.device import resolve_device
 
@@ -44,7 +42,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
     anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
     hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
     settings = SpringGaus()
-    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     return model, hands
 
@@ -80,7 +78,7 @@ class InTorch(ByKernels):
         parameters = model.parameters(self.values)
         for k in range(SUBSTEPS):
             at = self.hands[0] + (k + 1) / SUBSTEPS * (self.hands[1] - self.hands[0])
-            x, v = reference.substep(model, model, parameters, x, v, at, model.frame_time / SUBSTEPS)
+            x, v = reference_substep(model, model, parameters, x, v, at, model.frame_time / SUBSTEPS)
         return x
 
 

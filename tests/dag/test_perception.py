@@ -111,11 +111,10 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
 def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
     project = copy_project(perceived_run, tmp_path / "project")
     small = {"anchors": 100, "iterations": 1, "substeps": 100}
-    changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus", "spring_gaus_ignore_hands"], "tracking": {"enabled": False}}
+    changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus"], "tracking": {"enabled": False}}
     jobs = plan(project, changes | {"baselines": {"spring_gaus": small}})
-    # Both variants share their splats; those of all methods are there.
-    assert (jobs["appearance"], jobs["train"], jobs["predict"], jobs["render"]) == (1, 2, 2, 2)
-    changes["methods"] = ["search_only", "spring_gaus"]
+    # The splats of all methods are there.
+    assert (jobs["appearance"], jobs["train"], jobs["predict"], jobs["render"]) == (1, 1, 1, 1)
     run(project, changes | {"baselines": {"spring_gaus": small}})
     folder = project / "results" / PACKAGE
     assert (folder / "appearance-spring_gaus" / "0" / "splats.ply").is_file()

@@ -318,18 +318,21 @@ def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
 
 
 def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
-    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_ignore_hands"]
+    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
+    rows = config.read_yaml(ROOT / "config" / "methods.yaml")
+    write(tmp_path / "methods.yaml", json.dumps(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}}))
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
+    values["method_table"] = str(tmp_path / "methods.yaml")
     values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
     made = Benchmark.of(values, ROOT)
-    assert made.pictured == {"spring_gaus", "spring_gaus_ignore_hands"}
+    assert made.pictured == {"spring_gaus", "spring_gaus_few"}
     assert made.applies("spring_gaus", "synthetic_single_lift_rope")
     assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
     assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
     left_out = ("toy_rope_lift_smooth",)
-    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_ignore_hands": left_out}
+    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_few": left_out}
     # The same splats are made once; who trains on points draws with those of all methods.
-    assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_ignore_hands": "spring_gaus"}
+    assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}
     assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
     blind = Benchmark.of(values | {"images": {"enabled": False}}, ROOT)
     assert blind.whole_left_out["spring_gaus"] == tuple(values["scenarios"])

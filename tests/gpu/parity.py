@@ -21,10 +21,9 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.baselines.spring_gaus.graph import AnchorGraph
-from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
+from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.baselines.spring_gaus.predict import roll_out as roll_out_anchors
-from neuspring.baselines.spring_gaus.solver import AnchorSolver
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.device import resolve_device
 from neuspring.physics.parameters import pack, twin_tensors
@@ -157,7 +156,7 @@ def spring_gaus(device: str) -> dict[str, Any]:
     settings = SpringGaus(
         anchors=72, neighbors=12, full_neighbors=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0
     )
-    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors, settings.link_reach, settings.link_count)
+    graph = AnchorGraph.between(anchors, hands[0], settings.neighbors)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     (received, reason), (wanted, _) = (roll_out_anchors(model, hands, where) for where in (device, "cpu"))
     assert not reason, reason

@@ -12,7 +12,6 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.synthetic.make import looking
 from neuspring.scores.images import psnr
 from neuspring.splats import harmonics
-from neuspring.splats.alpha import points_within
 from neuspring.splats.densify import Statistics, densify
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
@@ -214,22 +213,6 @@ def test_a_fixed_radius_stays_whatever_is_trained():
     np.testing.assert_allclose(np.exp(result.splats.log_scales), 0.004, rtol=1e-6)
     with pytest.raises(ValueError, match="splats of one radius are isotropic"):
         Appearance(fixed_radius=0.003, isotropic=False)
-
-
-def test_points_within_an_alpha_shape_fill_the_body_and_no_gap():
-    rng = np.random.default_rng(0)
-    # Two boxes with a gap that is wider than alpha.
-    boxes = [rng.uniform([offset, 0, 0], [offset + 0.05, 0.05, 0.05], (400, 3)) for offset in (0.0, 0.15)]
-    cloud = np.concatenate(boxes)
-    points = points_within(cloud, 0.03, 2000, 0)
-    inside = [((points >= box.min(axis=0)) & (points <= box.max(axis=0))).all(axis=1) for box in boxes]
-    assert (inside[0] | inside[1]).all()
-    assert abs(inside[0].mean() - 0.5) < 0.05
-    np.testing.assert_allclose(points[inside[0]].mean(axis=0), 0.025, atol=0.002)
-    np.testing.assert_array_equal(points, points_within(cloud, 0.03, 2000, 0))
-    for bad in (cloud * [1, 1, 0], 100 * cloud, cloud[:3]):
-        with pytest.raises(NumericalFailure, match=r"enclose no volume at alpha = 0\.03 m"):
-            points_within(bad, 0.03, 10, 0)
 
 
 def test_the_extent_is_that_of_the_cameras():

@@ -1,37 +1,257 @@
-"""A trained GS-Dynamics model: the weights of its network, and how graphs are made for it."""
+"""The model of GS-Dynamics: presets per kind of object, how points become a graph, the network, and what is saved.
+
+With receiver r and sender s of edge e, h the state of a node, c codes, R = ReLU:
+
+    m_e = R(W_r [c_e, h_r, h_s]),    h' = R(W_p [c_n, sum_e m_e] + h),
+
+a number of rounds with the same weights, from h = c_n. A head turns h of particles into displacements, m. Each block of W_r is
+multiplied with nodes, and the products are gathered at edges: the same sums as products of gathered states, in fewer operations.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from torch.nn.functional import linear, relu
+from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
-from neuspring.baselines.gs_dynamics.network import Dynamics, weight_count
-from neuspring.baselines.gs_dynamics.rules import Rules
+from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
+
+HISTORY = 3
+"""Steps H that the network sees, the present one included."""
+ROUNDS = 3
+"""Rounds of message passing, which share their weights."""
+UP_AXIS = 2
+"""Positions here have +z up."""
+PresetName = Literal["rope", "animals", "cloth"]
+PRESET_COLUMNS = ("radius", "neighbors", "particles", "noise", "length_weight", "batch", "heights")
+PRESETS: dict[PresetName, tuple[Any, ...]] = {
+    "rope": (0.08, 5, 100, 0.003, 0.1, 16, False),
+    "animals": (0.08, 6, 100, 0.003, 0.05, 64, True),
+    "cloth": (0.075, 6, 150, 0.002, 0.1, 64, True),
+}
+"""The public configurations. Meanings as in `Rules` and `config.GsDynamics`."""
+CLOTHS = ("cloth", "package")
+# Without weights: they are drawn by `initial` or set by `of`.
+Linear = partial(skip_init, torch.nn.Linear)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """How graphs are made and what the network sees. A rollout needs these and the weights. Meanings as in GsDynamics."""
+
+    radius: float
+    neighbors: int
+    particles: int
+    coverage: float
+    width: int
+    step: float
+    heights: bool
+    """Nodes know their heights and displacements in the history."""
+
+    @property
+    def node_size(self) -> int:
+        """Inputs per node: kind 2, heights H, displacements 3 (H - 1), action 3."""
+        return 5 + (4 * HISTORY - 3 if self.heights else 0)
+
+    @property
+    def edge_size(self) -> int:
+        """Inputs per edge: kinds 2 + 2, whether they differ 1, receiver - sender 3 H."""
+        return 5 + 3 * HISTORY
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """How the network is trained. Meanings as in GsDynamics."""
+
+    noise: float
+    yaw: bool
+    length_weight: float
+    batch: int
+
+
+def preset_name(settings: GsDynamics, category: str) -> PresetName:
+    """The preset of an object's category."""
+    if settings.preset != "auto":
+        return settings.preset
+    # The cables of the motion-capture data are DLO1, DLO2, ...
+    if category == "rope" or category.startswith("DLO"):
+        return "rope"
+    return "cloth" if category in CLOTHS else "animals"
+
+
+def resolve(settings: GsDynamics, category: str) -> tuple[Rules, Recipe]:
+    """The settings of a model and of its training, with every null replaced by the value of the preset."""
+    values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(settings, category)], strict=True))
+    values |= {name: value for name, value in vars(settings).items() if value is not None}
+    rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))
+    return Rules(**rules), Recipe(**recipe)
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Directed edges among nodes 0..N-1. The first nodes are particles, the others tools."""
+
+    receivers: torch.Tensor
+    """[E] int64."""
+    senders: torch.Tensor
+    """[E] int64."""
+    particles: int
+
+    @property
+    def among_particles(self) -> torch.Tensor:
+        """[E] bool: edges without a tool."""
+        return (self.receivers < self.particles) & (self.senders < self.particles)
+
+
+def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules: Rules) -> Graph:
+    """The graph of B windows with points [B, K, 3] and tools [B, C, 3], m. Points with used [B, K] are particles.
+
+    A particle receives from its k nearest particles, itself included, as far as they are within the radius. Between a particle and
+    a tool within the radius there are edges both ways. There are none between tools, and none between windows. The nodes are the
+    particles of window 0, of window 1, ..., then the tools of window 0, of window 1, ...
+    """
+    count = int(used.sum())
+    number = (used.flatten().cumsum(0) - 1).view(used.shape)
+    # Not by products of matrices: a particle's distance from itself must be 0.
+    distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = distances.masked_fill(~used[:, None, :], torch.inf)
+    distance, near = distances.topk(min(rules.neighbors, points.shape[1]), dim=2, largest=False)
+    window, receiver, slot = ((distance < rules.radius) & used[:, :, None]).nonzero(as_tuple=True)
+    receivers, senders = number[window, receiver], number[window, near[window, receiver, slot]]
+    near_tools = torch.cdist(points, tools, compute_mode="donot_use_mm_for_euclid_dist") < rules.radius
+    window, point, tool = (near_tools & used[:, :, None]).nonzero(as_tuple=True)
+    particle_ends, tool_ends = number[window, point], count + window * tools.shape[1] + tool
+    return Graph(torch.cat([receivers, particle_ends, tool_ends]), torch.cat([senders, tool_ends, particle_ends]), count)
+
+
+def sample(
+    points: torch.Tensor, usable: torch.Tensor, most: int, coverage: float, first: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Farthest-point samples of B clouds at once: indices [B, K] into points [B, M, 3], and which entries are used [B, K].
+
+    A sample starts at point first [B] and adds the usable [B, M] point that is farthest from it, up to `most` points or until all
+    points lie within `coverage`, m. The public code's two passes give the same: `most` points, then as many of these as cover.
+    """
+    rows = torch.arange(len(points), device=points.device)
+    distance = torch.where(usable, torch.inf, -torch.inf).to(points.dtype)
+    indices, used = [first], [torch.ones_like(first, dtype=torch.bool)]
+    while len(indices) < most:
+        distance = torch.minimum(distance, (points - points[rows, indices[-1]][:, None]).norm(dim=2))
+        farthest, index = distance.max(dim=1)
+        uncovered = used[-1] & (farthest > coverage)
+        if not bool(uncovered.any()):
+            break
+        indices.append(index)
+        used.append(uncovered)
+    return torch.stack(indices, dim=1), torch.stack(used, dim=1)
+
+
+class Dynamics(torch.nn.Module):
+    """The network. A model file holds its weights as one vector [W]: the parameters in their order, matrix before bias."""
+
+    def __init__(self, rules: Rules) -> None:
+        super().__init__()
+        self.rules, width = rules, rules.width
+        self.node, self.edge = _encoder(rules.node_size, width), _encoder(rules.edge_size, width)
+        self.relation, self.particle = Linear(3 * width, width), Linear(2 * width, width)
+        relu_layer = torch.nn.ReLU()
+        self.head = torch.nn.Sequential(Linear(width, width), relu_layer, Linear(width, width), relu_layer, Linear(width, 3))
+
+    @classmethod
+    def of(cls, rules: Rules, weights: torch.Tensor) -> Dynamics:
+        """The network with weights [W], on their device and of their dtype; it shares their memory."""
+        network = cls(rules).to(weights)
+        vector_to_parameters(weights, network.parameters())
+        return network
+
+    @classmethod
+    def initial(cls, rules: Rules, seed: int, device: str = "cpu") -> Dynamics:
+        """The network with weights as torch starts linear layers: uniform in +- 1 / sqrt(inputs)."""
+        generator = torch.Generator().manual_seed(seed)
+        layers = [layer for layer in cls(rules).modules() if isinstance(layer, torch.nn.Linear)]
+        draws = [
+            (torch.rand(layer.out_features * (layer.in_features + 1), generator=generator) * 2 - 1) / layer.in_features**0.5
+            for layer in layers
+        ]
+        return cls.of(rules, torch.cat(draws).to(device))
+
+    @property
+    def weights(self) -> torch.Tensor:
+        """A copy of the weights [W], without gradient."""
+        return parameters_to_vector(self.parameters()).detach()
+
+    def forward(self, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Displacements [P, 3] of particles, m, in the next step.
+
+        history [H, N, 3], m, oldest first: positions of the nodes. action [N - P, 3], m: the tools' next displacements.
+        """
+        nodes = self.node(node_inputs(self.rules, graph, history, action))
+        edges = self.edge(edge_inputs(graph, history))
+        by_edge, by_receiver, by_sender = self.relation.weight.chunk(3, dim=1)
+        by_code, by_sum = self.particle.weight.chunk(2, dim=1)
+        edge_part, code_part = linear(edges, by_edge, self.relation.bias), linear(nodes, by_code, self.particle.bias)
+        state = nodes
+        for _ in range(ROUNDS):
+            received = linear(state, by_receiver).index_select(0, graph.receivers)
+            messages = relu(edge_part + received + linear(state, by_sender).index_select(0, graph.senders))
+            total = torch.zeros_like(state).index_add(0, graph.receivers, messages)
+            state = relu(code_part + linear(total, by_sum) + state)
+        displacements: torch.Tensor = self.head(state[: graph.particles])
+        return displacements
+
+
+def _encoder(inputs: int, width: int) -> torch.nn.Sequential:
+    relu_layer = torch.nn.ReLU()
+    layers = (Linear(inputs, width), Linear(width, width), Linear(width, width))
+    return torch.nn.Sequential(*(module for layer in layers for module in (layer, relu_layer)))
+
+
+def node_inputs(rules: Rules, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    """[N, `node_size`]: kind; heights and displacements in the history [H, N, 3], if asked for; action, 0 for particles."""
+    nodes = history.shape[1]
+    parts = [_kinds(torch.arange(nodes, device=history.device) < graph.particles, history)]
+    if rules.heights:
+        parts += [history[:, :, UP_AXIS].T, history.diff(dim=0).transpose(0, 1).reshape(nodes, -1)]
+    return torch.cat([*parts, torch.cat([action.new_zeros(graph.particles, 3), action])], dim=1)
+
+
+def edge_inputs(graph: Graph, history: torch.Tensor) -> torch.Tensor:
+    """[E, `edge_size`]: kinds of receiver and sender, 1 between particle and tool, receiver - sender in each step H."""
+    receives, sends = graph.receivers < graph.particles, graph.senders < graph.particles
+    between = history.index_select(1, graph.receivers) - history.index_select(1, graph.senders)
+    differs = (receives != sends).to(history.dtype)[:, None]
+    offsets = between.transpose(0, 1).reshape(len(receives), -1)
+    return torch.cat([_kinds(receives, history), _kinds(sends, history), differs, offsets], dim=1)
+
+
+def _kinds(particle: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    return torch.stack([particle, ~particle], dim=1).to(like.dtype)
+
+
+def weight_count(rules: Rules) -> int:
+    """Length of the vector of weights."""
+    return sum(parameter.numel() for parameter in Dynamics(rules).parameters())
 
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamicsModel(Artifact):
-    """Knows no object: it moves the structure points of any scenario."""
+    """A trained model. It knows no object: it moves the structure points of any scenario."""
 
     kind: ClassVar[str] = "gs_dynamics"
-    weights: np.ndarray = array("W", np.float32, "1", "parameters of network.Dynamics in their order")
+    weights: np.ndarray = array("W", np.float32, "1", "parameters of Dynamics in their order")
     rules: Rules
 
     def check(self) -> None:
         count = weight_count(self.rules)
         if len(self.weights) != count:
             raise InputError("gs_dynamics.weights", f"{count} weights are required", len(self.weights))
-
-    @classmethod
-    def _build(cls, arrays: dict[str, np.ndarray], plain: dict[str, Any], prefix: str) -> Self:
-        # Files of earlier versions hold this as well; it is a constant now.
-        plain["rules"].pop("hand_gap", None)
-        return super()._build(arrays, plain, prefix)
 
     def dynamics(self, device: str) -> Dynamics:
         """The network on a device."""

@@ -1,6 +1,6 @@
-"""Spring-Gaus: anchors with directed springs move splats; their parameters are trained on silhouettes.
+"""Spring-Gaus: anchors with directed springs move splats; their parameters are trained on silhouettes, or on points.
 
-setup: the training problem from a capture's masks, splats or points. train: epochs over the training frames. predict: the rollout.
-graph, kernels, solver, reference: anchors and their motion. model: what is saved. objectives, silhouettes, vgg16: losses.
+model: anchors in frame 0, what is trained and saved. physics: their motion. losses: silhouettes, points. train: the problem and
+its epochs. predict: the rollout. vgg: features for a loss.
 What differs from the public code, and what was measured: `neuspring/baselines/README.md`.
 """

@@ -6,11 +6,27 @@ import numpy as np
 import torch
 
 from neuspring.baselines.results import LIMIT, Prediction
-from neuspring.baselines.spring_gaus.graph import Binding
-from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.baselines.spring_gaus.objectives import Follower
-from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel
+from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.core.artifacts import Observations, Trajectory
+
+
+def predict(model: SpringGausModel, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
+    """Both outputs in all frames. `splats` [G, 3], m, are the centers of the splats in frame 0 (None: the model has none)."""
+    anchors, reason = roll_out(model, observations.controller_points, device)
+    nodes = torch.tensor(observations.nodes, device=device)
+    follow = Follower(observations.nodes, model.anchors, model.bound_anchors, device)
+    positions = np.stack([(nodes + follow(frame - anchors[0])).cpu().numpy() for frame in anchors])
+    frames = len(observations.controller_points)
+    diverged = len(anchors) if reason else None
+    trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
+    facts = {"anchors": len(model.anchors), "substeps": model.substeps}
+    if splats is None:
+        return Prediction(trajectory, facts)
+    follow = Follower(splats, model.anchors, model.bound_anchors, device)
+    # Frame by frame, because all frames of hundreds of thousands of splats may not fit on the device.
+    centers = np.stack([follow(frame).cpu().numpy() for frame in anchors])
+    return Prediction(trajectory, facts | contraction(splats, centers[0]), centers)
 
 
 @torch.no_grad()
@@ -30,24 +46,6 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
             return torch.stack(states), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
         states.append(x)
     return torch.stack(states), ""
-
-
-def predict(model: SpringGausModel, observations: Observations, centers: np.ndarray | None, device: str) -> Prediction:
-    """Both outputs in all frames. `centers` [G, 3], m, are those of the splats in frame 0 (None: the model has no splats)."""
-    anchors, reason = roll_out(model, observations.controller_points, device)
-    nodes = torch.tensor(observations.nodes, device=device)
-    follow = Follower(Binding.of(observations.nodes, model.anchors, model.bound_anchors), device)
-    positions = np.stack([(nodes + follow(frame - anchors[0])).cpu().numpy() for frame in anchors])
-    frames = len(observations.controller_points)
-    diverged = len(anchors) if reason else None
-    trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
-    facts = {"anchors": len(model.anchors), "substeps": model.substeps}
-    if centers is None:
-        return Prediction(trajectory, facts)
-    follow = Follower(Binding.of(centers, model.anchors, model.bound_anchors), device)
-    # Frame by frame, because all frames of hundreds of thousands of splats may not fit on the device.
-    moved = np.stack([follow(frame).cpu().numpy() for frame in anchors])
-    return Prediction(trajectory, facts | contraction(centers, moved[0]), moved)
 
 
 def contraction(centers: np.ndarray, bound: np.ndarray) -> dict[str, float]:

@@ -16,14 +16,29 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import LIMIT, Trained, TrainingStopped, run_epochs
-from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.baselines.spring_gaus.solver import AnchorSolver
+from neuspring.baselines.spring_gaus import vgg
+from neuspring.baselines.spring_gaus.losses import Points, Silhouettes
+from neuspring.baselines.spring_gaus.model import AnchorGraph, Follower, SpringGausModel, choose_anchors
+from neuspring.baselines.spring_gaus.physics import AnchorSolver
+from neuspring.config import Config
 from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.errors import InputError
+from neuspring.data.capture import OBJECT, Capture
+from neuspring.perception.results import masks_of_cameras
+from neuspring.splats.draw import view_of
+from neuspring.splats.model import Gaussians, Splats
+from neuspring.splats.rasterize import choose_backend
+from neuspring.twin.losses import FrameLoss
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(epoch, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""
+SOFT_RATE = GROUND_RATE = 1e-3
+"""Adam's learning rates of s, the parameter of the soft weights, and of rho."""
+CLIP = 1.0
+"""Largest norm of the gradient of each tensor by itself."""
 ADAM_EPSILON = 1e-15
 METRICS = ("loss", "gradient_norm", "substeps")
 
@@ -44,6 +59,62 @@ class Problem:
     device: str = "cpu"
 
 
+def train(request: TrainingRequest) -> Trained[SpringGausModel]:
+    """Train on silhouettes, or on points. Raises InputError for `supervision: masks` without pictures."""
+    observations, settings, device = request.observations, request.settings, request.device
+    chosen, scenario = settings.baselines.spring_gaus, observations.scenario
+    pictures = request.pictures if chosen.supervision == "masks" else None
+    if chosen.supervision == "masks" and pictures is None:
+        rule = "supervision: masks needs --capture, --masks and --appearance"
+        raise InputError("baselines.spring_gaus.supervision", rule, "none", "Use supervision: points for captures without images.")
+    splats = Splats.load(pictures.splats) if pictures else None
+    cloud = observations.nodes if splats is None else splats.means
+    anchors = choose_anchors(cloud, chosen.anchors, np.random.default_rng(request.seed))
+    hands = observations.controller_points[: scenario.train_end]
+    graph = AnchorGraph.between(anchors, hands[0], chosen.neighbors)
+    world = {"frame_time": 1 / scenario.frame_rate, "up_sign": scenario.up_sign, "gravity": settings.simulation.gravity}
+    start = SpringGausModel.start(graph, chosen, ground=scenario.ground, **world)
+    follower = Follower(cloud, start.anchors, start.bound_anchors, device)
+    facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
+    objective: Objective
+    if pictures and splats:
+        weights = vgg.find_weights(chosen.vgg16)
+        facts |= {"vgg16": weights if isinstance(weights, str) else "computed", "splats": len(splats.means)}
+        objective = silhouettes(pictures, splats, follower, weights, settings, request.seed, device)
+    else:
+        nodes, rest = (torch.tensor(points, device=device) for points in (observations.nodes, start.anchors))
+        objective = Points(nodes, rest, follower, FrameLoss.of(observations, settings.losses, device))
+    problem = Problem(start, hands, objective, chosen, device)
+    result = run(problem, request.partial, request.key(vgg16=facts.get("vgg16") == "computed"))
+    result.facts.update(facts)
+    return result
+
+
+def silhouettes(
+    pictures: Pictures, splats: Splats, follower: Follower, weights: Path | str, settings: Config, seed: int, device: str
+) -> Silhouettes:
+    """The loss on the masks of a capture's training frames; masks of future frames are not used."""
+    capture, images = Capture.load(pictures.folder), settings.images
+    masks = {
+        (name, frame): torch.tensor(perceived.labels[frame], device=device) == OBJECT
+        for name, perceived in masks_of_cameras(capture, pictures.masks).items()
+        for frame in range(capture.train_end)
+        if capture.has(name, frame)
+    }
+    views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
+    features = None if isinstance(weights, str) else vgg.load_features(weights, device)
+    backend = choose_backend(images.backend, device)
+    return Silhouettes(Gaussians.of(splats, device), follower, views, masks, features, backend, seed)
+
+
+def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
+    """Train; continue from `partial` if it holds a checkpoint with the same key."""
+    settings = problem.settings
+    training = Training(problem)
+    loop = TrainingLoop("the training", "train", settings.iterations, settings.checkpoint_every, partial, key)
+    return run_epochs(training, loop, METRICS)
+
+
 class Training:
     """Runs epochs, a frame at a time."""
 
@@ -51,12 +122,12 @@ class Training:
         self.problem, settings = problem, problem.settings
         model, device = problem.start, problem.device
         self.values = {name: tensor.requires_grad_() for name, tensor in model.tensors(device).items()}
-        self.solver = AnchorSolver(model, model, settings.substeps, device)
+        self.use_substeps(settings.substeps)
         rates = {
             "kappa": settings.stiffness_rate,
-            "soft": settings.soft_rate,
+            "soft": SOFT_RATE,
             "theta": settings.damping_rate,
-            "rho": settings.ground_rate,
+            "rho": GROUND_RATE,
             "velocity": settings.velocity_rate,
         }
         groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in self.values.items()]
@@ -65,10 +136,19 @@ class Training:
         self.hands = torch.tensor(problem.hands, device=device)
         self.keep()
 
-    @property
-    def frames(self) -> range:
-        """The loop of the public code ends one frame before the last training frame."""
-        return range(1, max(len(self.hands) - 1, 2))
+    def use_substeps(self, count: int) -> None:
+        """Integrate with `count` substeps per frame from now on."""
+        model = self.problem.start
+        self.substeps, self.solver = count, AnchorSolver(model, model, count, self.problem.device)
+
+    def add_substeps(self) -> bool:
+        """Take more substeps per frame; False if no more are allowed."""
+        settings = self.problem.settings
+        more = min(self.substeps + settings.substeps_added, settings.max_substeps)
+        raised = more > self.substeps
+        if raised:
+            self.use_substeps(more)
+        return raised
 
     def epoch(self, number: int) -> dict[str, float]:
         """One pass over the frames. Raises TrainingStopped where a frame fails with the most substeps."""
@@ -76,7 +156,8 @@ class Training:
             self.add_substeps()
         x, v = self.rest, torch.zeros_like(self.rest)
         losses, largest = [], 0.0
-        for frame in self.frames:
+        # The loop of the public code ends one frame before the last training frame.
+        for frame in range(1, max(len(self.hands) - 1, 2)):
             x, v, loss, norm = self.stable_frame(number, frame, x, v)
             if loss is not None:
                 losses.append(loss)
@@ -96,25 +177,6 @@ class Training:
                     raise TrainingStopped(f"{fault} (iteration {epoch}, frame {number}, {self.substeps} substeps)") from fault
                 print(f"iteration {epoch}, frame {number}: {fault}; {self.substeps} substeps from here on", flush=True)
 
-    def add_substeps(self) -> bool:
-        """Take more substeps per frame; False if no more are allowed."""
-        settings = self.problem.settings
-        more = min(self.substeps + settings.substeps_added, settings.max_substeps)
-        raised = more > self.substeps
-        if raised:
-            self.use_substeps(more)
-        return raised
-
-    def use_substeps(self, count: int) -> None:
-        """Integrate with `count` substeps per frame from now on."""
-        model = self.problem.start
-        self.solver = AnchorSolver(model, model, count, self.problem.device)
-
-    @property
-    def substeps(self) -> int:
-        """Per frame."""
-        return self.solver.substeps
-
     def frame(
         self, epoch: int, frame: int, x: torch.Tensor, v: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, float | None, float]:
@@ -122,8 +184,7 @@ class Training:
 
         Returns the state after it, its loss, and the largest gradient norm of any tensor before clipping. Raises UnusableFrame.
         """
-        model = self.problem.start
-        parameters = model.parameters(self.values)
+        parameters = self.problem.start.parameters(self.values)
         ends = self.hands[frame - 1], self.hands[frame]
         after, speed = self.solver.frame(parameters, x, v + self.values["velocity"], *ends)
         # NaN compares false, so this catches it together with infinity and absurd distances.
@@ -139,15 +200,12 @@ class Training:
         norms = torch.stack([tensor.grad.norm() for tensor in tensors if tensor.grad is not None])
         if not bool(torch.isfinite(loss.detach()) and torch.isfinite(norms).all()):
             raise UnusableFrame("the loss or its gradient is not finite")
-        limit = self.problem.settings.clip_gradient_norm
-        if limit:
-            for tensor in tensors:
-                torch.nn.utils.clip_grad_norm_([tensor], limit)
+        for tensor in tensors:
+            torch.nn.utils.clip_grad_norm_([tensor], CLIP)
         self.optimizer.step()
-        if not self.problem.settings.negative_damping:
-            # Clamping in the forces alone would leave a negative value without a gradient, stuck for good.
-            with torch.no_grad():
-                self.values["theta"].clamp_(min=1.0)
+        # Clamping in the forces alone would leave a negative damping without a gradient, stuck for good.
+        with torch.no_grad():
+            self.values["theta"].clamp_(min=1.0)
         return *state, float(loss.detach()), float(norms.max())
 
     def keep(self) -> None:
@@ -176,11 +234,3 @@ class Training:
             tensor.copy_(torch.tensor(checkpoint.arrays["values"][name]))
         restore_adam(self.optimizer, checkpoint.arrays["adam"])
         self.keep()
-
-
-def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
-    """Train; continue from `partial` if it holds a checkpoint with the same key."""
-    settings = problem.settings
-    training = Training(problem)
-    loop = TrainingLoop("the training", "train", settings.iterations, settings.checkpoint_every, partial, key)
-    return run_epochs(training, loop, METRICS)

@@ -1,9 +1,8 @@
-"""The object skinned to the controllers: what is not better than this has learned nothing."""
+"""Two reference points that learn nothing: what is not better than these has learned nothing either."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,9 +12,14 @@ from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.splats.skinning import Skin
 
 
-def predict(
-    observations: Observations, model: Path | None = None, splats: np.ndarray | None = None, device: str = "cpu"
-) -> Prediction:
+def static(model: None, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
+    """Frame 0 in all frames."""
+    frames = observations.scenario.frame_count
+    positions = np.repeat(observations.nodes[None], frames, axis=0)
+    return Prediction(Trajectory(positions=positions, frame_count=frames))
+
+
+def controller_lbs(model: None, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
     """Nodes follow the controllers from frame to frame, as splats follow nodes (`neuspring.splats.skinning`).
 
     Each node has the 16 nearest controllers, with weights 1 / distance, and their local rotations. Only those that
@@ -28,8 +32,7 @@ def predict(
     if observations.controller_valid.size:
         carried = _held(hands, observations.controller_valid, nodes, unturned, device)
     else:
-        skin = Skin(hands[0], device=device)
-        carried = (means for means, _ in skin.carry(hands, nodes, unturned))
+        carried = (means for means, _ in Skin(hands[0], device=device).carry(hands, nodes, unturned))
     positions = np.stack([means.cpu().numpy() for means in carried])
     return Prediction(Trajectory(positions=positions, frame_count=len(hands)))
 

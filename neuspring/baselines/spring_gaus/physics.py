@@ -1,0 +1,287 @@
+"""The motion of anchors: one substep and its adjoint as kernels, frames of them, and the same in torch as specification.
+
+With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbor j by distance in frame 0, anchor i feels
+
+    spring   (s_i / l) eta_r (d - l) (1 + |e|)^p n       (zero where |d - l| < 1e-6 m)
+    damping  (zeta / l) ((v_j - v_i) . n) n
+    control  c (|q - x_i| / L - 1) (q - x_i) / |q - x_i|  from each controller q with a link to it
+    gravity  at unit mass
+
+Nothing reacts on j: this is a gather, not the symmetric spring of `neuspring.physics.springs`. Integration is semi-implicit. After
+the step, anchors at or below the ground are put on it. Their velocity along z becomes zero, that along the ground is multiplied by
+phi.
+"""
+# No postponed annotations here: Warp needs the evaluated types of the closures below.
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.baselines.spring_gaus.model import AnchorGraph, AnchorParameters, AnchorPhysics
+from neuspring.core.device import start_warp
+from neuspring.physics.arrays import Graphs
+from neuspring.physics.solver import simulate_frame
+
+SLACK = 1e-6
+"""Elongations below this exert no force, m."""
+MIN_LENGTH = 1e-6
+"""Lengths are floored here when a direction is formed, m."""
+PACKED = ("stiffness", "soft", "scalars")
+"""Trained parameters as the kernels take them; scalars are damping and friction."""
+
+
+class Kernels(NamedTuple):
+    """Kernels and their arguments for one scalar type. Kernels are launched over [N] anchors."""
+
+    substep: Any
+    adjoint: Any
+    State: Any
+    Model: Any
+
+
+@functools.cache
+def kernels(real: Any) -> Kernels:
+    """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
+    vec3 = wp.types.vector(3, real)
+    slack, floor = wp.constant(real(SLACK)), wp.constant(real(MIN_LENGTH))
+    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
+
+    @wp.struct
+    class State:
+        x: wp.array2d(dtype=vec3)  # [substeps + 1, N]
+        v: wp.array2d(dtype=vec3)
+        stiffness: wp.array(dtype=real)  # [N]
+        soft: wp.array(dtype=real)  # [K]
+        scalars: wp.array(dtype=real)  # zeta, phi
+
+    @wp.struct
+    class Model:
+        neighbors: wp.array2d(dtype=wp.int32)
+        lengths: wp.array2d(dtype=real)
+        link_starts: wp.array(dtype=wp.int32)
+        links: wp.array(dtype=wp.int32)
+        link_lengths: wp.array(dtype=real)
+        begin: wp.array(dtype=vec3)  # controllers at the start of the frame
+        end: wp.array(dtype=vec3)
+        exponent: real
+        link_stiffness: real
+        substep: real
+        gravity: real
+        up: real
+        ground: int
+
+    def anchor_substep(slot: int, fraction: real, state: State, model: Model):
+        i = wp.tid()
+        at = state.x[slot, i]
+        speed = state.v[slot, i]
+        force = vec3(zero, zero, model.gravity)
+        for r in range(model.neighbors.shape[1]):
+            j = model.neighbors[i, r]
+            rest = model.lengths[i, r]
+            offset = state.x[slot, j] - at
+            length = wp.length(offset)
+            n = offset / wp.max(length, floor)
+            stretch = length - rest
+            pull = state.scalars[0] / rest * wp.dot(state.v[slot, j] - speed, n)
+            if wp.abs(stretch) >= slack:
+                pull += state.stiffness[i] / rest * state.soft[r] * stretch * wp.pow(one + wp.abs(stretch) / rest, model.exponent)
+            force += n * pull
+        for k in range(model.link_starts[i], model.link_starts[i + 1]):
+            c = model.links[k]
+            reach = model.begin[c] * (one - fraction) + model.end[c] * fraction - at
+            distance = wp.length(reach)
+            force += reach / wp.max(distance, floor) * (model.link_stiffness * (distance / model.link_lengths[k] - one))
+        moved = speed + force * model.substep
+        target = at + moved * model.substep
+        if model.ground != 0 and model.up * target[2] <= zero:
+            target = vec3(target[0], target[1], zero)
+            moved = vec3(moved[0] * state.scalars[1], moved[1] * state.scalars[1], zero)
+        state.x[slot + 1, i] = target
+        state.v[slot + 1, i] = moved
+
+    def anchor_substep_adjoint(slot: int, fraction: real, state: State, model: Model, adjoint: State):
+        i = wp.tid()
+        at = state.x[slot, i]
+        speed = state.v[slot, i]
+        to = adjoint.x[slot + 1, i]
+        by = adjoint.v[slot + 1, i]
+        # Only the ground puts a point at exactly 0.
+        if model.ground != 0 and state.x[slot + 1, i][2] == zero:
+            # Along the ground the step is x + h u: u is read from the positions, as phi may be 0.
+            u = (state.x[slot + 1, i] - at) / model.substep
+            wp.atomic_add(adjoint.scalars, 1, by[0] * u[0] + by[1] * u[1])
+            to = vec3(to[0], to[1], zero)
+            by = vec3(by[0] * state.scalars[1], by[1] * state.scalars[1], zero)
+        by += to * model.substep
+        c = by * model.substep
+        damping = zero
+        hard = zero
+        for r in range(model.neighbors.shape[1]):
+            j = model.neighbors[i, r]
+            rest = model.lengths[i, r]
+            offset = state.x[slot, j] - at
+            length = wp.max(wp.length(offset), floor)
+            n = offset / length
+            stretch = length - rest
+            relative = state.v[slot, j] - speed
+            closing = wp.dot(relative, n)
+            cn = wp.dot(c, n)
+            dashpot = state.scalars[0] / rest
+            pull = dashpot * closing
+            slope = zero
+            if wp.abs(stretch) >= slack:
+                strain = wp.abs(stretch) / rest
+                grown = wp.pow(one + strain, model.exponent)
+                unit = stretch / rest * grown
+                spring = state.stiffness[i] * state.soft[r]
+                pull += spring * unit
+                slope = spring / rest * grown * (one + model.exponent * strain / (one + strain))
+                hard += cn * state.soft[r] * unit
+                wp.atomic_add(adjoint.soft, r, cn * state.stiffness[i] * unit)
+            damping += cn * closing / rest
+            # The direction turns (c and the relative velocity, without their parts along n), the length stretches the spring.
+            g = (c - n * cn) * (pull / length) + (relative - n * closing) * (dashpot * cn / length) + n * (cn * slope)
+            w = n * (cn * dashpot)
+            wp.atomic_add(adjoint.x, slot, j, g)
+            wp.atomic_add(adjoint.v, slot, j, w)
+            to -= g
+            by -= w
+        for k in range(model.link_starts[i], model.link_starts[i + 1]):
+            q = model.links[k]
+            reach = model.begin[q] * (one - fraction) + model.end[q] * fraction - at
+            distance = wp.max(wp.length(reach), floor)
+            m = reach / distance
+            cm = wp.dot(c, m)
+            turn = model.link_stiffness * (one / model.link_lengths[k] - one / distance)
+            to -= (c - m * cm) * turn + m * (cm * model.link_stiffness / model.link_lengths[k])
+        wp.atomic_add(adjoint.x, slot, i, to)
+        wp.atomic_add(adjoint.v, slot, i, by)
+        wp.atomic_add(adjoint.scalars, 0, damping)
+        adjoint.stiffness[i] = adjoint.stiffness[i] + hard
+
+    unique = wp.kernel(module="unique", enable_backward=False)
+    return Kernels(unique(anchor_substep), unique(anchor_substep_adjoint), State, Model)
+
+
+class AnchorSolver:
+    """Advances anchors by frames of a fixed number of substeps. The forward and the backward pass are each a captured graph."""
+
+    def __init__(
+        self, graph: AnchorGraph, physics: AnchorPhysics, substeps: int, device: str = "cpu", dtype: torch.dtype = torch.float32
+    ) -> None:
+        start_warp()
+        self.physics, self.substeps, self.device, self.dtype = physics, substeps, device, dtype
+        self._real = real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
+        self._kernels = kernels(real)
+        vec3 = wp.types.vector(3, real)
+        self.count, ranks = graph.neighbors.shape
+        controllers = int(graph.links.max(initial=-1)) + 1
+        self._buffers: dict[str, torch.Tensor] = {}
+        self._state, self._adjoint, self._model = self._kernels.State(), self._kernels.State(), self._kernels.Model()
+        for struct, prefix in ((self._state, ""), (self._adjoint, "adj_")):
+            for name in ("x", "v"):
+                setattr(struct, name, self._allocate(prefix + name, (substeps + 1, self.count, 3), vec3))
+            for name, size in zip(PACKED, (self.count, ranks, 2), strict=True):
+                setattr(struct, name, self._allocate(prefix + name, (size,), real))
+        for name in ("begin", "end"):
+            setattr(self._model, name, self._allocate(name, (controllers, 3), vec3))
+        for name in ("neighbors", "lengths", "link_starts", "links", "link_lengths"):
+            values = getattr(graph, name)
+            kind = wp.int32 if values.dtype.kind == "i" else real
+            setattr(self._model, name, wp.array(values, dtype=kind, device=device))
+        self._model.exponent, self._model.link_stiffness = physics.exponent, physics.link_stiffness
+        self._model.substep = physics.frame_time / substeps
+        self._model.gravity, self._model.up = -physics.up_sign * physics.gravity, physics.up_sign
+        self._model.ground = int(physics.ground)
+        self._graphs = Graphs(device)
+        self.frame_token = 0
+        """Number of the frame whose substeps are in the buffers."""
+
+    def _allocate(self, name: str, shape: tuple[int, ...], kind: Any) -> Any:
+        self._buffers[name] = torch.zeros(shape, dtype=self.dtype, device=self.device)
+        return wp.from_torch(self._buffers[name], dtype=kind)
+
+    def frame(
+        self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(x, v) [N, 3] one frame later, differentiable in x, v and parameters; controllers [C, 3] go from `begin` to `end`."""
+        scalars = torch.stack([parameters.damping.reshape(()), parameters.friction.reshape(())])
+        packed = {"stiffness": parameters.stiffness, "soft": parameters.soft, "scalars": scalars}
+        return simulate_frame(self, packed, x, v, begin, end)
+
+    def run(
+        self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: dict[str, torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(x, v) after a frame with parameters as the kernels take them."""
+        b = self._buffers
+        for name in PACKED:
+            b[name].copy_(parameters[name])
+        # Controllers after the last that holds an anchor do not matter.
+        b["begin"].copy_(begin[: len(b["begin"])])
+        b["end"].copy_(end[: len(b["end"])])
+        b["x"][0], b["v"][0] = x, v
+        self._launch(backward=False)
+        self.frame_token += 1
+        return b["x"][-1].clone(), b["v"][-1].clone()
+
+    def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """Adjoints of the last forward frame: of x, of v, and of parameters by name."""
+        b = self._buffers
+        for name in ("x", "v", *PACKED):
+            b[f"adj_{name}"].zero_()
+        b["adj_x"][-1], b["adj_v"][-1] = adj_x, adj_v
+        self._launch(backward=True)
+        return b["adj_x"][0].clone(), b["adj_v"][0].clone(), {name: b[f"adj_{name}"].clone() for name in PACKED}
+
+    def _launch(self, *, backward: bool) -> None:
+        kernel = self._kernels.adjoint if backward else self._kernels.substep
+        structs = (self._state, self._model, self._adjoint) if backward else (self._state, self._model)
+
+        def record() -> None:
+            for substep in reversed(range(self.substeps)) if backward else range(self.substeps):
+                fraction = self._real((substep + 1) / self.substeps)
+                wp.launch(kernel, self.count, [substep, fraction, *structs], device=self.device)
+
+        self._graphs.run("backward" if backward else "forward", [kernel], record)
+
+
+def reference_substep(
+    graph: AnchorGraph,
+    physics: AnchorPhysics,
+    parameters: AnchorParameters,
+    x: torch.Tensor,
+    v: torch.Tensor,
+    controllers: torch.Tensor,
+    step: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end.
+
+    In torch: differentiable, in any precision.
+    """
+    neighbors = torch.tensor(graph.neighbors, device=x.device).long()
+    rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
+    offset = x[neighbors] - x[:, None]
+    length = offset.norm(dim=2)
+    n = offset / length.clamp(min=MIN_LENGTH)[..., None]
+    stretch = length - rest
+    stiff = parameters.stiffness[:, None] / rest * parameters.soft * stretch
+    pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
+    closing = ((v[neighbors] - v[:, None]) * n).sum(dim=2)
+    force = ((pull + parameters.damping / rest * closing)[..., None] * n).sum(dim=1)
+    anchor = torch.tensor(np.repeat(np.arange(len(graph.anchors)), np.diff(graph.link_starts)), device=x.device).long()
+    reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]
+    distance = reach.norm(dim=1, keepdim=True)
+    strain = distance / torch.tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
+    force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_LENGTH) * strain * physics.link_stiffness)
+    force = force + x.new_tensor([0.0, 0.0, -physics.up_sign * physics.gravity])
+    v = v + step * force
+    x = x + step * v
+    if physics.ground:
+        below = (physics.up_sign * x[:, 2:] <= 0).expand(-1, 3)
+        x = torch.where(below, x * x.new_tensor([1.0, 1.0, 0.0]), x)
+        slowed = torch.cat([v[:, :2] * parameters.friction, torch.zeros_like(v[:, 2:])], dim=1)
+        v = torch.where(below, slowed, v)
+    return x, v
