@@ -15,13 +15,12 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
 from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
-from neuspring.config.search import Clusters, Polish, Search, SearchRanges, SearchScales, SearchStart
+from neuspring.config.search import Polish, Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.twin import Fit, Losses, RestShape, SpringField
 
 __all__ = [
-    "Clusters",
     "Config",
     "Fit",
     "Kind",
@@ -33,15 +32,14 @@ __all__ = [
     "RestShape",
     "ScenarioRow",
     "Search",
-    "SearchRanges",
     "SearchRow",
-    "SearchScales",
-    "SearchStart",
+    "SearchVariables",
     "Simulation",
     "SpringField",
     "Synthetic",
     "Toy",
     "Tracking",
+    "Variable",
     "merge",
     "parse",
     "plain",

@@ -14,6 +14,7 @@ from typing import Any, get_args, get_type_hints
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
+from neuspring.config.types import Section
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
@@ -29,9 +30,14 @@ def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
     hints = get_type_hints(kind)
     for spec in dataclasses.fields(kind):
         for part in (hints[spec.name], *_parts(hints[spec.name])):
-            if dataclasses.is_dataclass(part) and isinstance(part, type):
+            if is_section(part):
                 found |= sections(part, f"{path}.{spec.name}" if path else spec.name)
     return found
+
+
+def is_section(kind: Any) -> bool:
+    """Whether a type has a table of its own on the page; a dataclass that is no section is one value."""
+    return isinstance(kind, type) and issubclass(kind, Section)
 
 
 def _parts(hint: Any) -> Iterator[Any]:
@@ -67,8 +73,7 @@ def fields(kind: type) -> list[tuple[str, str, str, str]]:
     hints, meanings = typing.get_type_hints(kind, include_extras=True), declared_meanings(kind)
     entries = []
     for spec in dataclasses.fields(kind):
-        is_section = dataclasses.is_dataclass(hints[spec.name])
-        words, default = ("section", "") if is_section else (allowed(hints[spec.name]), shown_default(spec))
+        words, default = ("section", "") if is_section(hints[spec.name]) else (allowed(hints[spec.name]), shown_default(spec))
         entries.append((spec.name, words, default, meanings.get(spec.name, "")))
     return entries
 
@@ -101,6 +106,8 @@ def yaml_text(value: Any) -> str:
         return f"[{', '.join(map(yaml_text, value))}]"
     if value == "":
         return '""'
+    if dataclasses.is_dataclass(value):
+        return f"{{{', '.join(f'{name}: {yaml_text(inner)}' for name, inner in vars(value).items())}}}"
     # Six digits: 1/6 is meant, not its last bit.
     if not isinstance(value, float):
         return str(value)
@@ -123,8 +130,10 @@ def allowed(hint: Any) -> str:
         if arguments[-1] is Ellipsis:
             return f"list of {allowed(arguments[0])}"
         return f"[{', '.join(map(allowed, arguments))}]"
-    if dataclasses.is_dataclass(hint):
+    if is_section(hint):
         return "section"
+    if dataclasses.is_dataclass(hint):
+        return f"mapping of {', '.join(f'`{spec.name}`' for spec in dataclasses.fields(hint))}"
     return "mapping" if origin is dict else PLAIN[hint]
 
 

@@ -27,8 +27,20 @@ RENAMED = {
     "least_neighbours": "least_neighbors",
     "carry_over": REMOVED,
     "average_seeds": REMOVED,
+    "ranges": "now variables.NAME: {low: ..., high: ...}",
+    "scales": "now variables.NAME: {scale: ...}",
+    "start": "of a search now variables.NAME: {start: ...}",
+    "betas": "a constant of neuspring/twin/fit.py now",
     "last_frame": REMOVED,
 }
+RENAMED |= dict.fromkeys(
+    (
+        *("losses.alpha", "simulation.mass", "search.clusters", "extra", "bending_reach"),
+        *("homogeneous_epochs", "fit.warmup_epochs", "schedule", "fit.clip_gradient_norm", "weight_decay"),
+        *("rest_lengths_by", "field.scale", "field.controllers"),
+    ),
+    REMOVED,
+)
 """Keys of older versions -> their name now, or a sentence that says where they went. An entry is a key or its dotted path."""
 
 

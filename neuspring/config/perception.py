@@ -220,11 +220,9 @@ class ColorSettings(Section):
     hand_radius: Positive = 0.08
     """Corners of a hand are followed this far around its grip, m at the object."""
     hand_tilt: Finite = 0.0
-    """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.ranges.hand_tilt)."""
+    """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.variables.hand_tilt)."""
     samples: Count = 300
-    """Points of the object's silhouette per frame, and as many beside it."""
-    band: Positive = 30.0
-    """How far from the object points beside it may be, pixels."""
+    """Points of the object's silhouette per frame."""
     cell: Count = 4
     """Side of the cells of the distance from object and hands, pixels."""
 

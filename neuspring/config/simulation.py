@@ -28,8 +28,6 @@ class Simulation(Section):
     """Dashpots use the controllers' velocity (finite differences); false: zero velocity, as in the released simulator."""
     initial_velocity: Literal["rest", "observed"] = "rest"
     """Velocity in frame 0. rest: zero, as released. observed: from the first three frames, for captures that begin in motion."""
-    mass: Literal["unit", "volume"] = "unit"
-    """Mass of the nodes. unit: 1 kg each, as released. volume: by the space around each, with mean 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

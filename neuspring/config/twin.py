@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from neuspring.config.types import Count, NonNegative, Positive, Range, Section
-
-Beta = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +26,6 @@ class Losses(Section):
     silhouette: NonNegative = 1.0
     """Color alone: weight of the squared distance, in the image, between mask and nodes: of points of the mask from the
     nearest node, and of nodes that leave object and hands from these."""
-    alpha: NonNegative = 0.0
-    """Color alone: weight of the error of the coverage by splats on the nodes, in squared node spacings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,22 +46,12 @@ class SpringField(Section):
     """What the Fourier transform is applied to: the summed plane feature, the coordinates (concatenated), or both."""
     bands: Count = 4
     """Number of frequencies 1, 2, 4, ... (times pi) of the Fourier transform."""
-    scale: Literal["log", "linear"] = "log"
-    """log: Y = Y0 exp(F). linear: Y = Y0 (1 + F)."""
-    controllers: bool = True
-    """The field covers controller springs too; false: they keep S0."""
     texel_scale: Positive = 0.1
     """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
     plane_smoothness: NonNegative = 0.0
     """Weight of the mean squared difference of neighboring texels, in the loss unit (`fit.loss_unit`)."""
-    weight_decay: NonNegative = 0.0
-    """Decoupled weight decay of texels and MLP."""
-
-
-Weights = NonNegative | tuple[NonNegative, ...]
-"""A weight, or several of which the held-back tail of the training frames chooses one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +60,8 @@ class RestShape(Section):
 
     handles: Annotated[int, Field(ge=0)] = 0
     """Number of handles, farthest-point samples of nodes and controllers; 0: the rest shape is the recorded one."""
-    prior: Weights = 0.1
-    """Weight of the mean squared change of rest lengths (as strain) in the loss unit. A list: the held-back tail chooses."""
+    prior: NonNegative = 0.1
+    """Weight of the mean squared change of rest lengths (as strain) in the loss unit."""
     learning_rate: Positive = 0.01
     """Learning rate of the handles: displacements in node spacings, and gradients as displacements at the next handle."""
 
@@ -99,44 +84,30 @@ class Fit(Section):
     """Learning rate of drag and common factors; null: `scalar_learning_rate`."""
     rest_learning_rate: Positive | None = None
     """Learning rate of rest lengths that are free beside a field; null: `learning_rate`."""
-    betas: tuple[Beta, Beta] = (0.9, 0.99)
-    """Adam's decay rates of the first and the second moment."""
     epsilon: Positive = 1e-15
     """Adam's epsilon, in the loss unit. Gradients far below it are not followed. The released code has 1e-8, with
     `loss_unit: meter`."""
     loss_unit: Literal["spacing", "meter"] = "spacing"
     """Unit of the loss that is differentiated, and of its penalties. spacing: squared node spacings (neuspring/twin/spacing.py), so
     that a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
-    schedule: Literal["constant", "cosine"] = "constant"
-    """Learning rates over the epochs; cosine: they fall to a hundredth."""
-    warmup_epochs: Annotated[int, Field(ge=0)] = 0
-    """Epochs over which learning rates rise linearly."""
-    homogeneous_epochs: Annotated[int, Field(ge=0)] = 0
-    """First epochs, in which one common factor and the scalars are trained, not single springs: a warm start."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
-    clip_gradient_norm: NonNegative = 0.0
-    """Largest norm of the gradient, in the loss unit; 0 disables clipping."""
     output_bound: NonNegative = 0.0
-    """Bound b of the change per spring: stiffness (and dashpot) stay within exp(+-b) of the searched value, by b tanh(x / b).
+    """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""
     global_stiffness: bool = False
     """Train one common factor of all stiffnesses beside springs or field, without a bound, in every epoch."""
     controller_factors: bool = False
-    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs. Bending springs,
-    where there are any, always have their own."""
+    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation, N."""
-    damping: Literal["fixed", "homogeneous", "springs"] = "fixed"
-    """What is trained of the damping. homogeneous: drag and one factor of all dashpots. springs: a dashpot per spring, by the field
-    where the method has one."""
+    damping: Literal["fixed", "homogeneous"] = "fixed"
+    """What is trained of the damping. homogeneous: drag and one factor of all dashpots."""
     rest_length_bound: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Bound of trained rest lengths: within exp(+-bound) of the distances in the rest shape; 0: rest lengths are fixed."""
-    rest_lengths_by: Literal["springs", "field"] = "springs"
-    """Trained rest lengths are free per spring, or an output of the field (for methods that have one)."""
-    rest_prior: Weights = 0.0
-    """Weight of the mean squared change of the logarithm of trained rest lengths, in the loss unit. A list: the held-back tail
-    chooses."""
+    """Bound of trained rest lengths: within exp(+-bound) of the distances in the rest shape; 0: rest lengths are fixed.
+    They are free per spring, beside a field too."""
+    rest_prior: NonNegative = 0.0
+    """Weight of the mean squared change of the logarithm of trained rest lengths, in the loss unit."""
     rest_shape: RestShape = dataclasses.field(default_factory=RestShape)
     selection: Literal["training_loss", "tail"] = "training_loss"
     """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last
@@ -153,21 +124,3 @@ class Fit(Section):
             raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
         if not self.field.triplane and self.field.fourier not in ("coordinates", "both"):
             raise ValueError(f"field.fourier: coordinates is required without the tri-plane, received {self.field.fourier}")
-        for name, weights in (("rest_prior", self.rest_prior), ("rest_shape.prior", self.rest_shape.prior)):
-            if isinstance(weights, tuple) and not weights:
-                raise ValueError(f"{name}: at least one weight is required")
-        if len(self.priors) > 1 and self.selection != "tail":
-            raise ValueError(f"several weights of a prior need selection: tail, received {self.selection}")
-
-    @property
-    def total_epochs(self) -> int:
-        """Epochs for all weights of the priors together."""
-        return self.epochs * len(self.priors)
-
-    @property
-    def priors(self) -> list[tuple[float, float]]:
-        """Weights (rest_prior, rest_shape.prior) that are tried, one pair after the other, each for `epochs` epochs."""
-        first, second = (
-            weights if isinstance(weights, tuple) else (weights,) for weights in (self.rest_prior, self.rest_shape.prior)
-        )
-        return list(itertools.product(first, second))

@@ -257,7 +257,6 @@ class ImageObservations(Artifact):
     pixels: np.ndarray = array("T,No,2", np.float32, "px", "where tracked points of the object are seen; zeros elsewhere")
     visible: np.ndarray = array("T,No", np.bool_, "1", "whether they are seen; never in future frames")
     inside: np.ndarray = array("E,P,2", np.float32, "px", "on the object, in training frames; NaN: fewer", nan=True)
-    beside: np.ndarray = array("E,Q,2", np.float32, "px", "points beside object and hands; NaN: fewer", nan=True)
     outside: np.ndarray = array("E,h,w", np.float32, "px", "distance from object and hands of cells of the image; 0 within")
     cell: int
     """Side of a cell, px; the center of cell (row i, column j) is ((j + 1/2) cell - 1/2, (i + 1/2) cell - 1/2)."""
@@ -362,7 +361,6 @@ class Topology(Artifact):
     )
     controller_rest: str = "rest_shape"
     """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
-    bending: np.ndarray = array("B", bool, "1", "which springs are bending springs; empty: none", optional=True)
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
@@ -378,8 +376,6 @@ class Topology(Artifact):
             raise InputError("topology.springs", "a spring may not join two controllers")
         if self.controller_rest not in ("rest_shape", "first_frame"):
             raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
-        if len(self.bending) not in (0, len(self.springs)):
-            raise InputError("topology.bending", f"one entry per spring ({len(self.springs)}), or none", len(self.bending))
         short = np.flatnonzero(~(self.rest_lengths > 0))
         if len(short):
             raise InputError(
@@ -393,11 +389,6 @@ class Topology(Artifact):
     def canonical(self) -> np.ndarray:
         """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
         return canonical_shape(self.nodes, self.controllers, self.rest_shape)
-
-    @property
-    def is_bending(self) -> np.ndarray:
-        """Which springs are bending springs [S]."""
-        return self.bending if len(self.bending) else np.zeros(len(self.springs), bool)
 
     @property
     def object_spring_count(self) -> int:

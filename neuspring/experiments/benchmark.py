@@ -238,14 +238,14 @@ class Benchmark:
             losses_of(self.config, self.searches[method.searched], method.search)
         if not (method.search and method.fit):
             return
-        wanted_low, wanted_high = search_of(self.config, self.searches[method.searched], method.search).ranges.stiffness
+        wanted = search_of(self.config, self.searches[method.searched], method.search).variables.stiffness
         fit = fit_of(self.config, method, name)
         if method.oracle and fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
             raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")
         low, high = fit.stiffness_range
-        if not low <= wanted_low < wanted_high <= high:
-            rule = f"must hold the search's range of {wanted_low} to {wanted_high}, or springs start beyond their clamp"
+        if not low <= wanted.low < wanted.high <= high:
+            rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     def pool_kind(self, job: Any) -> str | None:

@@ -30,7 +30,7 @@ from neuspring.stages import STAGES
 
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-REGIONS_ONLY = ("clusters", "tied_rollouts", "freed_sigma")
+REGIONS_ONLY = ("tied_rollouts", "freed_sigma")
 """Settings of the search that concern nothing where there is one region."""
 
 

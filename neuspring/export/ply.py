@@ -13,7 +13,7 @@ from neuspring.export.source import Source
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
 EDGE = [
     *(("vertex1", "<i4"), ("vertex2", "<i4"), ("stiffness", "<f4"), ("dashpot", "<f4"), ("rest_length", "<f4")),
-    *(("strain", "<f4"), ("bending", "u1")),
+    ("strain", "<f4"),
 ]
 WORDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
@@ -60,7 +60,6 @@ def edges(source: Source, frame: int) -> np.ndarray:
     table["stiffness"], table["dashpot"], table["rest_length"] = material.stiffness, material.dashpot, topology.rest_lengths
     ends = points(source, frame)[topology.springs]
     table["strain"] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / topology.rest_lengths - 1
-    table["bending"] = topology.is_bending
     return table
 
 

@@ -141,7 +141,6 @@ class Simulator:
             springs=np.concatenate([topology.springs, np.array([[own, node]], np.int32)]),
             rest_lengths=np.append(topology.rest_lengths, np.float32(REST)),
             rest_shape=np.concatenate([rest, place]) if len(rest) else rest,
-            bending=np.append(topology.bending, False) if len(topology.bending) else topology.bending,
         )
         stiffness = np.append(material.stiffness, np.float32(k * REST))
         stronger = replace(material, stiffness=stiffness, dashpot=np.append(material.dashpot, np.float32(c)))

@@ -158,7 +158,7 @@ def run(
         "best_epoch": result.best_epoch,
         "best_loss": result.best_loss,
         "epochs": len(result.history),
-        "epochs_asked": problem.fit.total_epochs,
+        "epochs_asked": problem.fit.epochs,
         "epochs_together": result.epochs_together,
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,

@@ -7,8 +7,7 @@ start counts too. Test frames are never read, but by an oracle (`FitProblem.orac
 parameters of the epoch's start, halves the learning rates and is reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
-is recorded is in m^2. Several weights of a prior are several trainings from the start, one after the other, and the held-back
-tail selects among the epochs of all.
+is recorded is in m^2.
 """
 
 from __future__ import annotations
@@ -40,8 +39,8 @@ from neuspring.twin.movement import median_gradient, movement, watched
 from neuspring.twin.parameters import TwinParameters
 from neuspring.twin.unloaded import topology_spacing
 
-LOWEST_RATE = 0.01
-"""Where the cosine schedule ends, as a fraction of the learning rate."""
+BETAS = (0.9, 0.99)
+"""Adam's decay rates of the first and the second moment, as released."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -85,7 +84,7 @@ class FitProblem:
 class FitResult:
     """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate).
 
-    Epochs count through all weights of the priors. Gradients are those of the loss in its unit (`fit.loss_unit`).
+    Gradients are those of the loss in its unit (`fit.loss_unit`).
     """
 
     twin: Twin
@@ -103,7 +102,7 @@ class FitResult:
     epochs_together: int
     """Epochs that ran together with those of other fits."""
     figures: dict[str, Any]
-    """What moved and what was in the way (`movement`), gradient_over_epsilon, and the chosen weights where there were several."""
+    """What moved and what was in the way (`movement`), and gradient_over_epsilon."""
 
 
 @dataclass
@@ -168,7 +167,7 @@ class TwinFit:
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
-        self.optimizer = torch.optim.AdamW(self.parameters.groups(), betas=settings.betas, eps=settings.epsilon)
+        self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
         """Loss units per m^2."""
         self.gradients: list[float] | None = None
@@ -244,17 +243,10 @@ class TwinFit:
             raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
         return simulation.substeps
 
-    def start_epoch(self, epoch: int, rate: float) -> None:
-        """Set what an epoch trains, and the learning rates: the settings' times `rate` (halved by rollbacks)."""
-        settings = self.problem.fit
-        weights, epoch = divmod(epoch, settings.epochs)
-        self.parameters.priors = settings.priors[weights]
-        self.parameters.homogeneous = epoch < settings.homogeneous_epochs
-        factor = rate * min((epoch + 1) / (settings.warmup_epochs + 1), 1.0)
-        if settings.schedule == "cosine":
-            factor *= LOWEST_RATE + (1 - LOWEST_RATE) * (1 + math.cos(math.pi * epoch / settings.epochs)) / 2
+    def set_rate(self, rate: float) -> None:
+        """Set the learning rates: the settings' times `rate` (halved by rollbacks)."""
         for group in self.optimizer.param_groups:
-            group["lr"] = factor * group["base_rate"]
+            group["lr"] = rate * group["base_rate"]
 
     def epoch(self) -> dict[str, float]:
         """One pass over the frames that are trained on; raises NonFinite.
@@ -318,9 +310,6 @@ class TwinFit:
             raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
         if self.gradients is not None:
             self.gradients.append(median_gradient(watched(self.parameters)))
-        limit = self.problem.fit.clip_gradient_norm
-        if limit:
-            torch.nn.utils.clip_grads_with_norm_(tensors, limit, norm)
         self.optimizer.step()
         return float(norm)
 
@@ -331,12 +320,9 @@ class TwinFit:
 
     def figures(self, state: _State) -> dict[str, Any]:
         """What the fit's record says of the selected values, which are the present ones."""
-        settings, figures = self.problem.fit, movement(self.parameters)
+        figures = movement(self.parameters)
         if state.gradient_over_epsilon is not None:
             figures["gradient_over_epsilon"] = state.gradient_over_epsilon
-        if len(settings.priors) > 1 and state.best_epoch >= 0:
-            chosen = settings.priors[state.best_epoch // settings.epochs]
-            figures |= dict(zip(("rest_prior", "rest_shape_prior"), chosen, strict=True))
         return figures
 
 
@@ -357,17 +343,15 @@ def fit(
     """
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(seat.company.seats) if seat else 1.0
-    loop = TrainingLoop("the fit", label, problem.fit.total_epochs, problem.fit.checkpoint_every, partial, key, share=share)
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
     run = (run_of or TwinFit)(problem, seat)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
     for epoch in loop:
-        if len(state.rollbacks) >= MAX_ROLLBACKS * len(problem.fit.priors):
+        if len(state.rollbacks) >= MAX_ROLLBACKS:
             break
-        if epoch and epoch % problem.fit.epochs == 0:
-            _start_again(run, state)
         row = _advance(run, state, problem, epoch)
         state.overflow = overflow + run.collision_overflow
         loop.record(row, f"loss {row['loss']:.3e} m^2" if not row["rolled_back"] else "rolled back")
@@ -376,7 +360,6 @@ def fit(
     if not math.isfinite(state.best_loss):
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
     run.parameters.restore(state.best_values)
-    run.parameters.homogeneous = False
     run.use_substeps(state.best_substeps)
     best = run.parameters.as_twin(run.twin)
     return FitResult(
@@ -391,14 +374,6 @@ def fit(
         loop.epochs_together,
         run.figures(state),
     )
-
-
-def _start_again(run: TwinFit, state: _State) -> None:
-    """Back to where the fit began, for the next weights; the best epoch so far is kept."""
-    state.values, state.moments, state.rate = run.parameters.first, {}, 1.0
-    state.substeps = run.problem.twin.simulation.substeps
-    run.use_substeps(state.substeps)
-    run.restore(state.values, state.moments)
 
 
 def _start(run: TwinFit, problem: FitProblem) -> _State:
@@ -424,7 +399,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
     Accepted values can always be integrated with `state.substeps`.
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
-    run.start_epoch(epoch, state.rate)
+    run.set_rate(state.rate)
     row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
         before = (state.values, state.substeps)
@@ -442,10 +417,8 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
         )
         row |= losses
         loss = losses["tail_loss" if problem.fit.selection == "tail" else "loss"]
-        within = epoch % problem.fit.epochs
-        if _eligible(within, problem) and loss < state.best_loss:
-            state.best_loss = loss
-            state.best_epoch = epoch - run.one_step if within else (-1 if run.one_step else epoch)
+        if _eligible(epoch, problem) and loss < state.best_loss:
+            state.best_loss, state.best_epoch = loss, epoch - run.one_step
             state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
     except NonFinite as failure:
         state.rollbacks.append(f"epoch {epoch}: {failure}")

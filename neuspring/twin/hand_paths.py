@@ -42,7 +42,7 @@ def names(image: ImageObservations, knots: int) -> tuple[str, ...]:
 
 def start(image: ImageObservations, search: config.Search) -> dict[str, float]:
     """The values that the search begins with; those of `controller_points`."""
-    return {name: float(getattr(search.start, name.partition(".")[0])) for name in names(image, search.hand_knots)}
+    return {name: float(getattr(search.variables, name.partition(".")[0]).start) for name in names(image, search.hand_knots)}
 
 
 def with_hands(observations: Observations, twin: Twin) -> Observations:
@@ -63,7 +63,7 @@ def hand_depths(observations: Observations, values: Mapping[str, float]) -> np.n
     """z(t) / z(0) of each hand [T, H]."""
     image, scenario = observations.image, observations.scenario
     assert image is not None
-    return depths_of(image, values, scenario.train_end, 1.0 if scenario.up == "+z" else -1.0)
+    return depths_of(image, values, scenario.train_end, scenario.up_sign)
 
 
 def depths_of(image: ImageObservations, values: Mapping[str, float], train_end: int, up: float) -> np.ndarray:

@@ -1,14 +1,12 @@
 """Training losses in the image of one camera without depth, differentiable in the predicted nodes.
 
-With the projection u(x) = K R^T (x - c) / depth, pixel size s (m per pixel at the object in frame 0) and node spacing d (m):
+With the projection u(x) = K R^T (x - c) / depth and the pixel size s (m per pixel at the object in frame 0):
 
     image_track   smooth-L1 of s (u(x_i) - q_i), mean over tracked points that are seen and over x and y; linear beyond BETA, since
                   trackers slide
     silhouette    s^2 (mean over points p of the mask of min_i |p - u(x_i)|^2  +  mean over nodes i of D(u(x_i))^2), the first over
                   surface nodes, assignment fixed; D is the distance from object and hands, bilinear between cells. A node that a
                   hand hides is not wrong.
-    alpha         d^2 (mean over points p of the mask of (1 - A(p))^2  +  mean over points p beside it of A(p)^2), where splats
-                  on the surface nodes cover A(p) = 1 - prod_i (1 - OPACITY exp(-|p - u(x_i)|^2 / (2 w^2))), w = d / (2 s) pixels
 
 A term is weighted by the field of `config.Losses` that has its name. All are in m^2, as the other losses are.
 """
@@ -22,11 +20,9 @@ from torch.nn.functional import grid_sample
 
 from neuspring.config import Losses
 from neuspring.core.artifacts import Observations
-from neuspring.twin.spacing import node_spacing
 
 BETA = 0.03
 """m: beyond it a track's error counts linearly."""
-OPACITY = 0.95
 NEAR = 0.05
 """m: nodes nearer to the camera are projected as if they were there."""
 
@@ -43,16 +39,12 @@ class ImageLoss:
     """[E, No]."""
     inside: torch.Tensor
     """[E, P, 2], NaN where there are fewer."""
-    beside: torch.Tensor
-    """[E, Q, 2], NaN where there are fewer."""
     outside: torch.Tensor
     """[E, h, w], pixels."""
     cell: int
     surface: int
     size: float
     """s, m per pixel."""
-    spacing: float
-    """d, m."""
     weights: Losses
 
     @classmethod
@@ -73,20 +65,18 @@ class ImageLoss:
             tensor(image.pixels[:end].copy()),
             torch.tensor(image.visible[:end], device=device),
             tensor(image.inside.copy()),
-            tensor(image.beside.copy()),
             tensor(image.outside.copy()),
             image.cell,
             observations.surface_count,
             image.pixel_size,
-            node_spacing(observations.canonical[: len(observations.nodes)]),
             weights,
         )
 
     def to(self, device: str, dtype: torch.dtype) -> ImageLoss:
         """The same on another device, in another precision."""
-        names = ("world_to_camera", "intrinsics", "pixels", "inside", "beside", "outside")
+        names = ("world_to_camera", "intrinsics", "pixels", "inside", "outside")
         moved = {name: getattr(self, name).to(device=device, dtype=dtype) for name in names}
-        rest = {name: getattr(self, name) for name in ("cell", "surface", "size", "spacing", "weights")}
+        rest = {name: getattr(self, name) for name in ("cell", "surface", "size", "weights")}
         return ImageLoss(visible=self.visible.to(device), **moved, **rest)
 
     def project(self, x: torch.Tensor) -> torch.Tensor:
@@ -126,11 +116,6 @@ class ImageLoss:
             away = self.size * (u[near] - points) * inside[:, None]
             left = self.size * self.distance(frame, u)
             parts["silhouette"] = [_weighted(away, w.silhouette, inside.sum()), _weighted(left, w.silhouette, len(u))]
-        if w.alpha:
-            beside = ~torch.isnan(self.beside[frame, :, 0])
-            missing = self.spacing * (1 - self.coverage(points, u)) * inside
-            extra = self.spacing * self.coverage(torch.nan_to_num(self.beside[frame]), u) * beside
-            parts["alpha"] = [_weighted(missing, w.alpha, inside.sum()), _weighted(extra, w.alpha, beside.sum())]
         return parts
 
     def distance(self, frame: int, u: torch.Tensor) -> torch.Tensor:
@@ -143,12 +128,6 @@ class ImageLoss:
             self.outside[frame][None, None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
         )
         return sampled[0, 0, 0]
-
-    def coverage(self, points: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        """A [P] at pixels [P, 2]."""
-        width = self.spacing / (2 * self.size)
-        squares = (points[:, None] - u[None, : self.surface]).square().sum(dim=2)
-        return 1 - torch.exp(torch.log1p(-OPACITY * torch.exp(-squares / (2 * width**2))).sum(dim=1))
 
 
 def _weighted(values: torch.Tensor, weight: float, count: torch.Tensor | int) -> torch.Tensor:

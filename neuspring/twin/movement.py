@@ -41,9 +41,8 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
             first = torch.from_numpy(parameters.first["field.planes.texels"])
             change = (parameters.field.planes.texels.cpu() - first).abs()
             figures["texels_moved"] = _share(change > MOVED * s.field.texel_scale)
-        covered = slice(parameters.covered)
         if s.output_bound:
-            deviation = parameters.deviation(parameters.raw()["stiffness"])[covered].log()
+            deviation = parameters.deviation(parameters.raw()["stiffness"]).log()
             figures["at_bound"] = _share(deviation.abs() >= NEAR * s.output_bound)
         physical = parameters.physical()
         low, high = s.stiffness_range

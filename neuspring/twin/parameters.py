@@ -1,21 +1,18 @@
 """What a first-order stage trains, and the physical quantities that follow from it.
 
 Every spring has offsets o on a log scale: its own numbers (`springs`), or the neural spring field at its midpoint (`field`;
-rest lengths stay free per spring unless `rest_lengths_by` says otherwise). With b(o) = bound tanh(o / bound), or o without a bound:
+rest lengths stay free per spring). With b(o) = bound tanh(o / bound), or o without a bound:
 
-    stiffness    Y = Y0 exp(b(o_Y)), clamped to the stiffness range     (linear field: Y0 (1 + b(o_Y)))
-    dashpot      g = g0 exp(b(o_g))                                     if damping is trained
+    stiffness    Y = Y0 exp(b(o_Y)), clamped to the stiffness range
     rest length  l = l0 exp(r tanh(o_l))                                if rest_length_bound r > 0
                  l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (unloaded.py)
 
-Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`, or a warm start),
-drag and dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own;
-bending springs, where there are any, always do.
+Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
+dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any
@@ -27,7 +24,6 @@ from torch import nn
 from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Twin
-from neuspring.core.errors import InputError
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
 from neuspring.twin.unloaded import UnloadedShape
@@ -36,7 +32,7 @@ CONTACT_SCALARS = tuple(LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
 """Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
 SPRING_FACTORS = ("stiffness", "dashpot")
-"""Those that may have a factor of their own for controllers' springs and for bending springs."""
+"""Those that may have a factor of their own for controllers' springs."""
 UNTRAINED = ("contact_distance",)
 """It only selects pairs, so it has no gradient."""
 LOWEST_STIFFNESS = 1e-3
@@ -78,100 +74,70 @@ class TwinParameters(nn.Module):
         self.settings, self.kind = settings, kind
         self.start = twin_tensors(twin, device)
         self.start["stiffness"] = self.start["stiffness"].clamp_min(LOWEST_STIFFNESS)
-        self.channels = ["stiffness"]
-        self.channels += ["dashpot"] if settings.damping == "springs" else []
-        shared_rest = settings.rest_lengths_by == "field" or kind == "springs"
-        self.channels += ["rest_lengths"] if settings.rest_length_bound and shared_rest else []
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
-        self.is_bending = torch.tensor(topology.is_bending, device=device)
-        self.covered = count if settings.field.controllers or kind == "springs" else topology.object_spring_count
+        self.channels = ["stiffness"]
+        """What the columns of the offsets, or the outputs of the field, change."""
         self.offsets, self.field, self.rest_offsets = None, None, None
-        if settings.rest_length_bound and not shared_rest:
-            self.rest_offsets = nn.Parameter(torch.zeros(count))
         if kind == "springs":
+            self.channels += ["rest_lengths"] if settings.rest_length_bound else []
             self.offsets = nn.Parameter(torch.zeros(count, len(self.channels)))
         else:
-            if not self.covered:
-                rule = "a field that leaves out controllers needs springs between object nodes"
-                raise InputError("fit.field.controllers", rule, "none", "Let it cover controllers, or widen the search's radii.")
-            points = midpoints(topology.canonical, topology.springs)[: self.covered]
-            self.field = SpringField(points, settings.field, len(self.channels), seed)
+            self.rest_offsets = nn.Parameter(torch.zeros(count)) if settings.rest_length_bound else None
+            self.field = SpringField(midpoints(topology.canonical, topology.springs), settings.field, len(self.channels), seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
         self.unloaded = UnloadedShape(topology, settings.rest_shape.handles) if settings.rest_shape.handles else None
-        self.homogeneous = False
-        """While true, offsets and the unloaded shape are not trained."""
-        self.priors = settings.priors[0]
-        """Weights (rest_prior, rest_shape.prior) of the penalty."""
         self.to(device)
         self.first = self.copy()
         """The trained values before the first step."""
 
     def _factor_names(self) -> list[str]:
-        """Common factors that are trained: what they scale, `controller_` or `bending_` before it where of those springs."""
+        """Common factors that are trained: what they scale, `controller_` before it where of those springs."""
         s = self.settings
-        names = ["stiffness"] if s.homogeneous_epochs or s.global_stiffness else []
+        names = ["stiffness"] if s.global_stiffness else []
         names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
-        parts = ["controller"] if s.controller_factors else []
-        parts += ["bending"] if bool(self.is_bending.any()) else []
-        return names + [f"{part}_{name}" for part in parts for name in names if name in SPRING_FACTORS]
+        return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later) and weight decay."""
+        """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later)."""
         s = self.settings
-        rate, decay = s.learning_rate, s.field.weight_decay
-        groups: list[tuple[Iterable[nn.Parameter], float, float]] = []
+        rate = s.learning_rate
+        groups: list[tuple[Iterable[nn.Parameter], float]] = []
         if self.offsets is not None:
-            groups.append(([self.offsets], rate, 0.0))
+            groups.append(([self.offsets], rate))
         if self.field is not None:
-            groups.append((self.field.layers.parameters(), rate, decay))
+            groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
-                groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate, decay))
+                groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate))
         if self.rest_offsets is not None:
-            groups.append(([self.rest_offsets], s.rest_learning_rate or rate, 0.0))
-        groups.append((self.scalars.values(), s.scalar_learning_rate or rate, 0.0))
+            groups.append(([self.rest_offsets], s.rest_learning_rate or rate))
+        groups.append((self.scalars.values(), s.scalar_learning_rate or rate))
         if self.factors:
-            groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate, 0.0))
+            groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate))
         if self.unloaded is not None:
-            groups.append((self.unloaded.parameters(), s.rest_shape.learning_rate, 0.0))
-        return [{"params": list(each), "lr": rate, "base_rate": rate, "weight_decay": decay} for each, rate, decay in groups]
-
-    def raw_offsets(self) -> torch.Tensor:
-        """Offsets [S, channels] before bounding; zero for springs that the field does not cover."""
-        if self.offsets is not None:
-            raw: torch.Tensor = self.offsets
-        else:
-            assert self.field is not None
-            raw = self.field()
-            missing = len(self.start["stiffness"]) - self.covered
-            raw = torch.cat([raw, raw.new_zeros(missing, raw.shape[1])]) if missing else raw
-        return raw.detach() if self.homogeneous else raw
+            groups.append((self.unloaded.parameters(), s.rest_shape.learning_rate))
+        return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
 
     def raw(self) -> dict[str, torch.Tensor]:
         """Offsets [S] before bounding, by what they change."""
-        raw = dict(zip(self.channels, self.raw_offsets().unbind(dim=1), strict=True))
-        if self.rest_offsets is not None:
-            raw["rest_lengths"] = self.rest_offsets.detach() if self.homogeneous else self.rest_offsets
-        return raw
+        columns = self.offsets if self.field is None else self.field()
+        assert columns is not None
+        raw: dict[str, torch.Tensor] = dict(zip(self.channels, columns.unbind(dim=1), strict=True))
+        return raw if self.rest_offsets is None else raw | {"rest_lengths": self.rest_offsets}
 
     def deviation(self, offset: torch.Tensor) -> torch.Tensor:
         """Factor of each spring's stiffness [S], apart from common factors, for offsets [S] before bounding."""
-        bound = self.settings.output_bound
-        within = bounded(offset, bound)
-        if self.kind == "springs" or self.settings.field.scale == "log":
-            return within.exp()
-        return inward_clamp(1 + within, math.exp(-bound), math.exp(bound)) if bound else 1 + within
+        return bounded(offset, self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
         """The common factor of a physical value: one number, or a number per spring."""
         if name not in self.factors:
             return 1.0
         factor: torch.Tensor = self.factors[name].exp()
-        for part, members in (("controller", self.on_controller), ("bending", self.is_bending)):
-            if f"{part}_{name}" in self.factors:
-                factor = torch.where(members, self.factors[f"{part}_{name}"].exp(), factor)
+        if f"controller_{name}" in self.factors:
+            factor = torch.where(self.on_controller, self.factors[f"controller_{name}"].exp(), factor)
         return factor
 
     def physical(self) -> dict[str, torch.Tensor]:
@@ -184,11 +150,8 @@ class TwinParameters(nn.Module):
         for name in DAMPING_FACTORS:
             if name in self.factors:
                 values[name] = self.start[name] * self._common(name)
-        if "dashpot" in raw:
-            values["dashpot"] = values["dashpot"] * bounded(raw["dashpot"], s.output_bound).exp()
         if self.unloaded is not None:
-            ratio = self.unloaded()
-            values["rest_lengths"] = self.start["rest_lengths"] * (ratio.detach() if self.homogeneous else ratio)
+            values["rest_lengths"] = self.start["rest_lengths"] * self.unloaded()
         if "rest_lengths" in raw:
             values["rest_lengths"] = values["rest_lengths"] * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).exp()
         return values | dict(self.scalars.items())
@@ -200,16 +163,13 @@ class TwinParameters(nn.Module):
     def penalty(self) -> torch.Tensor:
         """The regularizers of a step, in the loss unit: roughness of the planes, changes of rest lengths, each with its weight."""
         s, total = self.settings, torch.zeros(())
-        if self.homogeneous:
-            return total
         if self.field is not None and s.field.plane_smoothness:
             total = total + s.field.plane_smoothness * self.field.roughness()
-        lengths, shape = self.priors
-        raw = self.raw() if lengths else {}
+        raw = self.raw() if s.rest_prior else {}
         if "rest_lengths" in raw:
-            total = total + lengths * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).square().mean()
-        if self.unloaded is not None and shape:
-            total = total + shape * (self.unloaded() - 1).square().mean()
+            total = total + s.rest_prior * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).square().mean()
+        if self.unloaded is not None and s.rest_shape.prior:
+            total = total + s.rest_shape.prior * (self.unloaded() - 1).square().mean()
         return total
 
     def copy(self) -> dict[str, np.ndarray]:

@@ -76,12 +76,6 @@ class PooledFit(TwinFit):
         self.use_substeps(max(run.twin.simulation.substeps for run in [self, *self._members]))
         return self.parameters.pack(self.twin.simulation.substep)
 
-    def start_epoch(self, epoch: int, rate: float) -> None:
-        """As of one recording."""
-        super().start_epoch(epoch, rate)
-        for member in self._members:
-            member.parameters.homogeneous, member.parameters.priors = self.parameters.homogeneous, self.parameters.priors
-
     def epoch(self) -> dict[str, float]:
         """One pass over each recording; raises NonFinite. Means over the recordings, and the largest gradient of any step."""
         for member in self._members:

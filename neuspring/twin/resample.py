@@ -24,7 +24,6 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.field import midpoints
-from neuspring.twin.masses import volume_masses
 from neuspring.twin.register import Registration, register, spacing
 from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology, unloaded
 
@@ -42,15 +41,10 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
 
     A spring takes stiffness, dashpot and strain at rest (rest length over distance without force) from the nearest springs of the
     twin, object and controller springs apart, as geometric means weighted by inverse distance, and the sums above are kept. Masses,
-    where nodes have any, are those of the new nodes' volumes. Substeps and scenario are still the twin's. Raises InputError if the
+    where nodes have any, are those of the nearest nodes. Substeps and scenario are still the twin's. Raises InputError if the
     shapes do not fit, or no hand reaches a node.
     """
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
-    if old.is_bending.any():
-        rule = "a twin with bending springs moves to recordings with the same nodes only"
-        raise InputError(
-            name, rule, f"{len(observations.nodes)} nodes, the twin has {len(old.nodes)}", "Leave out search.extra: [bending]."
-        )
     nodes, count = len(old.nodes), len(observations.nodes)
     there = observations.canonical
     laid = register(old.canonical[:nodes], there[:count], there[count:])
@@ -82,7 +76,7 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     if old.object_spring_count < len(old.springs) and new.object_spring_count == len(new.springs):
         rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
         raise InputError(name, rule, "none is", "Check the controllers of frame 0.")
-    mass = volume_masses(there[:count]) if len(twin.material.mass) else twin.material.mass
+    mass = twin.material.mass[nearest] if len(twin.material.mass) else twin.material.mass
     material = replace(twin.material, contact_distance=twin.material.contact_distance * factor, mass=mass)
     return _carried(twin, new, material, np.concatenate([laid.points, laid.others])), laid
 

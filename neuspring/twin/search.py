@@ -22,7 +22,7 @@ import pandas as pd
 import torch
 
 from neuspring import config
-from neuspring.config.search import HANDS, LENGTHS
+from neuspring.config.search import HANDS, LENGTHS, VARIABLES
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.text import Progress
@@ -32,7 +32,6 @@ from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import hand_paths
 from neuspring.twin import trace as trace_file
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.masses import volume_masses
 from neuspring.twin.motion import initial_velocity
 from neuspring.twin.polish import CMAES, POLISH, PRODUCT, RESIDUAL, SLOPES, Polish, slopes
 from neuspring.twin.proposals import Proposals
@@ -40,7 +39,7 @@ from neuspring.twin.recordings import Recording, mean_outcome, on_recording, req
 from neuspring.twin.residuals import Residuals
 from neuspring.twin.rollout import FAR
 from neuspring.twin.spacing import controller_reach, node_spacing
-from neuspring.twin.topology import isolated, piecewise_topology, regions
+from neuspring.twin.topology import piecewise_topology, regions
 from neuspring.twin.trials import Outcome, motions, outcomes
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
@@ -73,16 +72,14 @@ class SearchProblem:
     pool: tuple[Recording, ...] = ()
     """Other recordings of the object; a candidate's cost is the mean over all.
 
-    Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's masses, `spacing`
-    and `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
+    Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
+    `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
     nodes there, and the material of one topology would be judged on another.
     """
     leave_out: bool = False
     """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts, neither for costs nor for slopes."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
-    mass: np.ndarray = field(init=False)
-    """Mass of each node [N], kg; empty: 1 each."""
     velocity: np.ndarray = field(init=False)
     """Velocity of each node in frame 0 [N, 3], m/s."""
     spacing: float = field(init=False)
@@ -97,8 +94,7 @@ class SearchProblem:
             raise InputError(where, "recordings of color alone are searched one by one", f"a pool of {len(self.pool) + 1}")
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
-        object.__setattr__(self, "labels", regions(nodes, self.clusters, self.search.clusters))
-        object.__setattr__(self, "mass", volume_masses(nodes) if self.simulation.mass == "volume" else np.zeros(0))
+        object.__setattr__(self, "labels", regions(nodes, self.clusters))
         object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
         object.__setattr__(self, "spacing", node_spacing(nodes))
         object.__setattr__(self, "reach", controller_reach(nodes, hands))
@@ -111,13 +107,13 @@ class SearchProblem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All that makes a candidate: the fields of `config.SearchRanges`, regional ones as name.0, name.1, ... (bare for one)."""
+        """All that makes a candidate: the variables of the settings, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
-        for f in fields(config.SearchRanges):
-            if f.name in (*self.search.absent, *HANDS):
+        for name in VARIABLES:
+            if name in HANDS:
                 continue
-            regional = f.name in REGIONAL and self.clusters > 1
-            names += [f"{f.name}.{region}" for region in range(self.clusters)] if regional else [f.name]
+            regional = name in REGIONAL and self.clusters > 1
+            names += [f"{name}.{region}" for region in range(self.clusters)] if regional else [name]
         image = self.observations.image
         return (*names, *(hand_paths.names(image, self.search.hand_knots) if image else ()))
 
@@ -132,39 +128,21 @@ class SearchProblem:
         bases = self.search.polish.variables
         return tuple(name for base in bases for name in self.variables if name.partition(".")[0] == base)
 
-    @property
-    def bending_reach(self) -> tuple[float, float]:
-        """Lengths of bending springs, from and to, m."""
-        low, high = self.search.bending_reach
-        return low * self.spacing, high * self.spacing
-
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
         """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
         searched = dict(zip(self.variables, normalized, strict=True))
         values = {}
         for name in self.names:
             base = name.partition(".")[0]
-            if name in searched:
-                low, high = getattr(self.search.ranges, base)
-                u = float(searched[name])
-                value = float(low * (high / low) ** u) if self._is_log(base) else low + u * (high - low)
-            else:
-                value = float(getattr(self.search.start, base))
+            variable = getattr(self.search.variables, base)
+            value = variable.value(float(searched[name])) if name in searched else float(variable.start)
             values[name] = float(int(value)) if base in INTEGERS else self._meters(base, value)
         return values
 
     def encode(self) -> np.ndarray:
         """Normalized `variables` of the starting values."""
-        normalized = []
-        for name in self.variables:
-            base = name.partition(".")[0]
-            low, high = getattr(self.search.ranges, base)
-            value = getattr(self.search.start, base)
-            normalized.append(np.log(value / low) / np.log(high / low) if self._is_log(base) else (value - low) / (high - low))
-        return np.array(normalized)
-
-    def _is_log(self, base: str) -> bool:
-        return bool(getattr(self.search.scales, base) == "log")
+        settings = [getattr(self.search.variables, name.partition(".")[0]) for name in self.variables]
+        return np.array([variable.normalized(variable.start) for variable in settings])
 
     def _meters(self, base: str, value: float) -> float:
         """A setting's value; of a length in m, whatever unit it is searched in."""
@@ -213,7 +191,7 @@ def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
 
 def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
-    observations, isolated_nodes = problem.observations, problem.search.isolated_nodes
+    observations = problem.observations
     topology = piecewise_topology(
         observations.nodes,
         observations.controller_points[0],
@@ -222,21 +200,14 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         [int(n) for n in problem.of_regions(values, "object_neighbors")],
         values["controller_radius"],
         int(values["controller_neighbors"]),
-        repair=isolated_nodes == "repair",
+        repair=problem.search.isolated_nodes == "repair",
         rest_shape=observations.rest_shape,
         controller_rest=problem.search.controller_rest,
-        bending=problem.bending_reach if "bending" in values else None,
     )
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
-    lonely = isolated(len(topology.nodes), topology.springs[~topology.is_bending])
-    if isolated_nodes == "penalize" and len(lonely):
-        raise NumericalFailure(f"{len(lonely)} nodes have no spring, the first is node {lonely[0]}")
-    material = replace(homogeneous(values, count), mass=problem.mass)
-    if "bending" in values:
-        factor = np.where(topology.is_bending, values["bending"], 1.0)
-        material = replace(material, stiffness=material.stiffness * factor, dashpot=material.dashpot * factor)
+    material = homogeneous(values, count)
     hands = {name: value for name, value in values.items() if name.partition(".")[0] in HANDS}
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1), hands=hands))
 

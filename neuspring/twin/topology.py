@@ -3,18 +3,15 @@
 Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. A spring is made
 if either end asks for it. In a piecewise topology each region of nodes has
 its own radius and number of neighbors; a node asks among all nodes, with its own region's values, so regions stay joined.
-Bending springs, where they are wanted, join nodes about two spacings apart that have no other spring.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config import Clusters
 from neuspring.core.artifacts import NO_REST_SHAPE, Topology, canonical_shape
 from neuspring.core.errors import InputError
 
@@ -24,31 +21,25 @@ REPAIR_SPRINGS = 3
 """Springs given to a node that has none: the fewest that can hold a point in space."""
 
 
-def regions(nodes: np.ndarray, count: int, settings: Clusters) -> np.ndarray:
-    """Region of each node [N], 0 .. count - 1, by agglomerative clustering of nodes [N, 3], m.
+def regions(nodes: np.ndarray, count: int) -> np.ndarray:
+    """Region of each node [N], 0 .. count - 1, by agglomerative clustering (Ward) of nodes [N, 3], m.
 
     Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter (unless
     distances tie, as on a lattice).
-    Raises InputError if there are fewer nodes than regions, or than the connectivity graph needs.
+    Raises InputError if there are fewer nodes than regions.
     """
     if count < 1:
         raise InputError("search.clusters", "at least one region is required", count)
     if count == 1:
         return np.zeros(len(nodes), np.int32)
-    least = max(count, settings.connectivity + 1)
-    if len(nodes) < least:
-        rule = f"{count} regions with connectivity {settings.connectivity} need at least {least} nodes"
-        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions or neighbors.")
+    if len(nodes) < count:
+        rule = f"{count} regions need at least {count} nodes"
+        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions.")
     # Imported here: it takes longer than most commands that need a topology.
     from sklearn.cluster import AgglomerativeClustering
-    from sklearn.neighbors import kneighbors_graph
 
     points = np.asarray(nodes, np.float64)
-    graph = None
-    if settings.connectivity:
-        directed = kneighbors_graph(points, settings.connectivity)
-        graph = directed.maximum(directed.T)
-    clusters = AgglomerativeClustering(n_clusters=count, linkage=settings.linkage, connectivity=graph).fit_predict(points)
+    clusters = AgglomerativeClustering(n_clusters=count, linkage="ward").fit_predict(points)
     # Micrometers: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
     centroids = np.round([points[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
@@ -110,21 +101,6 @@ def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float
     return np.stack([len(nodes) + controller, partner[controller, column]], axis=1)
 
 
-def bending_springs(nodes: np.ndarray, springs: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
-    """Pairs of nodes [N, 3] at a distance within `reach`, m, that none of the springs [S, 2] joins, [B, 2], in ascending order.
-
-    Along a surface or cable two spacings lie across one node between. Bent there by an angle a, at equal spacings h, the spring is
-    shorter by the factor cos(a / 2), and its energy is Y h (1 - cos(a / 2))^2: the body resists bending, softly at first.
-    """
-    nodes = np.asarray(nodes, np.float64)
-    pairs = np.sort(cKDTree(nodes).query_pairs(reach[1], output_type="ndarray"), axis=1).reshape(-1, 2)
-    pairs = pairs[distances(nodes, pairs) >= reach[0]]
-    joined = np.sort(springs, axis=1)
-    number, taken = (each[:, 0].astype(np.int64) * len(nodes) + each[:, 1] for each in (pairs, joined))
-    wanted = np.setdiff1d(number, taken)
-    return np.stack([wanted // len(nodes), wanted % len(nodes)], axis=1)
-
-
 def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
     """Distance of the ends of each spring [S], m, in double precision."""
     ends = points.astype(np.float64)[springs.reshape(-1, 2)]
@@ -183,13 +159,12 @@ def piecewise_topology(
     repair: bool = False,
     rest_shape: np.ndarray = NO_REST_SHAPE,
     controller_rest: str = "rest_shape",
-    bending: tuple[float, float] | None = None,
 ) -> Topology:
     """A radius [m] and a neighbor count (self included) per region; `labels` [N] says which region a node belongs to.
 
     Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
-    any spring, controllers' included, to their nearest nodes. With `bending`, a range of lengths, m, the other object springs are
-    followed by bending springs. Rest lengths: `unloaded`. Raises InputError if a controller coincides with a node.
+    any spring, controllers' included, to their nearest nodes. Rest lengths: `unloaded`. Raises InputError if a controller
+    coincides with a node.
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
@@ -197,13 +172,8 @@ def piecewise_topology(
     outer = controller_springs(points, hands, controller_radius, controller_neighbors)
     if repair:
         inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
-    across = bending_springs(points, inner, bending) if bending else np.zeros((0, 2), inner.dtype)
-    springs = np.concatenate([inner, across, outer])
-    topology = build(np.asarray(nodes), np.asarray(controllers), springs, labels, rest_shape, controller_rest)
-    if not bending:
-        return topology
-    kinds = np.repeat([False, True, False], [len(inner), len(across), len(outer)])
-    return replace(topology, bending=kinds)
+    springs = np.concatenate([inner, outer])
+    return build(np.asarray(nodes), np.asarray(controllers), springs, labels, rest_shape, controller_rest)
 
 
 def uniform_topology(

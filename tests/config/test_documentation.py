@@ -24,7 +24,7 @@ def sections(kind: type) -> set[type]:
     for hint in hints:
         # Sections that may be null, or that a mapping holds.
         hints += [inner for inner in typing.get_args(hint) if not isinstance(inner, str)]
-    return {kind}.union(*(sections(hint) for hint in hints if dataclasses.is_dataclass(hint)))
+    return {kind}.union(*(sections(hint) for hint in hints if config_page.is_section(hint)))
 
 
 def test_every_section_is_on_the_page():
@@ -55,7 +55,6 @@ def test_ranges_are_those_that_the_configuration_enforces():
     shown = {key: words for key, words, _, _ in config_page.fields(config.Fit)}
     assert shown["epochs"] == "integer >= 1"
     assert shown["tail_fraction"] == "number > 0 and < 1"
-    assert shown["betas"] == "[number >= 0 and < 1, number >= 0 and < 1]"
     assert shown["scalar_learning_rate"] == "number > 0 or `null`"
-    assert shown["damping"] == "`fixed`, `homogeneous`, `springs`"
+    assert shown["damping"] == "`fixed`, `homogeneous`"
     assert shown["field"] == "section"

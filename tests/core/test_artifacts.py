@@ -246,7 +246,7 @@ def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
     path = tmp_path / "old.npz"
     topology().save(path)
     with np.load(path) as stored:
-        np.savez(path, **{name: stored[name] for name in stored.files if name not in ("rest_shape", "bending")})
+        np.savez(path, **{name: stored[name] for name in stored.files if name != "rest_shape"})
     assert_same(Topology.load(path), topology())
 
 
@@ -283,17 +283,6 @@ def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
     assert len(topology(rest_shape=np.ones((points, 3))).canonical) == points
     with pytest.raises(InputError, match=rf"topology\.rest_shape: one position per node and controller \({points}\)"):
         topology(rest_shape=np.ones((points - 1, 3)))
-
-
-def test_bending_springs_are_marked_per_spring(tmp_path: Path) -> None:
-    made = topology()
-    assert made.is_bending.tolist() == [False] * len(made.springs)
-    marks = np.arange(len(made.springs)) == 1
-    marked = topology(bending=marks)
-    marked.save(tmp_path / "it.npz")
-    np.testing.assert_array_equal(Topology.load(tmp_path / "it.npz").is_bending, marks)
-    with pytest.raises(InputError, match=rf"topology\.bending: one entry per spring \({len(marks)}\), or none"):
-        topology(bending=marks[:-1])
 
 
 def test_missing_fields(tmp_path: Path) -> None:

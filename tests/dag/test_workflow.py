@@ -157,8 +157,8 @@ def test_bad_configuration_is_explained_before_any_job(project, changes, message
         ({"seeds": [0, 0]}, "seeds: entries must differ"),
         ({"results": "a{b}"}, "results: string should match pattern"),
         ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
-        ({"search": {"ranges": {"object_neighbors": [0, 5]}}}, "object_neighbors: at least 2 is required"),
-        ({"search": {"ranges": {"stiffness": [10.0, 2e5]}}}, "must hold the search's range of 10.0 to 200000.0"),
+        ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
+        ({"search": {"variables": {"stiffness": {"high": 2e5}}}}, "must hold the search's range of 10.0 to 200000.0"),
     ],
 )
 def test_what_the_workflow_checks_first(changes, message):

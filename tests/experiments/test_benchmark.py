@@ -52,7 +52,7 @@ uniform: {clusters: 1, description: one region}
 pieces:
   clusters: 5
   description: five regions
-  settings: {rollouts: 33, clusters: {linkage: single}}
+  settings: {rollouts: 33, polish: {rounds: 1}}
 """
 
 
@@ -77,10 +77,10 @@ def test_methods(tmp_path: Path) -> None:
 def test_searches(tmp_path: Path) -> None:
     found = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
-    made = load("search: {rollouts: 44, sigma: 0.25, clusters: {connectivity: 4}}")
+    made = load("search: {rollouts: 44, sigma: 0.25, polish: {share: 0.5}}")
     merged = tables.search_of(made, found["pieces"], "pieces")
     assert (merged.rollouts, merged.sigma) == (33, 0.25)
-    assert (merged.clusters.linkage, merged.clusters.connectivity) == ("single", 4)
+    assert (merged.polish.rounds, merged.polish.share) == (1, 0.5)
     assert tables.search_of(made, found["uniform"], "uniform") == made.search
 
 
@@ -93,7 +93,7 @@ BAD_SEARCHES = {
 }
 
 
-@pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"ranges": {"drag": [2, 1]}}])
+@pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"variables": {"drag": {"high": 0}}}])
 def test_bad_search_settings(settings: dict[str, Any]) -> None:
     row = SearchRow(clusters=2, description="x", settings=settings)
     with pytest.raises(InputError, match="search pieces, settings: "):
@@ -284,7 +284,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
         benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
     benchmark(tmp_path, methods=["coarse"], **narrow)
-    text = "uniform: {clusters: 1, description: x, settings: {ranges: {stiffness: [10.0, 4.0e+4]}}}\n"
+    text = "uniform: {clusters: 1, description: x, settings: {variables: {stiffness: {high: 4.0e+4}}}}\n"
     write(tmp_path / "soft.yaml", text)
     benchmark(tmp_path, search_table="soft.yaml", **narrow)
 
@@ -594,10 +594,11 @@ def test_the_released_rows_have_the_released_search() -> None:
     made = Benchmark.of({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
     for name, row in made.searches.items():
         search = tables.search_of(made.config, row, name)
-        scales = config.plain(search.scales)
-        assert {scales[name] for name in scales if name not in (*search.absent, *HANDS)} == {"linear"}
+        variables = config.plain(search.variables)
+        assert {one["scale"] for name, one in variables.items() if name not in HANDS} == {"linear"}
         assert (search.lengths, search.polish_rounds, search.fixed) == ("meter", 0, ())
-        assert (search.ranges.stiffness, search.start.stiffness, search.start.object_radius) == ((0.0, 1e5), 3e4, 0.02)
+        assert search.variables.stiffness == config.Variable(0.0, 1e5, 3e4)
+        assert search.variables.object_radius.start == 0.02
     assert tables.search_of(made.config, made.searches["released_quirks"], "x").isolated_nodes == "allow"
 
 

@@ -20,7 +20,7 @@ def test_trial_0_is_the_unchanged_configuration_and_all_values_lie_in_the_space(
     by_slot = slots(folder, tune)
     assert list(by_slot) == [0, 1, 2, 3]
     assert [slot.state for slot in by_slot.values()] == ["complete"] * 4
-    assert by_slot[0].trials[-1].params == {"fit.learning_rate": 1e-4, "fit.horizon": 1, "fit.schedule": "constant"}
+    assert by_slot[0].trials[-1].params == {"fit.learning_rate": 1e-4, "fit.horizon": 1, "fit.damping": "fixed"}
     rates = [slot.trials[-1].params["fit.learning_rate"] for slot in by_slot.values()]
     assert all(1e-4 <= rate <= 1e-1 for rate in rates)
     assert len(set(rates)) == 4
@@ -92,11 +92,11 @@ def test_the_best_overlay_makes_the_best_trial_a_method_row(finished):
     best = min(by_slot.values(), key=lambda slot: slot.trials[-1].value).trials[-1]
     tuned = benchmark.fit_of(bench.config, bench.methods["baseline_small"], "baseline_small")
     assert list(bench.methods) == ["baseline", "baseline_small"]
-    assert (tuned.learning_rate, tuned.horizon, tuned.schedule) == tuple(best.params[f"fit.{n}"] for n in NAMES)
+    assert (tuned.learning_rate, tuned.horizon, tuned.damping) == tuple(best.params[f"fit.{n}"] for n in NAMES)
     assert benchmark.fit_of(bench.config, bench.methods["baseline"], "baseline") == settings().fit
 
 
-NAMES = ("learning_rate", "horizon", "schedule")
+NAMES = ("learning_rate", "horizon", "damping")
 
 
 def test_varied_search_settings_and_clusters_get_a_search_row(folder):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import functools
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from neuspring import config
 from neuspring.core.artifacts import Observations
@@ -53,10 +55,20 @@ def _released() -> dict[str, object]:
     return dict(rows["released_uniform"]["settings"])
 
 
-def released(**changes: object) -> config.Search:
+def variables(ranges: Mapping[str, Any] = {}, scales: Mapping[str, str] = {}, start: Mapping[str, float] = {}) -> dict[str, Any]:
+    """Settings of variables by name: [low, high], scales, starts."""
+    names = {*ranges, *scales, *start}
+    bounds = {name: dict(zip(("low", "high"), ranges[name], strict=True)) for name in ranges}
+    others = {"scale": scales, "start": start}
+    return {name: bounds.get(name, {}) | {key: values[name] for key, values in others.items() if name in values} for name in names}
+
+
+def released(
+    ranges: Mapping[str, Any] = {}, scales: Mapping[str, str] = {}, start: Mapping[str, float] = {}, **changes: object
+) -> config.Search:
     """The settings of the released search (config/searches.yaml); `changes` replace keys, those of sections are merged."""
     values = copy.deepcopy(_released())
-    config.merge(values, changes)
+    config.merge(values, {"variables": variables(ranges, scales, start)} | changes)
     return config.parse(config.Search, values, "test")
 
 
@@ -75,8 +87,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 def start_values() -> dict[str, float]:
     """Physical values near the truth of the default scene, stiffness too low."""
     own = {"object_radius": 0.045, "object_neighbors": 18.0, "stiffness": 6e3, "drag": 1.0, "dashpot": 20.0}
-    search = released(start=own)
-    return {name: float(value) for name, value in config.plain(search.start).items() if name not in search.absent}
+    return {name: one["start"] for name, one in config.plain(released(start=own).variables).items()}
 
 
 def fit_problem(seen: Observations | None = None, values: dict[str, float] | None = None, **changes: object) -> FitProblem:

@@ -23,7 +23,7 @@ OBSERVATIONS = "observations.npz"
 BASE = {
     "scenarios": ["small"],
     # Springs begin far too soft, so that a faster rate is better by a tenth, not by last digits that depend on the processor.
-    "search": {"rollouts": 11, "fixed": ["stiffness"], "start": {"stiffness": 1500.0}},
+    "search": {"rollouts": 11, "fixed": ["stiffness"], "variables": {"stiffness": {"start": 1500.0}}},
     "fit": {"epochs": 3, "checkpoint_every": 1, "learning_rate": 1e-4},
 }
 METHODS = {

@@ -1,6 +1,5 @@
 """Losses in the image: closed forms, gradients through projection and simulator, residuals, searches."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from neuspring.config import Losses
 from neuspring.core.errors import InputError
 from neuspring.twin import hand_paths
 from neuspring.twin.fit import FitProblem, TwinFit
-from neuspring.twin.image_losses import BETA, OPACITY, ImageLoss
+from neuspring.twin.image_losses import BETA, ImageLoss
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.recordings import Recording
 from neuspring.twin.residuals import Residuals
@@ -20,7 +19,7 @@ from neuspring.twin.search import SearchProblem, _motion, candidate, judge, sear
 from neuspring.twin.trials import motions
 from tests.support import colored, small
 
-ALL = Losses(image_track=1.0, silhouette=1.0, alpha=1.0)
+ALL = Losses(image_track=1.0, silhouette=1.0)
 
 
 def loss_of(weights: Losses = ALL) -> ImageLoss:
@@ -79,21 +78,9 @@ def test_nodes_that_leave_object_and_hands_cost_their_distance():
     assert float(moved.distance(1, beyond)) == 0.0
 
 
-def test_coverage_is_that_of_splats_on_the_nodes():
-    loss = loss_of()
-    u = torch.tensor([[10.0, 10.0], [90.0, 90.0]], dtype=torch.float64)
-    lonely = replace(loss, surface=2)
-    far = torch.tensor([[50.0, 10.0]], dtype=torch.float64)
-    assert float(lonely.coverage(u[:1], u)) == pytest.approx(OPACITY, rel=1e-6)
-    assert float(lonely.coverage(far, u)) < 1e-6
-    width = loss.spacing / (2 * loss.size)
-    beside = u[:1] + torch.tensor([width, 0.0])
-    assert float(lonely.coverage(beside, u)) == pytest.approx(OPACITY * math.exp(-0.5), rel=1e-6)
-
-
-@pytest.mark.parametrize("name", ["image_track", "silhouette", "alpha"])
+@pytest.mark.parametrize("name", ["image_track", "silhouette"])
 def test_gradients_through_the_projection(name):
-    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0, "alpha": 0.0} | {name: 1.0})
+    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0} | {name: 1.0})
     loss = loss_of(weights)
     rng = np.random.default_rng(0)
     x = (nodes_of(3) + 0.004 * torch.tensor(rng.normal(size=nodes_of(3).shape))).requires_grad_()
@@ -132,10 +119,10 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
         assert r @ r == pytest.approx(outcome.cost, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["image_track", "silhouette", "alpha"])
+@pytest.mark.parametrize("name", ["image_track", "silhouette"])
 def test_gradients_of_stiffness_through_projection_and_simulator(name):
     """An epoch's gradient against central differences of its loss, in steps so short that no contact begins."""
-    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0, "alpha": 0.0} | {name: 1.0})
+    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0} | {name: 1.0})
     problem = problem_of()
     twin = candidate(problem, problem.decode(problem.encode()))
     twin = replace(twin, simulation=replace(twin.simulation, substeps=100))
@@ -159,7 +146,7 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
 def test_a_search_moves_the_hands_and_reads_training_frames_alone():
     polish = {"variables": ["stiffness", "hand_tilt", "hand_size", "hand_depth"]}
     # The hand rises upright.
-    settings = config.parse(config.Search, {"rollouts": 60, "start": {"hand_tilt": 50.0}, "polish": polish}, "test")
+    settings = config.parse(config.Search, {"rollouts": 60, "variables": {"hand_tilt": {"start": 50.0}}, "polish": polish}, "test")
     problem = problem_of(search=settings)
     found = search(problem, 0)
     true = small.observations().controller_points

@@ -60,7 +60,7 @@ def test_gradients_are_compared_with_epsilon():
     medians = {epsilon: gradient_over_epsilon("springs", epsilon, 1e-12) for epsilon in (1e-15, 1e-3)}
     assert medians[1e-15] == pytest.approx(1e12 * medians[1e-3], rel=1e-2)
     assert medians[1e-15] > 1
-    run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0, betas=(0.0, 0.0))))
+    run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0)))
     run.gradients = []
     run.epoch()
     assert run.gradients == [float(run.parameters.offsets.grad.abs().median())]

@@ -12,9 +12,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from neuspring.twin.field import in_cube, midpoints
-from neuspring.twin.fit import TwinFit
 from neuspring.twin.parameters import CONTACT_SCALARS, TwinParameters, bounded, inward_clamp
-from tests.support import small
 from tests.support.scenes import random_scene, twin_of
 
 STEP = 1e-6
@@ -25,7 +23,7 @@ TRUNCATION = 1e-7
 SINGLE = 1e-6
 """Relative: a few operations in float32, whose rounding is 6e-8."""
 SMALL = {"channels": 3, "hidden": 8, "bands": 2}
-ALL = {"damping": "springs", "rest_length_bound": 0.2, "output_bound": 1.5}
+ALL = {"damping": "homogeneous", "rest_length_bound": 0.2, "output_bound": 1.5}
 
 
 def twin() -> Twin:
@@ -61,11 +59,8 @@ def offsets(trained: TwinParameters, values: torch.Tensor | float) -> TwinParame
 
 TRAINED = {
     "field": ("field", {}, ALL),
-    "linear field": ("field", {"scale": "linear"}, ALL),
     "field of coordinates": ("field", {"triplane": False}, ALL),
-    "field of rest lengths too": ("field", {}, ALL | {"rest_lengths_by": "field"}),
-    "field without controllers": ("field", {"controllers": False, "fourier": "none"}, ALL | {"homogeneous_epochs": 1}),
-    "springs": ("springs", {}, ALL | {"damping": "homogeneous", "homogeneous_epochs": 1}),
+    "springs": ("springs", {}, ALL | {"global_stiffness": True}),
     "common factors": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
     "unloaded shape": ("springs", {}, ALL | {"rest_shape": config.RestShape(handles=3)}),
 }
@@ -83,7 +78,7 @@ def test_gradients_through_simulated_frames_match_differences(name):
     start = twin_of(scene, x, hands[0])
     trained = parameters(kind, start, field, **settings).double()
     trained.start = {key: value.double() for key, value in trained.start.items()}
-    disturb(trained)
+    disturb(trained, seed=1)
     topology, motion = start.topology, torch.tensor(hands)
     solver = FrameSolver(topology.springs, len(x), hands.shape[1], start.simulation, dtype=torch.float64)
     target = torch.tensor(np.random.default_rng(1).normal(size=(4, *x.shape)) * 0.1)
@@ -175,26 +170,25 @@ def test_bounded_is_the_identity_near_zero_and_saturates():
 def test_the_start_is_the_twin_whatever_is_trained(kind):
     """Bit for bit, in single precision."""
     start = twin()
-    values = parameters(kind, start, **ALL, homogeneous_epochs=2).physical()
+    values = parameters(kind, start, **ALL, global_stiffness=True).physical()
     for name, value in twin_tensors(start, "cpu").items():
         assert torch.equal(values[name].detach().expand_as(value), value), name
 
 
 def test_offsets_are_logarithms_of_factors():
-    trained = parameters("springs", damping="springs")
+    trained = parameters("springs")
     values = torch.linspace(-1, 1, len(trained.start["stiffness"]))
-    offsets(trained, torch.stack([values, -values], dim=1))
-    physical = trained.physical()
-    torch.testing.assert_close(physical["stiffness"], trained.start["stiffness"] * values.exp(), rtol=SINGLE, atol=0)
-    torch.testing.assert_close(physical["dashpot"], trained.start["dashpot"] * (-values).exp(), rtol=SINGLE, atol=0)
+    offsets(trained, values[:, None])
+    expected = trained.start["stiffness"] * values.exp()
+    torch.testing.assert_close(trained.physical()["stiffness"], expected, rtol=SINGLE, atol=0)
 
 
-def test_bounds_of_stiffness_dashpots_and_rest_lengths():
-    """However far the offsets go; stiffness and dashpot share a bound, rest lengths have their own."""
+def test_bounds_of_stiffness_and_rest_lengths():
+    """However far the offsets go."""
     for sign in (-1.0, 1.0):
         trained = offsets(parameters("springs", **ALL), sign * 50.0)
         physical = trained.physical()
-        for name, bound in (("stiffness", 1.5), ("dashpot", 1.5), ("rest_lengths", 0.2)):
+        for name, bound in (("stiffness", 1.5), ("rest_lengths", 0.2)):
             factor = torch.tensor(np.exp(sign * bound), dtype=torch.float32)
             torch.testing.assert_close(physical[name], trained.start[name] * factor, rtol=SINGLE, atol=0)
     free = offsets(parameters("springs"), 3.0)
@@ -228,32 +222,6 @@ def test_controllers_springs_may_have_factors_of_their_own():
     assert 0 < inner < len(start["stiffness"])
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_bending_springs_have_factors_of_their_own(apart):
-    """With and without those of controllers' springs; a twin without bending springs has none."""
-    start, settings = twin(), {"global_stiffness": True, "damping": "homogeneous", "controller_factors": apart}
-    inner, count = start.topology.object_spring_count, len(start.topology.springs)
-    marks = (np.arange(count) >= inner - 3) & (np.arange(count) < inner)
-    marked = replace(start, topology=replace(start.topology, bending=marks))
-    trained, without = parameters("springs", marked, **settings), parameters("springs", start, **settings)
-    assert set(trained.factors) - set(without.factors) == {"bending_stiffness", "bending_dashpot"}
-    assert not set(parameters("springs", marked).factors)
-    with torch.no_grad():
-        trained.factors["stiffness"].fill_(math.log(2.0))
-        trained.factors["bending_stiffness"].fill_(math.log(0.1))
-        trained.factors["bending_dashpot"].fill_(math.log(5.0))
-    physical = trained.physical()
-    of_controllers = np.arange(count) >= inner
-    stiffness = np.select([marks, of_controllers & apart], [0.1, 1.0], 2.0)
-    for name, factor in (("stiffness", stiffness), ("dashpot", np.where(marks, 5.0, 1.0))):
-        expected = trained.start[name].numpy() * factor
-        np.testing.assert_allclose(physical[name].detach().numpy(), expected, rtol=SINGLE)
-    # Each factor has the gradient of its own springs: d/dlog f of the sum of f Y is that sum.
-    physical["stiffness"].sum().backward()
-    gradient = float(trained.factors["bending_stiffness"].grad)
-    assert gradient == pytest.approx(float(physical["stiffness"].detach()[torch.tensor(marks)].sum()), rel=SINGLE)
-
-
 def test_the_common_factor_has_no_bound():
     trained = offsets(parameters("springs", global_stiffness=True, output_bound=0.1, stiffness_range=(0.0, 1e9)), 50.0)
     with torch.no_grad():
@@ -275,57 +243,15 @@ def test_fixed_damping_does_not_move():
         assert torch.equal(trained.physical()[name], trained.start[name])
 
 
-def test_damping_of_springs_is_an_output_of_the_field():
-    trained = disturb(parameters(damping="springs"))
-    assert trained.field().shape[1] == 2
-    factor = (trained.physical()["dashpot"] / trained.start["dashpot"]).detach()
-    assert factor.std() > 1e-3
-
-
-def test_a_linear_field_adds_a_fraction_and_stops_at_the_clamp():
-    trained = disturb(parameters(field={"scale": "linear"}), 1.0)
-    f = trained.field()[:, 0]
-    assert f.min() < -1, "some springs would be negative"
-    expected = (trained.start["stiffness"] * (1 + f)).clamp(0, 1e5)
-    torch.testing.assert_close(trained.physical()["stiffness"], expected, rtol=SINGLE, atol=0)
-    assert trained.physical()["stiffness"].min() == 0
-
-
-def test_a_bounded_linear_field_stays_within_the_bound_and_finds_back():
-    trained = disturb(parameters(field={"scale": "linear"}, output_bound=1.5), 1.0)
-    stiffness, start = trained.physical()["stiffness"], trained.start["stiffness"]
-    factor = (stiffness / start).detach()
-    assert factor.min() == pytest.approx(math.exp(-1.5)), "some springs are at the bound"
-    assert factor.max() < math.exp(1.5)
-    lowest = int(factor.argmin())
-    (towards_more,) = torch.autograd.grad(-stiffness[lowest], trained.field.layers[-1].bias, retain_graph=True)
-    (towards_less,) = torch.autograd.grad(stiffness[lowest], trained.field.layers[-1].bias)
-    assert towards_more.abs().sum() > 0
-    assert towards_less.abs().sum() == 0
-
-
-def test_controllers_that_the_field_does_not_cover_keep_their_values_exactly():
-    start = twin()
-    inner = start.topology.object_spring_count
-    for controllers in (False, True):
-        trained = disturb(parameters(field={"controllers": controllers}, **ALL, rest_lengths_by="field"))
-        for name in ("stiffness", "rest_lengths"):
-            same = (trained.physical()[name] == trained.start[name]).detach()
-            assert same[inner:].all() == (not controllers)
-            assert not same[:inner].any()
-    assert parameters(field={"controllers": False}).field.coordinates.shape[0] == inner < len(start.topology.springs)
-
-
-def test_rest_lengths_are_free_per_spring_or_an_output_of_the_field():
-    free, shared = (parameters(**ALL, rest_lengths_by=by) for by in ("springs", "field"))
-    assert (free.field().shape[1], shared.field().shape[1]) == (2, 3)
+def test_rest_lengths_are_free_per_spring_beside_a_field():
+    free = parameters(**ALL)
+    assert free.field().shape[1] == 1
     with torch.no_grad():
         free.rest_offsets[3] = 0.5
     ratio = (free.physical()["rest_lengths"] / free.start["rest_lengths"]).detach()
     assert ratio[3].item() == pytest.approx(np.exp(0.2 * np.tanh(0.5)), rel=SINGLE)
     assert (ratio == 1).sum() == len(ratio) - 1
-    assert shared.rest_offsets is None
-    assert parameters(rest_lengths_by="field").rest_offsets is None, "no bound: not trained"
+    assert parameters().rest_offsets is None, "no bound: not trained"
 
 
 def test_the_field_lives_on_the_rest_shape():
@@ -334,11 +260,6 @@ def test_the_field_lives_on_the_rest_shape():
     shape = np.random.default_rng(0).uniform(0, 1, (points, 3)).astype(np.float32)
     trained = parameters(start=replace(start, topology=replace(start.topology, rest_shape=shape)))
     np.testing.assert_allclose(trained.field.coordinates, in_cube(midpoints(shape, start.topology.springs)), atol=SINGLE)
-
-
-def test_springs_are_covered_whatever_the_field_s_settings():
-    trained = disturb(parameters("springs", field={"controllers": False}))
-    assert not (trained.physical()["stiffness"] == trained.start["stiffness"]).any()
 
 
 def test_stiffness_of_zero_can_grow():
@@ -352,47 +273,18 @@ def test_stiffness_of_zero_can_grow():
 # Training -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("kind", "settings"),
-    [("springs", {}), ("field", {}), ("field", {"weight_decay": 0.1}), ("field", {"plane_smoothness": 10.0})],
-    ids=str,
-)
-def test_a_warm_start_leaves_single_springs_alone(kind, settings):
-    """In the first epochs one factor and the scalars are trained; the epochs after train the springs too."""
-    field = config.SpringField(**SMALL, **settings)
-    fit = config.Fit(epochs=3, learning_rate=1e-2, homogeneous_epochs=2, rest_length_bound=0.05, field=field)
-    run = TwinFit(small.fit_problem(fit=fit, kind=kind))
-    of_springs = {name for name, _ in run.parameters.named_parameters() if not name.startswith(("scalars", "factors"))}
-    start = run.parameters.copy()
-    for epoch in range(2):
-        run.start_epoch(epoch, 1.0)
-        run.epoch()
-    warm = run.parameters.copy()
-    factor = float(np.exp(warm["factors.stiffness"]))
-    assert abs(factor - 1) > 1e-3
-    assert {name for name in start if np.array_equal(start[name], warm[name])} >= of_springs
-    stiffness = run.parameters.physical()["stiffness"].detach()
-    torch.testing.assert_close(stiffness, run.parameters.start["stiffness"] * factor, rtol=SINGLE, atol=0)
-    run.start_epoch(2, 1.0)
-    run.epoch()
-    after = run.parameters.copy()
-    assert not any(np.array_equal(after[name], warm[name]) for name in of_springs)
-    # The factor stays, and is trained on.
-    assert after["factors.stiffness"] not in (0, warm["factors.stiffness"])
-
-
-def test_learning_rates_and_decay_of_each_group():
-    field = {"plane_learning_rate": 0.3, "weight_decay": 0.01}
+def test_learning_rates_of_each_group():
+    field = {"plane_learning_rate": 0.3}
     rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "rest_learning_rate": 0.4}
     trained = parameters(field=field, damping="homogeneous", rest_length_bound=0.1, **rates)
-    expected = {"field.layers": (0.1, 0.01), "field.planes": (0.3, 0.01), "rest_offsets": (0.4, 0.0)}
+    expected = {"field.layers": 0.1, "field.planes": 0.3, "rest_offsets": 0.4}
     names = {tensor: name for name, tensor in trained.named_parameters()}
     for group in trained.groups():
         assert group["lr"] == group["base_rate"]
         for tensor in group["params"]:
             name = names.pop(tensor)
-            wanted = next((values for start, values in expected.items() if name.startswith(start)), (0.2, 0.0))
-            assert (group["lr"], group["weight_decay"]) == wanted, name
+            wanted = next((values for start, values in expected.items() if name.startswith(start)), 0.2)
+            assert group["lr"] == wanted, name
     assert not names, "every trained value belongs to one group"
 
 
@@ -422,14 +314,11 @@ def test_the_penalty_is_the_weighted_roughness():
     assert parameters(field={"plane_smoothness": 0.5, "triplane": False}).penalty() == 0
 
 
-@pytest.mark.parametrize("settings", [{}, {"rest_lengths_by": "field"}], ids=["by springs", "by field"])
-def test_the_prior_of_rest_lengths_is_their_mean_squared_logarithm(settings):
-    trained = disturb(parameters(rest_length_bound=0.2, rest_prior=3.0, **settings))
+def test_the_prior_of_rest_lengths_is_their_mean_squared_logarithm():
+    trained = disturb(parameters(rest_length_bound=0.2, rest_prior=3.0))
     ratio = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"]
     assert trained.penalty().item() == pytest.approx(3.0 * float(ratio.log().square().mean()), rel=1e-4)
     assert trained.penalty() > 0
-    trained.homogeneous = True
-    assert trained.penalty() == 0
 
 
 def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
@@ -441,7 +330,7 @@ def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
 
 @pytest.mark.parametrize("kind", ["springs", "field"])
 def test_copies_restore_everything_that_is_trained(kind):
-    trained = disturb(parameters(kind, **ALL, homogeneous_epochs=1))
+    trained = disturb(parameters(kind, **ALL, global_stiffness=True))
     copy, before = trained.copy(), {name: value.detach().clone() for name, value in trained.physical().items()}
     assert copy.keys() == dict(trained.named_parameters()).keys()
     disturb(trained, seed=1)

@@ -99,7 +99,7 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
 @pytest.mark.parametrize("changes", [{}, {"scales": {"stiffness": "log"}, "ranges": {"stiffness": [1e2, 1e5]}}])
 def test_the_start_is_decoded_to_itself(changes):
     problem = plain(clusters=3, **changes)
-    start = config.plain(problem.search.start)
+    start = {name: one["start"] for name, one in config.plain(problem.search.variables).items()}
     for name, value in problem.decode(problem.encode()).items():
         # Counts are truncated, and 30 may come back as 29.999...
         slack = {"abs": 1} if name.partition(".")[0] in module.INTEGERS else {"rel": CODING}
@@ -122,8 +122,8 @@ def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalized, sca
         problem = plain(clusters=clusters, ranges={"stiffness": [1.0, 1e5]}, scales={"stiffness": scale})
         for name, value in problem.decode(np.array(normalized[: 2 * clusters + 10])).items():
             base = name.partition(".")[0]
-            low, high = getattr(problem.search.ranges, base)
-            assert low * (1 - CODING) <= value <= high * (1 + CODING)
+            variable = getattr(problem.search.variables, base)
+            assert variable.low * (1 - CODING) <= value <= variable.high * (1 + CODING)
             assert base not in module.INTEGERS or value == int(value)
 
 
@@ -135,12 +135,11 @@ def test_what_is_decoded_comes_from_where_it_is_decoded_to(normalized, lengths):
     if lengths == "spacing":
         values["controller_radius"] -= problem.reach
         values |= {name: values[name] / problem.spacing for name in LENGTHS}
-    ranges = problem.search.ranges
-    inside = {name: float(np.clip(value, *getattr(ranges, name))) for name, value in values.items()}
-    back = replace(problem, search=replace(problem.search, start=config.SearchStart(**inside))).encode()
+    settings = {name: getattr(problem.search.variables, name) for name in values}
+    inside = {name: replace(one, start=float(np.clip(values[name], one.low, one.high))) for name, one in settings.items()}
+    back = replace(problem, search=replace(problem.search, variables=replace(problem.search.variables, **inside))).encode()
     for name, u, again in zip(problem.variables, normalized, back, strict=True):
-        low, high = getattr(ranges, name)
-        slack = 1 / (high - low) if name in module.INTEGERS else ROUND_TRIP
+        slack = 1 / (settings[name].high - settings[name].low) if name in module.INTEGERS else ROUND_TRIP
         assert again == pytest.approx(u, abs=slack)
 
 
@@ -151,12 +150,12 @@ def ours(**changes: object) -> SearchProblem:
 
 def test_lengths_are_multiples_of_the_spacing_of_the_nodes():
     problem = ours()
-    values, start = problem.decode(problem.encode()), problem.search.start
+    values, start = problem.decode(problem.encode()), problem.search.variables
     assert problem.spacing == pytest.approx(0.02, rel=0.1), "that of the toy rope"
     for name in ("object_radius", "contact_distance"):
-        assert values[name] == pytest.approx(getattr(start, name) * problem.spacing)
+        assert values[name] == pytest.approx(getattr(start, name).start * problem.spacing)
     # A controller's radius begins where there is a node.
-    assert values["controller_radius"] == pytest.approx(start.controller_radius * problem.spacing + problem.reach)
+    assert values["controller_radius"] == pytest.approx(start.controller_radius.start * problem.spacing + problem.reach)
     lowest = candidate(problem, problem.decode(np.zeros(12)))
     assert len(lowest.topology.springs) > lowest.topology.object_spring_count
 
@@ -184,7 +183,7 @@ def test_small_and_large_units_have_the_same_variables_and_springs():
 
 
 def test_fixed_variables_keep_their_start():
-    problem = ours(rollouts=11, fixed=["drag", "object_radius"], start={"drag": 0.0})
+    problem = ours(rollouts=11, fixed=["drag", "object_radius"], variables={"drag": {"start": 0.0}})
     assert len(problem.variables) == len(problem.encode()) == 10
     assert set(problem.names) - set(problem.variables) == {"drag", "object_radius"}
     assert problem.search.polished == ("stiffness", "dashpot")
@@ -253,7 +252,7 @@ def test_regions_and_candidates_are_made_on_the_rest_shape():
     shape = seen.canonical.astype(np.float64)
     shape[:, 0] += np.maximum(shape[:, 0] - shape[:, 0].mean(), 0)
     problem = small.search_problem(replace(seen, rest_shape=shape), clusters=3)
-    np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3, config.Clusters()))
+    np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3))
     assert (problem.labels != small.search_problem(clusters=3).labels).any()
     regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbors") for r in range(3)}
     topology = candidate(problem, small.start_values() | regional).topology
@@ -266,21 +265,18 @@ def loosely(**changes: object) -> SearchProblem:
     return small.search_problem(search=small.released(ranges={"object_radius": [0.001, 0.05]}, **changes))
 
 
-def test_isolated_nodes_are_repaired_penalized_or_left():
+def test_isolated_nodes_are_repaired_or_left():
     values = small.start_values() | {"object_radius": 0.005}
     count = len(small.observations().nodes)
     left = candidate(loosely(isolated_nodes="allow"), values)
     alone = isolated(count, left.topology.springs)
     assert 0 < len(alone) < count
     assert left.topology.object_spring_count == 0
-    with pytest.raises(NumericalFailure, match=f"{len(alone)} nodes have no spring, the first is node {alone[0]}"):
-        candidate(loosely(isolated_nodes="penalize"), values)
     mended = candidate(loosely(isolated_nodes="repair"), values)
     assert len(isolated(count, mended.topology.springs)) == 0
-    # Nothing is isolated: the three are the same.
-    whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "penalize", "allow")]
-    for other in whole[1:]:
-        np.testing.assert_array_equal(other.topology.springs, whole[0].topology.springs)
+    # Nothing is isolated: both are the same.
+    whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "allow")]
+    np.testing.assert_array_equal(whole[0].topology.springs, whole[1].topology.springs)
 
 
 def test_allow_is_the_released_topology():
@@ -288,17 +284,6 @@ def test_allow_is_the_released_topology():
     released = uniform_topology(seen.nodes, seen.controller_points[0], 0.005, 18, values["controller_radius"], 50)
     topology = candidate(loosely(isolated_nodes="allow"), values).topology
     np.testing.assert_array_equal(topology.springs, released.springs)
-
-
-def test_a_candidate_with_isolated_nodes_is_penalized_not_fatal():
-    """Radii around the distance of the rope's rings: some candidates leave nodes alone."""
-    ranges, start = {"object_radius": [0.001, 0.03]}, {"object_radius": 0.012}
-    settings = small.released(rollouts=11, ranges=ranges, start=start, isolated_nodes="penalize")
-    trace = search(small.search_problem(search=settings), seed=0).trace
-    refused = trace[trace["reason"].str.contains("nodes have no spring")]
-    assert 0 < len(refused) < len(trace)
-    assert (refused["cost"] == PENALTY).all()
-    assert (trace["cost"] < PENALTY).any()
 
 
 # The search -----------------------------------------------------------------------------------------------------------
@@ -632,9 +617,9 @@ def test_threads_of_a_search_have_none_of_torch(monkeypatch):
 
 
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
-    """Some diverge, some are unstable, some have isolated nodes, and the others are judged as if they were alone."""
+    """Some diverge, some are unstable, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
-    settings = small.released(rollouts=22, isolated_nodes="penalize", start={"object_radius": 0.0145, "stiffness": 3e4})
+    settings = small.released(rollouts=22, start={"object_radius": 0.0145, "stiffness": 3e4})
     chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
     check = stability.check
 
@@ -647,7 +632,7 @@ def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     slow = search(replace(chosen, together=1), seed=2).trace
     assert_same_trace(search(chosen, seed=2).trace, slow)
     assert_same_trace(search(replace(chosen, threads=2), seed=2).trace, slow)
-    kinds = {"left": "left the scene in frame", "unstable": "unstable: ", "isolated": "have no spring", "fine": "^$"}
+    kinds = {"left": "left the scene in frame", "unstable": "unstable: ", "fine": "^$"}
     for kind, pattern in kinds.items():
         rows = slow[slow["reason"].str.contains(pattern)]
         assert 0 in set(rows["generation"]), kind

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuspring.config import Clusters
 from neuspring.core.errors import InputError
 from neuspring.twin.topology import (
     MIN_LENGTH,
@@ -198,9 +197,6 @@ def test_labels_and_rest_lengths() -> None:
 
 # Regions --------------------------------------------------------------------------------------------------------------
 
-CLUSTERINGS = [Clusters(linkage=linkage) for linkage in ("ward", "complete", "average", "single")]
-CLUSTERINGS += [Clusters(connectivity=5), Clusters(linkage="single", connectivity=3)]
-
 
 def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
     """Tight groups of nodes along x, 1 m apart: what any clustering must find; the group at the largest x comes first."""
@@ -209,17 +205,14 @@ def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
     return np.concatenate(groups[::-1])
 
 
-@pytest.mark.parametrize("settings", CLUSTERINGS, ids=str)
-@pytest.mark.filterwarnings("ignore:the number of connected components")  # the groups are far apart
-def test_regions_are_found_and_numbered_by_centroid(settings: Clusters) -> None:
-    labels = regions(blocks(), 3, settings)
+def test_regions_are_found_and_numbered_by_centroid() -> None:
+    labels = regions(blocks(), 3)
     assert labels.tolist() == [2] * 4 + [1] * 9 + [0] * 6
 
 
-@pytest.mark.parametrize("settings", CLUSTERINGS, ids=str)
 @pytest.mark.parametrize("count", [1, 2, 5, 25])
-def test_every_region_has_a_node_and_numbers_have_no_gaps(settings: Clusters, count: int) -> None:
-    labels = regions(cloud(1), count, settings)
+def test_every_region_has_a_node_and_numbers_have_no_gaps(count: int) -> None:
+    labels = regions(cloud(1), count)
     assert (labels.shape, labels.dtype) == ((25,), np.int32)
     assert np.unique(labels).tolist() == list(range(count))
 
@@ -228,33 +221,20 @@ def test_equal_coordinates_of_centroids_are_ties() -> None:
     """Groups whose centroids differ in x by rounding alone are ordered by y, then by z."""
     corner = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     places = np.array([[0.1, 1, 0], [0.1 + 1e-9, 0, 1], [0.1, 0, 0]])
-    labels = regions(np.concatenate([corner + place for place in places]), 3, Clusters())
+    labels = regions(np.concatenate([corner + place for place in places]), 3)
     assert labels.tolist() == [2] * 3 + [1] * 3 + [0] * 3
 
 
-def test_a_connectivity_graph_keeps_regions_from_jumping_over_a_gap() -> None:
-    """A hairpin: the ends of its arms are near in space and far along the body."""
-    along = np.linspace(0, 1, 21)
-    arms = [np.stack([x, np.full(21, y), 0 * x], axis=1) for x, y in ((along[::-1], 0.0), (along, 0.2))]
-    bend = np.array([[0, 0.05, 0], [0, 0.1, 0], [0, 0.15, 0]])
-    # A little noise, so that the clustering meets no ties.
-    path = np.concatenate([arms[0], bend, arms[1]]) + np.random.default_rng(0).normal(0, 1e-3, (45, 3))
-    without, joined = (regions(path, 2, Clusters(connectivity=count)) for count in (0, 2))
-    assert without[0] == without[-1]
-    assert np.count_nonzero(np.diff(joined)) == 1, "each region is one piece of the path"
-
-
-@pytest.mark.parametrize(("count", "settings"), [(5, Clusters()), (2, Clusters(connectivity=4))])
-def test_more_regions_or_neighbors_than_nodes_are_refused(count: int, settings: Clusters) -> None:
+def test_more_regions_than_nodes_are_refused() -> None:
     with pytest.raises(InputError, match=r"search\.clusters: .* need at least 5 nodes; received 4 nodes"):
-        regions(cloud(0, 4), count, settings)
-    regions(cloud(0, 5), count, settings)
+        regions(cloud(0, 4), 5)
+    regions(cloud(0, 5), 5)
 
 
 @pytest.mark.parametrize("count", [0, -1])
 def test_less_than_one_region_is_refused(count: int) -> None:
     with pytest.raises(InputError, match=r"search\.clusters"):
-        regions(cloud(0), count, Clusters())
+        regions(cloud(0), count)
 
 
 # Piecewise ------------------------------------------------------------------------------------------------------------
@@ -264,7 +244,7 @@ def test_less_than_one_region_is_refused(count: int) -> None:
 @given(seed=seeds, count=st.integers(2, 5))
 def test_equal_regions_are_the_uniform_topology(seed: int, count: int) -> None:
     nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
-    labels = regions(nodes, count, Clusters())
+    labels = regions(nodes, count)
     pieces = piecewise_topology(nodes, hands, labels, [0.3] * count, [6] * count, 0.5, 4)
     whole = uniform_topology(nodes, hands, 0.3, 6, 0.5, 4)
     np.testing.assert_array_equal(pieces.springs, whole.springs)
@@ -273,16 +253,15 @@ def test_equal_regions_are_the_uniform_topology(seed: int, count: int) -> None:
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=seeds, settings=st.sampled_from([Clusters(), Clusters(linkage="average", connectivity=6)]), repair=st.booleans())
-@pytest.mark.filterwarnings("ignore:the number of connected components")
-def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, settings: Clusters, repair: bool) -> None:
+@given(seed=seeds, repair=st.booleans())
+def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, repair: bool) -> None:
     nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
     order = np.random.default_rng(seed + 2).permutation(25)
     # The last region asks for so little that some nodes are left alone, which `repair` then joins.
     values = [0.35, 0.3, 0.05], [7, 4, 3], 0.4, 3
 
     def graph(points: np.ndarray) -> tuple[np.ndarray, dict[tuple[int, int], float], int]:
-        labels = regions(points, 3, settings)
+        labels = regions(points, 3)
         topology = piecewise_topology(points, hands, labels, *values, repair=repair)
         pairs = [tuple(sorted(pair)) for pair in topology.springs.tolist()]
         return labels, dict(zip(pairs, topology.rest_lengths.tolist(), strict=True)), topology.object_spring_count

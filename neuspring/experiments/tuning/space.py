@@ -79,9 +79,13 @@ class Plan:
         clusters = changed.pop(CLUSTERS)
         settings = config.parse(Config, changed, where)
         low, high = settings.fit.stiffness_range
-        searched = settings.search.ranges.stiffness
-        if self.method.fit and not low <= searched[0] < searched[1] <= high:
-            raise InputError(f"{where}: fit.stiffness_range", f"must hold search.ranges.stiffness = {list(searched)}", [low, high])
+        searched = settings.search.variables.stiffness
+        if self.method.fit and not low <= searched.low < searched.high <= high:
+            raise InputError(
+                f"{where}: fit.stiffness_range",
+                f"must hold search.variables.stiffness, {searched.low} to {searched.high}",
+                [low, high],
+            )
         if not isinstance(clusters, int) or clusters < 1:
             raise InputError(f"{where}: clusters", "must be a whole number, at least 1", clusters)
         return settings, clusters
@@ -184,8 +188,7 @@ def _annotation(name: str) -> Any:
             raise InputError(where, f"{part} must be a setting", None, _suggestion(part, hints))
         kind = hints[part]
     if dataclasses.is_dataclass(kind):
-        remedy = "The number of regions is called clusters." if name == "search.clusters" else ""
-        raise InputError(where, "must be one setting, not a section", [f.name for f in dataclasses.fields(kind)], remedy)
+        raise InputError(where, "must be one setting, not a section", [f.name for f in dataclasses.fields(kind)])
     return kind
 
 

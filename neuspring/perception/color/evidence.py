@@ -15,6 +15,8 @@ from neuspring.perception.color.hands import follow_hands, grips
 from neuspring.perception.results import LiftedTracks, PixelTracks
 from neuspring.twin.hand_paths import depths_of, place
 
+BAND = 30.0
+"""How far from the object points beside it were drawn, pixels."""
 HIDDEN_STRIDE = 3
 """Of the object's pixels beneath hands each third gets a point."""
 
@@ -103,11 +105,11 @@ def lift_color(
 
 
 def silhouettes(labels: np.ndarray, settings: ColorSettings) -> dict[str, np.ndarray]:
-    """`inside`, `beside` and `outside` of ImageObservations from labels [E, H, W]."""
+    """`inside` and `outside` of ImageObservations from labels [E, H, W]."""
     frames, height, width = labels.shape
     rng = np.random.default_rng(0)
     count, cell = settings.samples, settings.cell
-    inside, beside = (np.full((frames, count, 2), np.nan, np.float32) for _ in range(2))
+    inside = np.full((frames, count, 2), np.nan, np.float32)
     outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
     for frame, label in enumerate(labels):
         away = cv2.distanceTransform((label == NOTHING).astype(np.uint8), cv2.DIST_L2, 5)
@@ -118,9 +120,10 @@ def silhouettes(labels: np.ndarray, settings: ColorSettings) -> dict[str, np.nda
             # Out of view: nothing says where it is.
             outside[frame] = 0.0
             continue
-        band = (label == NOTHING) & (from_object <= settings.band)
-        for result, mask in ((inside, label == OBJECT), (beside, band)):
-            y, x = np.nonzero(mask)
-            rows = rng.choice(len(x), min(count, len(x)), replace=False)
-            result[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
-    return {"inside": inside, "beside": beside, "outside": outside}
+        y, x = np.nonzero(label == OBJECT)
+        rows = rng.choice(len(x), min(count, len(x)), replace=False)
+        inside[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
+        # As many points were once drawn beside the object too; without that draw the samples of later frames would be others.
+        near = int(((label == NOTHING) & (from_object <= BAND)).sum())
+        rng.choice(near, min(count, near), replace=False)
+    return {"inside": inside, "outside": outside}

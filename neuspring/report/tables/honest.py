@@ -66,7 +66,7 @@ def _of_runs(runs: Iterable[RunRecord]) -> list[str]:
     first = [values for values in facts if values.get("fit.result.best_epoch", 1) <= 0]
     texts = []
     if ends:
-        texts.append(f"the search ended at an end of its range in {', '.join(sorted(ends))} (search.ranges)")
+        texts.append(f"the search ended at an end of its range in {', '.join(sorted(ends))} (search.variables)")
     if bound:
         most = max(values["fit.result.at_bound"] for values in bound)
         texts.append(f"up to {most:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)")
