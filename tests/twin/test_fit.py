@@ -11,7 +11,6 @@ from scipy.stats import pearsonr
 
 from neuspring import config
 from neuspring.core.artifacts import SCALARS, Observations, Twin
-from neuspring.core.checkpoint import adam_arrays
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.twin import fit as module
