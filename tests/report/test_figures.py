@@ -9,7 +9,6 @@ from matplotlib import image
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 
-from neuspring.config import Clusters
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.report.figures import clusters as figures_clusters
 from neuspring.report.figures import ratios as figures_ratios
@@ -60,7 +59,7 @@ def predicted(shift: float = 0.01) -> Trajectory:
 def regional(count: int) -> Twin:
     """The true twin with a topology of `count` regions."""
     seen, twin = observed(), truth()
-    labels = regions(seen.nodes, count, Clusters())
+    labels = regions(seen.nodes, count)
     radius = list(np.linspace(0.03, 0.045, count))
     topology = piecewise_topology(seen.nodes, seen.controller_points[0], labels, radius, [12] * count, 0.03, 8)
     springs = len(topology.springs)
