@@ -28,13 +28,9 @@ class Appearance(Section):
     the surface of the prior alone; without a prior, as for seen, and the run's notes say so."""
     degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics at the end."""
-    degree_every: Count = 1000
-    """Steps after which the degree in use rises by one; it starts from 0."""
     spacing: NonNegative = 0.0
     """Width of a voxel in pixels of the camera, at the object; there is one first splat per voxel. 0: one per point that was seen,
     as released."""
-    opacity: Fraction = 0.1
-    """Opacity of the first splats."""
     l1: NonNegative = 0.8
     """Weight of the mean absolute difference of colors."""
     dssim: NonNegative = 0.4
@@ -43,23 +39,15 @@ class Appearance(Section):
     """Weight of the mean absolute difference of coverage and mask."""
     depth: NonNegative = 0.001
     """Weight of the mean absolute difference of depth, per m, where depth was measured on the object."""
-    hand_margin: NonNegative = 8.0
-    """Side of the square, pixels, by which the hands' masks are dilated; pixels within are not compared."""
     position_rate: Positive = 1.6e-4
     """Learning rate of means at the start, per extent of the scene. The extent is 1.1 times the largest distance of a camera from
     the cameras' center."""
-    position_rate_end: Positive = 1.6e-6
-    """Learning rate of means after `position_steps`, per extent; log-linear between."""
-    position_steps: Count = 30_000
-    """Steps over which the learning rate of means falls to `position_rate_end`."""
     color_rate: Positive = 2.5e-3
     """Learning rate of the first harmonic; that of the others is a twentieth."""
     opacity_rate: Positive = 0.025
     """Learning rate of opacity logits."""
     scale_rate: Positive = 5e-3
     """Learning rate of log scales."""
-    rotation_rate: Positive = 1e-3
-    """Learning rate of quaternions; it has no effect on isotropic splats."""
     densify_from: Annotated[int, Field(ge=0)] = 500
     """Steps before splats are cloned, split and pruned for the first time."""
     densify_until: Annotated[int, Field(ge=0)] = 15_000
@@ -72,12 +60,6 @@ class Appearance(Section):
     """Size, as part of the extent, above which a splat is split; smaller ones are cloned."""
     prune_opacity: Fraction = 0.005
     """Opacity below which splats are removed."""
-    prune_radius: Positive = 20.0
-    """Radius in a picture, pixels; splats that ever exceeded it are removed, after the first reset of opacities."""
-    prune_size: Positive = 0.1
-    """Size, as part of the extent, above which splats are removed, after the first reset of opacities."""
-    reset_every: Count = 3000
-    """Steps between two resets of all opacities to at most 0.01."""
     most_splats: Count = 300_000
     """Largest number of splats."""
 

@@ -13,10 +13,9 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.splats.draw import moved
+from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
 from neuspring.splats.of_run import splats_file
-from neuspring.splats.train import restricted
 from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.motion import initial_velocity
 
@@ -71,7 +70,9 @@ class Source:
         The source must have all frames: the nodes carry splats from each to the next.
         """
         images, wanted = Images(), set(frames)
-        carried = moved(restricted(self.require_splats(), images.opacity), self.positions[: max(frames) + 1], images, "cpu")
+        carried = skinned_frames(
+            prune_by_opacity(self.require_splats(), images.opacity), self.positions[: max(frames) + 1], images, "cpu"
+        )
         return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
 
     def require_splats(self) -> Splats:

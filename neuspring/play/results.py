@@ -15,9 +15,9 @@ from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.play.guard import MOST_BYTES, inside, require_modest, require_small
+from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.model import Splats
 from neuspring.splats.of_run import APPEARANCE, RENDER, splats_file
-from neuspring.splats.train import restricted
 
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
@@ -68,7 +68,7 @@ class Run:
         require_small(self.splats_path, MOST_BYTES)
         splats = Splats.load(self.splats_path)
         # As pictures (stages/render.py): where a method's own model moves them, all of them are drawn.
-        return splats if self.centers_path else restricted(splats, Images().opacity)
+        return splats if self.centers_path else prune_by_opacity(splats, Images().opacity)
 
     @cached_property
     def centers(self) -> SplatCenters | None:

@@ -1,4 +1,4 @@
-"""How close a rendered picture is to the observed one: PSNR and IoU (SSIM: `neuspring.splats.ssim`), and the masked pair of
+"""How close a rendered picture is to the observed one: PSNR and IoU (SSIM: `neuspring.splats.losses`), and the masked pair of
 pictures that they compare.
 
 Pictures are [..., C, H, W], float32 or float64 in [0, 1]. Bad shapes and types raise InputError.
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.splats.ssim import check_pair, ssim
+from neuspring.splats.losses import check_pair, ssim
 
 __all__ = ["iou", "masked_pair", "psnr", "silhouettes", "ssim"]
 

@@ -15,9 +15,9 @@ from neuspring.perception.results import Masks
 from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
 from neuspring.scores.lpips import Lpips
 from neuspring.splats.draw import COVERED, picture, view_of
+from neuspring.splats.losses import RADIUS, ssim_map
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import Backend, choose_backend
-from neuspring.splats.ssim import RADIUS, ssim_map
 from neuspring.splats.view import View
 
 

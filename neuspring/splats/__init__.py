@@ -2,10 +2,9 @@
 
 | what | modules |
 |---|---|
-| the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors) |
-| drawing | `rasterize`: the entry, and the choice of backend; `reference`: its float64 specification |
-| | `view`, `project`, `tiles`, `blend`, `harmonics`: our backend; `gsplat_backend`: the other |
-| training | `train`, `losses`, `ssim`, `densify` |
-| motion | `skinning`, `skinning_kernels`: nodes carry splats |
+| the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors); `harmonics`: colors by direction |
+| drawing | `rasterize`: the entry, the choice of backend, gsplat, the float64 specification; `view`, `blend`: our backend |
+| training | `train`, `losses` |
+| motion | `skinning`: nodes carry splats |
 | pictures of a twin | `draw` |
 """

@@ -1,4 +1,4 @@
-"""Front-to-back blending of ellipses in tiles, differentiable: Warp kernels, the same on CPU and CUDA, and their launcher.
+"""Lists of ellipses per tile, and their front-to-back blending, differentiable: Warp kernels, the same on CPU and CUDA.
 
 For a pixel at u and the ellipses i of its tile in order of depth, with conic Q_i, mean m_i, opacity o_i and feature f_i [4],
 
@@ -13,14 +13,49 @@ T <= transmittance_min. The adjoint goes back to front and takes T_i = T_(i+1) /
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import warp as wp
 
 from neuspring.core.device import load, start_warp
-from neuspring.splats.tiles import Tiles
 from neuspring.splats.view import Limits, View
+
+TILE_SIDE = {"cpu": 8, "cuda": 16}
+"""Pixels. A pixel's thread looks at all ellipses of its tile: small tiles make many lists, large tiles many looks in vain."""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Lists of ellipses, one per tile, row by row."""
+
+    side: int
+    across: int
+    starts: torch.Tensor
+    """[tiles + 1] int32: where each tile's list begins."""
+    members: torch.Tensor
+    """[total] int32: ellipses, nearest first within a tile."""
+
+
+@torch.no_grad()
+def tiles(depths: torch.Tensor, boxes: torch.Tensor, view: View, side: int | None = None) -> Tiles:
+    """Lists for ellipses with depths [M] and boxes [M, 4], all of which touch the picture. Equal depths keep their order."""
+    device = depths.device
+    side = side or TILE_SIDE[device.type]
+    across, down = -(-view.width // side), -(-view.height // side)
+    order = torch.sort(depths, stable=True).indices
+    low = torch.div(boxes[order, :2], side, rounding_mode="floor")
+    span = torch.div(boxes[order, 2:] - 1, side, rounding_mode="floor") - low + 1
+    counts = (span[:, 0] * span[:, 1]).long()
+    # One entry per ellipse and tile that it touches, still in order of depth; a stable sort by tile keeps that order in each list.
+    owner = torch.repeat_interleave(torch.arange(len(order), device=device), counts)
+    inside = torch.arange(len(owner), device=device) - (torch.cumsum(counts, 0) - counts)[owner]
+    wide = span[owner, 0].long()
+    number = (low[owner, 1] + inside // wide) * across + low[owner, 0] + inside % wide
+    number, by_tile = torch.sort(number.int(), stable=True)
+    starts = torch.searchsorted(number, torch.arange(across * down + 1, device=device, dtype=torch.int32), out_int32=True)
+    return Tiles(side, across, starts.contiguous(), order[owner[by_tile]].int().contiguous())
 
 
 def blend(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring.config.images import Images
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import Camera
 from neuspring.splats.model import Gaussians, Splats
@@ -32,7 +32,15 @@ def view_of(camera: Camera, images: Images, device: str, borrowed: Camera | None
     return View.of(camera.camera_to_world, intrinsics, camera.width, camera.height, device, shift)
 
 
-def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
+def prune_by_opacity(splats: Splats, opacity: float) -> Splats:
+    """Splats above an opacity. Raises NumericalFailure where none is."""
+    dense = 1 / (1 + np.exp(-splats.opacity_logits)) > opacity
+    if not dense.any():
+        raise NumericalFailure(f"appearance: no splat has an opacity above {opacity}")
+    return Splats(**{field.name: getattr(splats, field.name)[dense] for field in fields(Splats)})
+
+
+def skinned_frames(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
     """The splats in every frame of a trajectory [F, N, 3], m."""
     start = Gaussians.of(splats, device)
     quirk = images.released_quirks.degenerate_skinning
@@ -41,7 +49,7 @@ def moved(splats: Splats, positions: np.ndarray, images: Images, device: str) ->
         yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
 
 
-def placed(splats: Splats, centers: np.ndarray, device: str) -> Iterator[Gaussians]:
+def frames_from_centers(splats: Splats, centers: np.ndarray, device: str) -> Iterator[Gaussians]:
     """The splats with the centers [F, G, 3], m, in every frame; their orientations stay."""
     start = Gaussians.of(splats, device)
     if centers.shape[1] != len(splats.means):
@@ -59,7 +67,7 @@ def picture(gaussians: Gaussians, view: View, backend: Backend, background: tupl
     return np.asarray((255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy())
 
 
-def turned(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
+def orbit_view(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
     """RGB [H, W, 3] uint8 over white: the view `like`, turned about the object by `angle` degrees."""
     center = gaussians.means.median(0).values.double().cpu().numpy()
     turn = Rotation.from_euler("z", angle, degrees=True)

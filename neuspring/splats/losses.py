@@ -1,9 +1,15 @@
-"""What training of splats minimizes, on one view of frame 0.
+"""SSIM of pictures, and what training of splats minimizes, on one view of frame 0.
 
     L = l1 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
 
 C color, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
 object. Means are over all pixels. What hands hide is not compared: there everything is zero on both sides.
+
+SSIM (Wang et al. 2004) of a and b, with means, variances and covariance under a Gaussian window (11x11, sigma 1.5), per channel:
+(2 mu_a mu_b + C1)(2 sigma_ab + C2) / ((mu_a^2 + mu_b^2 + C1)(sigma_a^2 + sigma_b^2 + C2)), C1 = 0.01^2, C2 = 0.03^2, data range 1.
+With s = a + b and d = a - b: 4 mu_a mu_b = mu_s^2 - mu_d^2, 2 (mu_a^2 + mu_b^2) = mu_s^2 + mu_d^2, and so for the variances.
+Outside the picture everything is zero, as in the released code of Gaussian splatting and PhysTwin.
+Pictures are [..., C, H, W], float32 or float64 in [0, 1]. Bad shapes and types raise InputError.
 """
 
 from __future__ import annotations
@@ -13,15 +19,64 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from torch.nn.functional import conv2d
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
 from neuspring.splats.rasterize import Rendered
-from neuspring.splats.ssim import ssim_map
 from neuspring.splats.view import View
 
+RADIUS = 5
+"""px: the window is 2 RADIUS + 1 wide."""
+SIGMA = 1.5
+"""px."""
+C1 = 0.01**2
+C2 = 0.03**2
+HAND_MARGIN, REFERENCE_WIDTH = 8.0, 848
+"""Hands are dilated by a square of so many pixels in an image of this width; pixels within are not compared."""
 WINDOW = 12
 """Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost l1 and mask alone."""
+
+
+def check_pair(where: str, a: torch.Tensor, b: torch.Tensor) -> None:
+    """Raise InputError, naming `where`, for pictures that cannot be compared."""
+    if a.ndim < 3 or a.shape != b.shape:
+        raise InputError(where, "two pictures [..., C, H, W] of the same shape are needed", f"{tuple(a.shape)}, {tuple(b.shape)}")
+    if a.dtype != b.dtype or a.dtype not in (torch.float32, torch.float64):
+        raise InputError(where, "both pictures must be float32 or both float64", f"{a.dtype}, {b.dtype}")
+
+
+def _blur(pictures: torch.Tensor) -> torch.Tensor:
+    """Mean of every [H, W] plane under the Gaussian window, zeros outside: rows, then columns."""
+    offsets = torch.arange(-RADIUS, RADIUS + 1, device=pictures.device, dtype=torch.float64)
+    window = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
+    window = (window / window.sum()).to(pictures.dtype)
+    # One call with a group per plane: much faster on CPU than a batch of one-channel pictures.
+    planes = pictures.reshape(1, -1, *pictures.shape[-2:])
+    groups = planes.shape[1]
+    planes = conv2d(planes, window.expand(groups, 1, 1, -1), padding=(0, RADIUS), groups=groups)
+    planes = conv2d(planes, window[:, None].expand(groups, 1, -1, 1), padding=(RADIUS, 0), groups=groups)
+    return planes.reshape(pictures.shape)
+
+
+def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """SSIM at every pixel and channel [..., C, H, W]; differentiable."""
+    check_pair("ssim", a, b)
+    # In sum and difference the formula needs four means instead of five, and keeps its digits in single precision: the rounding
+    # of the large variance, that of the sum, cancels between numerator and denominator.
+    total, difference = a + b, a - b
+    mean_total, mean_difference, total_squared, difference_squared = _blur(
+        torch.stack((total, difference, total * total, difference * difference))
+    )
+    p, q = mean_total * mean_total, mean_difference * mean_difference
+    u, v = total_squared - p, difference_squared - q
+    ratio: torch.Tensor = ((p - q + 2 * C1) * (u - v + 2 * C2)) / ((p + q + 2 * C1) * (u + v + 2 * C2))
+    return ratio
+
+
+def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """SSIM: the mean of its map; differentiable. 1 for equal pictures, less for all others."""
+    return ssim_map(a, b).mean()
 
 
 @dataclass(frozen=True, eq=False)

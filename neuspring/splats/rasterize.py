@@ -15,10 +15,8 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
-from neuspring.splats.blend import blend
-from neuspring.splats.project import boxes, project, radii
-from neuspring.splats.tiles import tiles
-from neuspring.splats.view import LIMITS, Limits, View
+from neuspring.splats.blend import blend, tiles
+from neuspring.splats.view import LIMITS, Limits, View, boxes, project, radii
 
 Backend = Literal["warp", "gsplat"]
 LEAST_ALPHA = 1e-10
@@ -66,9 +64,7 @@ def rasterize(
     view.require_valid()
     _require_splats(means, quaternions, scales, opacities, colors, degree)
     if backend == "gsplat":
-        from neuspring.splats import gsplat_backend
-
-        return gsplat_backend.rasterize(means, quaternions, scales, opacities, colors, view, degree, background, limits)
+        return _by_gsplat(means, quaternions, scales, opacities, colors, view, degree, background, limits)
     ellipses = project(means, quaternions, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
     visible = torch.nonzero(touching).squeeze(1)
@@ -86,6 +82,94 @@ def rasterize(
     rgb = total[..., :3] + left[..., None] * total.new_tensor(background)
     depth = total[..., 3] / alpha.clamp_min(LEAST_ALPHA)
     return Rendered(rgb, alpha, depth, index, flat, radii(ellipses)[visible], "warp")
+
+
+def _by_gsplat(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    view: View,
+    degree: int | None,
+    background: tuple[float, float, float],
+    limits: Limits,
+) -> Rendered:
+    """As `rasterize`. Thresholds of coverage cannot be set: since gsplat 1.5 no splat covers more than 0.99, ours 0.999."""
+    from gsplat import rasterization
+
+    own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
+    if own != (LIMITS.alpha_min, LIMITS.alpha_max, LIMITS.transmittance_min):
+        raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
+    picture, alpha, facts = rasterization(
+        means,
+        torch.nn.functional.normalize(quaternions, dim=-1),
+        scales,
+        opacities,
+        colors,
+        view.world_to_camera[None].to(means),
+        view.intrinsics[None].to(means),
+        view.width,
+        view.height,
+        near_plane=limits.near,
+        far_plane=limits.far,
+        eps2d=limits.blur,
+        sh_degree=degree,
+        packed=False,
+        render_mode="RGB+ED",
+    )
+    flat = facts["means2d"]
+    if flat.requires_grad:
+        flat.retain_grad()
+    # Radii are one per axis since gsplat 1.5, one before.
+    radii = facts["radii"][0].float()
+    radii = radii.amax(-1) if radii.ndim == 2 else radii
+    index = torch.nonzero(radii > 0).squeeze(1)
+    cover = alpha[0, ..., 0]
+    rgb = picture[0, ..., :3] + (1 - cover)[..., None] * picture.new_tensor(background)
+    return Rendered(rgb, cover, picture[0, ..., 3], index, flat, radii[index], "gsplat")
+
+
+def reference(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    view: View,
+    *,
+    degree: int | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    limits: Limits = LIMITS,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The specification: rgb [H, W, 3], alpha [H, W] and depth [H, W], arguments as in `rasterize`.
+
+    Every pixel looks at every splat, in plain torch, meant for float64. Slow and memory-hungry.
+    """
+    ellipses = project(means, quaternions, scales, view, limits)
+    order = torch.sort(ellipses.depths.detach(), stable=True).indices
+    index, flat, conics, depths = ellipses.index[order], ellipses.means[order], ellipses.conics[order], ellipses.depths[order]
+    shade = colors[index]
+    if degree is not None:
+        shade = harmonics.colors(shade, means[index] - view.position.to(means), degree)
+    rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
+    pixels = torch.stack([columns, rows], dim=-1).reshape(-1, 1, 2).to(means) + 0.5
+    offset = pixels - flat
+    a, b, c = conics.unbind(-1)
+    exponent = 0.5 * (a * offset[..., 0] ** 2 + c * offset[..., 1] ** 2) + b * offset[..., 0] * offset[..., 1]
+    raw = opacities[index] * torch.exp(-exponent)
+    alpha = torch.where(raw > limits.alpha_max, torch.full_like(raw, limits.alpha_max), raw)
+    alpha = torch.where(alpha < limits.alpha_min, torch.zeros_like(alpha), alpha)
+    after = torch.cumprod(1 - alpha, dim=1)
+    # Transmittance only falls, so all splats behind the first that would leave too little are left out as well.
+    alpha = torch.where(after > limits.transmittance_min, alpha, torch.zeros_like(alpha))
+    through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)
+    weights = alpha * through[:, :-1]
+    cover = 1 - through[:, -1]
+    rgb = weights @ shade + through[:, -1:] * weights.new_tensor(background)
+    depth = (weights @ depths) / cover.clamp_min(LEAST_ALPHA)
+    size = (view.height, view.width)
+    return rgb.reshape(*size, 3), cover.reshape(size), depth.reshape(size)
 
 
 def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Backend:

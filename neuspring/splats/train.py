@@ -1,11 +1,11 @@
 """Training of splats on the views of frame 0: Adam, one view per step, more harmonics in stages, adaptive density.
 
-After section 3.1 of the released appearance; the numbers are settings (`neuspring.config.images.Appearance`).
+Density adapts after Kerbl et al. 2023, section 5.2: a splat whose place in the picture has a mean gradient above a threshold is too
+coarse. Small ones are cloned, large ones split; faint and huge ones go. The other steps are those of the released appearance.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,20 +18,32 @@ from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.text import Progress
 from neuspring.splats import harmonics
-from neuspring.splats.densify import Statistics, densify
-from neuspring.splats.losses import Shot, loss
+from neuspring.splats.losses import REFERENCE_WIDTH, Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterize import Backend
+from neuspring.splats.rasterize import Backend, Rendered
+from neuspring.splats.view import rotations
 
 NEAREST = 3
 """The first scale of a splat is its mean distance to this many neighbors."""
-RESET_OPACITY = 0.01
+FIRST_OPACITY = 0.1
+RESET_OPACITY, RESET_EVERY = 0.01, 3000
+"""Steps between two resets of all opacities to at most this."""
+DEGREE_EVERY = 1000
+"""Steps after which the degree of the harmonics in use rises by one; it starts from 0."""
+POSITION_RATE_END, POSITION_STEPS = 1.6e-6, 30_000
+"""Learning rate of means after so many steps, per extent; log-linear before."""
+ROTATION_RATE = 1e-3
+PRUNE_RADIUS, PRUNE_SIZE = 20.0, 0.1
+"""After the first reset of opacities, splats are removed whose radius ever exceeded so many pixels, or this part of the extent."""
 RECORD_EVERY = 10
 """Steps between entries of the history."""
 SMALLEST = 1e-6
 """m: least first scale."""
 ADAM_EPSILON = 1e-15
 MOMENTS = ("exp_avg", "exp_avg_sq")
+CHILDREN = 2
+SHRINK = 1.6
+"""A child of a split is smaller than its parent by this factor."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +77,7 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
         log_scales=np.tile(np.log(scale)[:, None], (1, 1 if settings.isotropic else 3)),
-        opacity_logits=np.full(count, math.log(settings.opacity / (1 - settings.opacity))),
+        opacity_logits=np.full(count, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
         harmonics=shades,
     )
 
@@ -93,7 +105,7 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
     last_change = min(settings.densify_until, settings.iterations)
     for step, shot in zip(range(1, settings.iterations + 1), _shuffled(shots, generator), strict=False):
         optimizer.schedule(step)
-        rendered = optimizer.gaussians.draw(shot.view, degree=(step - 1) // settings.degree_every, backend=backend)
+        rendered = optimizer.gaussians.draw(shot.view, degree=(step - 1) // DEGREE_EVERY, backend=backend)
         value = loss(rendered, shot, settings)
         number = float(value.detach())
         value.backward()  # type: ignore[no-untyped-call]
@@ -105,12 +117,12 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
             for name, entry in {"step": step, "loss": number, "splats": len(optimizer)}.items():
                 history[name].append(float(entry))
         if settings.densify_from < step < last_change and step % settings.densify_every == 0:
-            splats, after_reset = vars(optimizer.gaussians), step > settings.reset_every
+            splats, after_reset = vars(optimizer.gaussians), step > RESET_EVERY
             stay, added = densify(splats, statistics, settings, optimizer.extent, after_reset, generator)
             optimizer.replace(stay, added)
             optimizer.require_usable(step)
             statistics = Statistics.empty(optimizer.gaussians.means)
-        if step % settings.reset_every == 0 and step < last_change:
+        if step % RESET_EVERY == 0 and step < last_change:
             optimizer.reset_opacities()
         progress.update(step, f"loss {number:.4f}, {len(optimizer)} splats")
     return Trained(optimizer.gaussians.stored(), history, len(start.means))
@@ -130,7 +142,7 @@ class _Optimizer:
         values = _parameters(vars(gaussians))
         rates = {
             "means": settings.position_rate * extent,
-            "quaternions": settings.rotation_rate,
+            "quaternions": ROTATION_RATE,
             "log_scales": 0.0 if settings.fixed_radius else settings.scale_rate,
             "opacity_logits": settings.opacity_rate,
             "base": settings.color_rate,
@@ -152,8 +164,8 @@ class _Optimizer:
 
     def schedule(self, step: int) -> None:
         """Lower the learning rate of the means, log-linearly."""
-        done = min(step / self.settings.position_steps, 1.0)
-        rate = math.exp((1 - done) * math.log(self.settings.position_rate) + done * math.log(self.settings.position_rate_end))
+        done = min(step / POSITION_STEPS, 1.0)
+        rate = math.exp((1 - done) * math.log(self.settings.position_rate) + done * math.log(POSITION_RATE_END))
         self._adam.param_groups[0]["lr"] = rate * self.extent
 
     def step(self) -> None:
@@ -198,9 +210,76 @@ def _parameters(splats: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return others | {"base": shades[:, :1], "bands": shades[:, 1:]}
 
 
-def restricted(splats: Splats, opacity: float) -> Splats:
-    """Splats above an opacity. Raises NumericalFailure where none is."""
-    dense = 1 / (1 + np.exp(-splats.opacity_logits)) > opacity
-    if not dense.any():
-        raise NumericalFailure(f"appearance: no splat has an opacity above {opacity}")
-    return Splats(**{field.name: getattr(splats, field.name)[dense] for field in dataclasses.fields(Splats)})
+@dataclass
+class Statistics:
+    """What pictures showed of each splat since their number last changed."""
+
+    pull: torch.Tensor
+    """[N] sum of gradients of the place in the picture, per half picture."""
+    seen: torch.Tensor
+    """[N] number of pictures that show it."""
+    radius: torch.Tensor
+    """[N] largest, as a part of the picture's width."""
+
+    @classmethod
+    def empty(cls, like: torch.Tensor) -> Statistics:
+        """For splats with means `like` [N, 3]."""
+        return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
+
+    @torch.no_grad()
+    def add(self, rendered: Rendered, width: int, height: int) -> None:
+        """Account for a picture after its backward pass."""
+        gradient = rendered.means.grad
+        if gradient is None:
+            return
+        if rendered.backend == "gsplat":
+            gradient = gradient[0, rendered.index]
+        half = gradient.new_tensor([width / 2, height / 2])
+        self.pull.index_add_(0, rendered.index, (gradient * half).norm(dim=1))
+        self.seen.index_add_(0, rendered.index, torch.ones_like(rendered.radii))
+        self.radius[rendered.index] = torch.maximum(self.radius[rendered.index], rendered.radii / width)
+
+
+@torch.no_grad()
+def densify(
+    splats: Mapping[str, torch.Tensor],
+    statistics: Statistics,
+    settings: Appearance,
+    extent: float,
+    after_reset: bool,
+    generator: torch.Generator,
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Which splats stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
+
+    `extent`, m, is the size of the scene; `after_reset` also removes splats that are huge.
+    """
+    size = torch.exp(splats["log_scales"]).amax(1)
+    mean_pull = statistics.pull / statistics.seen.clamp_min(1)
+    coarse = mean_pull > settings.densify_gradient
+    room = max(settings.most_splats - len(size), 0)
+    # The coarsest ones first where there is no room for all.
+    if int(coarse.sum()) > room:
+        coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean_pull, room).indices, True) & coarse
+    # A split makes smaller splats, so splats of a fixed radius are cloned.
+    split = coarse & (size > settings.split_size * extent) & (settings.fixed_radius is None)
+    added = {name: tensor[coarse & ~split] for name, tensor in splats.items()}
+    if split.any():
+        children = {name: tensor[split].repeat_interleave(CHILDREN, 0) for name, tensor in splats.items()}
+        noise = torch.randn(children["means"].shape, generator=generator).to(children["means"])
+        offsets = noise * torch.exp(children["log_scales"])
+        children["means"] = children["means"] + torch.einsum("nij,nj->ni", rotations(children["quaternions"]), offsets)
+        children["log_scales"] = children["log_scales"] - torch.log(size.new_tensor(SHRINK))
+        added = {name: torch.cat([added[name], children[name]]) for name in added}
+    gone = split | _superfluous(splats, settings, extent, after_reset)
+    if after_reset and settings.fixed_radius is None:
+        gone |= statistics.radius > PRUNE_RADIUS / REFERENCE_WIDTH
+    stay = ~_superfluous(added, settings, extent, after_reset)
+    return ~gone, {name: tensor[stay] for name, tensor in added.items()}
+
+
+def _superfluous(splats: Mapping[str, torch.Tensor], settings: Appearance, extent: float, after_reset: bool) -> torch.Tensor:
+    """Faint splats [N], after a reset also huge ones."""
+    faint = torch.sigmoid(splats["opacity_logits"]) < settings.prune_opacity
+    if not after_reset or settings.fixed_radius:
+        return faint
+    return faint | (torch.exp(splats["log_scales"]).amax(1) > PRUNE_SIZE * extent)

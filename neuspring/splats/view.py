@@ -1,4 +1,10 @@
-"""How a picture is taken: a pinhole view, and the thresholds of the rasterizer."""
+"""From splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, and the projection.
+
+With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
+(fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
+slopes px/pz, py/pz clamped to a margin around the picture (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
+Plain torch on any device and precision: gradients come by differentiation, through those limits too.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,11 @@ import numpy as np
 import torch
 
 from neuspring.core.errors import InputError
+
+MARGIN = 0.3
+"""Slopes in the Jacobian may leave the picture by this part of its half width or height."""
+SAFETY = 1e-3
+"""Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
 
 
 @dataclass(frozen=True)
@@ -66,3 +77,82 @@ class View:
             raise InputError("view", "width and height must be at least one pixel", (self.width, self.height))
         if not (torch.isfinite(self.world_to_camera).all() and torch.isfinite(self.intrinsics).all()):
             raise InputError("view", "pose and intrinsics must be finite")
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The splats between near and far plane, as ellipses."""
+
+    index: torch.Tensor
+    """[M] int64: which splats."""
+    means: torch.Tensor
+    """[M, 2] px."""
+    covariances: torch.Tensor
+    """[M, 3] xx, xy, yy, px^2."""
+    conics: torch.Tensor
+    """[M, 3] their inverses."""
+    depths: torch.Tensor
+    """[M] m along the optical axis."""
+
+
+def rotations(quaternions: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], w first, of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor, view: View, limits: Limits) -> Projected:
+    """Ellipses of splats with means [N, 3] m, quaternions [N, 4], standard deviations [N, 3] m."""
+    turn, shift = view.world_to_camera[:3, :3].to(means), view.world_to_camera[:3, 3].to(means)
+    local = means @ turn.T + shift
+    index = torch.nonzero((local[:, 2] >= limits.near) & (local[:, 2] <= limits.far)).squeeze(1)
+    x, y, z = local[index].unbind(-1)
+    k = view.intrinsics.to(means)
+    (fx, cx), (fy, cy) = (k[0, 0], k[0, 2]), (k[1, 1], k[1, 2])
+    flat = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    a, b = _limited(x / z, fx, cx, view.width), _limited(y / z, fy, cy, view.height)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * a / z, zero, fy / z, -fy * b / z], dim=-1).reshape(-1, 2, 3)
+    # cov = (J R Rq S)(J R Rq S)^T: a product of one factor with itself stays positive in single precision.
+    factor = jacobian @ turn @ rotations(quaternions[index]) * scales[index, None, :]
+    u, v = factor.unbind(1)
+    xx = (u * u).sum(-1) + limits.blur
+    xy = (u * v).sum(-1)
+    yy = (v * v).sum(-1) + limits.blur
+    # (u.u + blur)(v.v + blur) - (u.v)^2 = |u x v|^2 + blur (u.u + v.v) + blur^2 without the cancellation of long needles.
+    area: torch.Tensor = torch.linalg.cross(u, v)
+    determinant = (area * area).sum(-1) + limits.blur * ((u * u).sum(-1) + (v * v).sum(-1)) + limits.blur * limits.blur
+    conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
+    return Projected(index, flat, torch.stack([xx, xy, yy], dim=-1), conics, z)
+
+
+def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, size: int) -> torch.Tensor:
+    margin = MARGIN * 0.5 * size / focal
+    return slope.clamp(-center / focal - margin, (size - center) / focal + margin)
+
+
+@torch.no_grad()
+def boxes(projected: Projected, opacities: torch.Tensor, view: View, limits: Limits) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which projected splats touch the picture [M] bool, and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
+
+    alpha >= alpha_min needs a Mahalanobis square of at most 2 ln(opacity / alpha_min), an ellipse with these half widths.
+    """
+    reach = 2 * torch.log(opacities / limits.alpha_min)
+    half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + SAFETY)
+    size = torch.tensor([view.width, view.height], device=half.device, dtype=half.dtype)
+    low = torch.ceil(projected.means - half - 0.5).clamp_min(0.0).minimum(size)
+    high = (torch.floor(projected.means + half - 0.5) + 1).clamp_min(0.0).minimum(size)
+    seen = (reach >= 0) & (high > low).all(dim=1)
+    return seen, torch.cat([low, high], dim=1).to(torch.int32)
+
+
+def radii(projected: Projected) -> torch.Tensor:
+    """Three standard deviations along the long axis of each ellipse [M], px."""
+    xx, xy, yy = projected.covariances.detach().unbind(-1)
+    largest = 0.5 * (xx + yy) + torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp_min(0.0))
+    return 3 * torch.sqrt(largest)

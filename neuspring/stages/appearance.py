@@ -28,9 +28,8 @@ from neuspring.perception.lift import clean_masks, lifting_cameras
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior, masks_of_cameras
 from neuspring.report.figures import images as figures
 from neuspring.scores.images import psnr
-from neuspring.splats.densify import REFERENCE_WIDTH
-from neuspring.splats.draw import COVERED, picture, turned, view_of
-from neuspring.splats.losses import Shot
+from neuspring.splats.draw import COVERED, orbit_view, picture, view_of
+from neuspring.splats.losses import HAND_MARGIN, REFERENCE_WIDTH, Shot
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.train import NEAREST, first_splats, train
@@ -120,7 +119,7 @@ def run(
     write_table(pd.DataFrame(trained.history).melt("step", var_name="metric", value_name="value"), files["history"])
     gaussians = Gaussians.of(trained.splats, device)
     views = {shot.name: picture(gaussians, shot.view, backend) for shot in shots}
-    around = {angle: turned(gaussians, shots[0].view, backend, angle) for angle in (90, 180, 270)}
+    around = {angle: orbit_view(gaussians, shots[0].view, backend, angle) for angle in (90, 180, 270)}
     figures.appearance_figure(shots, views, around, files["picture"])
     behind = {shot.name: _behind_hands(shot, views[shot.name]) for shot in shots}
     facts: dict[str, Any] = {
@@ -164,7 +163,7 @@ def _shots(
     shots = []
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
-        margin = images.appearance.hand_margin * camera.width / REFERENCE_WIDTH
+        margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
         seen = (capture.color(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
         shot = Shot.of(name, view_of(camera, images, device), *seen, margin)
         if shot is None:

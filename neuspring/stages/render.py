@@ -28,9 +28,8 @@ from neuspring.report.video import Video
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.pictures import Scored, picture_scores
-from neuspring.splats.draw import moved, placed, turned
+from neuspring.splats.draw import frames_from_centers, orbit_view, prune_by_opacity, skinned_frames
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.train import restricted
 from neuspring.stages import options as shared
 from neuspring.stages.lengths import require_length
 
@@ -119,7 +118,7 @@ def run(
                         videos["video"].add(film.compared(frame, pair))
             if videos and frame < predicted:
                 angle = 360 * frame / predicted
-                videos["turntable"].add(film.turned(frame, turned(gaussians, scored.views[first], scored.backend, angle)))
+                videos["turntable"].add(film.turned(frame, orbit_view(gaussians, scored.views[first], scored.backend, angle)))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
     files |= record.beside(frames="frames.parquet", strip="images.png")
@@ -149,9 +148,9 @@ def posed(
     splats = Splats.load(StageRecord.load(appearance_record).file("splats", appearance_record))
     rollout = StageRecord.load(rollout_record)
     if "centers" not in rollout.files:
-        splats = restricted(splats, images.opacity)
-        return splats, moved(splats, trajectory.positions, images, device)
-    return splats, placed(splats, SplatCenters.load(rollout.file("centers", rollout_record)).positions, device)
+        splats = prune_by_opacity(splats, images.opacity)
+        return splats, skinned_frames(splats, trajectory.positions, images, device)
+    return splats, frames_from_centers(splats, SplatCenters.load(rollout.file("centers", rollout_record)).positions, device)
 
 
 def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:

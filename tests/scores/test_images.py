@@ -9,7 +9,7 @@ import torch
 from neuspring.core.errors import InputError
 from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
 from neuspring.scores.pictures import _ssim_on_black
-from neuspring.splats.ssim import ssim, ssim_map
+from neuspring.splats.losses import ssim, ssim_map
 from tests.support.devices import DEVICES
 
 FOLDER = Path(__file__).parents[1] / "golden"

@@ -10,12 +10,10 @@ import torch
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
 from neuspring.splats import harmonics
-from neuspring.splats.blend import blend
-from neuspring.splats.densify import Statistics, densify
-from neuspring.splats.project import boxes, project, radii
+from neuspring.splats.blend import blend, tiles
 from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize
-from neuspring.splats.tiles import tiles
-from neuspring.splats.view import LIMITS, Limits, View
+from neuspring.splats.train import Statistics, densify
+from neuspring.splats.view import LIMITS, Limits, View, boxes, project, radii
 from tests.support.random_splats import random_splats, small_view
 
 

@@ -12,10 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuspring.core.errors import InputError
-from neuspring.splats import reference
-from neuspring.splats.project import project
-from neuspring.splats.rasterize import choose_backend, rasterize
-from neuspring.splats.view import LIMITS
+from neuspring.splats.rasterize import choose_backend, rasterize, reference
+from neuspring.splats.view import LIMITS, project
 from tests.support.devices import DEVICES
 from tests.support.golden_splats import CASES, Golden
 from tests.support.random_splats import random_splats, small_view
@@ -77,7 +75,7 @@ def test_projection_and_order_are_the_golden_ones(case):
 @pytest.mark.parametrize("case", CASES)
 def test_the_specification_is_the_golden_data(case):
     golden = Golden(case, torch.float64)
-    pictures = reference.rasterize(*golden.inputs.values(), golden.view, **golden.options)
+    pictures = reference(*golden.inputs.values(), golden.view, **golden.options)
     for name, picture in zip(("rgb", "alpha", "depth"), pictures, strict=True):
         assert np.abs(picture.detach().numpy() - golden.values[f"exp_{name}"]).max() <= DOUBLE[name]
 
@@ -89,7 +87,7 @@ def test_any_scene_looks_as_the_specification_says(seed, count, side):
     splats = random_splats(seed, count, torch.float64)
     view = small_view(*side)
     picture = rasterize(*splats, view, background=(0.2, 0.3, 0.4))
-    specification = reference.rasterize(*splats, view, background=(0.2, 0.3, 0.4))
+    specification = reference(*splats, view, background=(0.2, 0.3, 0.4))
     for result, expected in zip((picture.rgb, picture.alpha, picture.depth), specification, strict=True):
         assert torch.allclose(result, expected, atol=1e-9)
     weights = torch.rand_like(picture.rgb)

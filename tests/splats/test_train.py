@@ -12,10 +12,10 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.synthetic.make import looking
 from neuspring.scores.images import psnr
 from neuspring.splats import harmonics
-from neuspring.splats.densify import Statistics, densify
+from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.train import extent_of, first_splats, restricted, train
+from neuspring.splats.train import Statistics, densify, extent_of, first_splats, train
 from neuspring.splats.view import View
 from tests.support.filmed import EYES, intrinsics
 
@@ -226,6 +226,6 @@ def test_faint_splats_are_left_out():
     splats = known_splats(10)
     logits = splats.opacity_logits.copy()
     logits[:4] = -5
-    assert len(restricted(dataclasses.replace(splats, opacity_logits=logits), 0.1).means) == 6
+    assert len(prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits), 0.1).means) == 6
     with pytest.raises(NumericalFailure, match="no splat"):
-        restricted(splats, 0.99)
+        prune_by_opacity(splats, 0.99)

@@ -18,7 +18,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import HANDS, Capture
 from neuspring.perception.results import Masks
 from neuspring.scores import metrics
-from neuspring.splats.draw import turned
+from neuspring.splats.draw import orbit_view
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
 from neuspring.stages import appearance, draw, render
@@ -208,7 +208,7 @@ def test_pictures_from_the_side_keep_the_object_in_view(scene):
     gaussians = Gaussians.of(Splats.load(scene.appearance.with_name("splats.ply")))
     camera = scene.capture.cameras["0"]
     view = View.of(camera.camera_to_world, camera.intrinsics, camera.width, camera.height)
-    pictures = [turned(gaussians, view, "warp", angle) for angle in (0, 90, 180, 270)]
+    pictures = [orbit_view(gaussians, view, "warp", angle) for angle in (0, 90, 180, 270)]
     for picture in pictures:
         dark = (picture.min(axis=2) < 200).mean()
         assert 0.01 < dark < 0.5

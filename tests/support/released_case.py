@@ -20,9 +20,9 @@ from neuspring.data.unpickle import load_pickle
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
 from neuspring.scores.released.findings import Published
-from neuspring.splats import reference as rasterizer
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
+from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 from neuspring.twin.topology import uniform_topology
@@ -213,7 +213,7 @@ def drawn(case: Released) -> list[np.ndarray]:
     scales = torch.exp(torch.tensor(splats.log_scales[opaque], dtype=torch.float64)).expand(-1, 3)
     skin, pictures = Skin(positions[0], released_degeneracy=True), []
     for means, turned in skin.carry(positions, torch.tensor(splats.means[opaque]), torch.tensor(splats.quaternions[opaque])):
-        rgb, alpha, _ = rasterizer.rasterize(means.double(), turned.double(), scales, opacity, colors, view)
+        rgb, alpha, _ = reference(means.double(), turned.double(), scales, opacity, colors, view)
         picture = torch.cat([rgb, alpha[..., None]], dim=2).clamp(0, 1)
         pictures.append((255 * picture + 0.5).floor().to(torch.uint8).numpy())
     return pictures

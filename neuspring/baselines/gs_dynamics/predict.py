@@ -21,7 +21,7 @@ from neuspring.baselines.gs_dynamics.windows import executed, upright
 from neuspring.baselines.results import LIMIT, Prediction
 from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.core.device import load, start_warp
-from neuspring.splats.skinning_kernels import turn_nodes
+from neuspring.splats.skinning import turn_nodes
 
 CLOSE = 1e-4
 """Distances are floored here before a weight is computed from them, m."""

@@ -12,7 +12,7 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Camera, Capture
 from neuspring.report.paper.look import box_around, part
-from neuspring.splats.draw import moved, placed
+from neuspring.splats.draw import frames_from_centers, skinned_frames
 from neuspring.splats.model import Gaussians, Splats
 
 FADE = 0.6
@@ -37,9 +37,9 @@ class Take:
         wanted = {frame for frame in frames if frame < len(self.positions)}
         stop = max(wanted, default=-1) + 1
         if self.centers is None:
-            every = moved(self.splats, self.positions[:stop], images, device) if stop else iter(())
+            every = skinned_frames(self.splats, self.positions[:stop], images, device) if stop else iter(())
         else:
-            every = placed(self.splats, self.centers[:stop], device)
+            every = frames_from_centers(self.splats, self.centers[:stop], device)
         return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in wanted)
 
 

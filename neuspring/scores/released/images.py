@@ -29,9 +29,8 @@ from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.scores.released.findings import Absent, Finding, Tools, of_scores, require
-from neuspring.splats.draw import COVERED, moved, picture, view_of
+from neuspring.splats.draw import COVERED, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
-from neuspring.splats.train import restricted
 
 SCORED = ("psnr", "ssim", "lpips", "iou")
 RELEASED = Images(
@@ -97,11 +96,11 @@ def frame_scores(
         raise InputError(case.folder / phystwin.METADATA, "a second camera is required: pictures have its intrinsics", len(cameras))
     camera, borrowed = cameras[0], cameras[1] if images.released_quirks.second_camera_intrinsics else None
     view = view_of(camera, images, device, borrowed)
-    splats = restricted(Splats.load(case.splats), images.opacity)
+    splats = prune_by_opacity(Splats.load(case.splats), images.opacity)
     positions = read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
     progress = Progress(f"pictures {case.name}", len(positions))
     rows = []
-    for frame, gaussians in enumerate(moved(splats, positions, images, device)):
+    for frame, gaussians in enumerate(skinned_frames(splats, positions, images, device)):
         if frame:
             rendered = picture(gaussians, view, "warp")
             values = _scores(case, camera, frame, rendered, lpips, images)
