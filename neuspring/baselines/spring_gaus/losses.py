@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from neuspring.baselines.spring_gaus.model import Follower
+from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import Backend, rasterize
-from neuspring.splats.losses import ssim
 from neuspring.splats.view import View
 from neuspring.twin.losses import FrameLoss
 
