@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from neuspring.config.perception import Segmentation
     from neuspring.data.capture import Capture
-    from neuspring.perception.marks import Carried, Mark
+    from neuspring.perception.marks.carry import Carried
+    from neuspring.perception.marks.marks import Mark
 
 SHOWN = 5
 """How many doubtful frames are named per camera."""
@@ -36,7 +37,8 @@ def mask(a: Namespace) -> int:
     """`neuspring mask`: 0 done, 2 bad input."""
     from neuspring.core.errors import InputError
     from neuspring.data.capture import Capture
-    from neuspring.perception.marks import MARKS, Marks, sheet, store
+    from neuspring.perception.marks import store
+    from neuspring.perception.marks.marks import MARKS, Marks
 
     capture = Capture.load(a.capture)
     path = a.marks or a.capture / MARKS
@@ -55,12 +57,12 @@ def mask(a: Namespace) -> int:
     for name in wanted:
         source = store.source_digest(capture, name, marks.of(name), a.backend, settings)
         if made.holds(capture, name, source) and not a.again:
-            picture, doubts = sheet.sheet_of(capture, name), made.cameras[name].doubt
+            picture, doubts = store.sheet_of(capture, name), made.cameras[name].doubt
             print(f"camera {name}: marks, images and settings are unchanged; its masks are kept; look at {picture}")
         else:
             carried = _carry(capture, name, marks.of(name), a.backend, segmentation, a.device)
             doubts = store.save_carried(capture, name, carried, source, a.backend).doubt
-            picture = sheet.sheet_of(capture, name)
+            picture = store.sheet_of(capture, name)
             print(f"camera {name}: masks are in {a.capture / 'mask' / name}; look at {picture}")
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]
         print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
@@ -104,7 +106,7 @@ def compare_masks_options(parser: ArgumentParser) -> None:
 
 def compare_masks(a: Namespace) -> int:
     """`neuspring compare-masks`: a table of IoU per frame."""
-    from neuspring.perception.marks.compare import compare, table
+    from neuspring.perception.marks.store import compare, table
 
     print(table(compare(a.masks, a.truth)), end="")
     return 0

@@ -14,7 +14,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.synthetic.truth import Truth, at_points, under_pixels
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import inside
-from neuspring.perception.shape_prior import visual_hull
+from neuspring.perception.shape import visual_hull
 from neuspring.perception.track_truth import carried
 
 MM = 1e3

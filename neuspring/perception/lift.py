@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.perception.controllers import choose_controllers
-from neuspring.perception.release import Body, Holding, holding
+from neuspring.perception.controllers import Body, Holding, choose_controllers, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
@@ -216,6 +215,12 @@ def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.nd
             points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
     x, y = rounded[0].T
     return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)
+
+
+def heights_above_table(camera: Camera, depth: np.ndarray, up_sign: float) -> np.ndarray:
+    """Height [H, W], m, above the table z = 0 of what an image of depth [H, W], m, shows; NaN where nothing was measured."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(float)
+    return np.where(depth > 0, up_sign * camera.lift(pixels, depth)[..., 2], np.nan)
 
 
 def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray, window: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Lifted tracks and a shape prior -> the structure points of a twin, one per voxel.
+"""Lifted tracks and shape prior -> observations: the structure points of a twin, one per voxel, and tracks for scoring.
 
 Observed points come first, then points on the prior's surface, then points inside it (section 2.9 of the released processing, here
 with a seed).
@@ -6,17 +6,71 @@ with a seed).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
 import warp as wp
 
-from neuspring.config.perception import Sampling
+from neuspring.config import ScenarioRow
+from neuspring.config.perception import Perception, Sampling
+from neuspring.core.artifacts import ImageObservations, Observations, Scenario
+from neuspring.core.records import digest_file
+from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import LiftedTracks, ShapePrior
-from neuspring.perception.sample_kernels import winding
 
 GROWTH = 1.01
 """Ratio of the voxel sizes that are tried one after the other."""
+
+
+def assemble(
+    row: ScenarioRow,
+    capture: Capture,
+    lifted: LiftedTracks,
+    prior: ShapePrior,
+    settings: Perception,
+    image: ImageObservations | None = None,
+) -> Observations:
+    """What every method reads. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks."""
+    up = capture.description.up_sign
+    # In the image every node should have a track that is followed for long.
+    followed = None if image is None else image.visible.sum(axis=0)
+    indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed, followed)
+    if image is not None:
+        image = replace(image, pixels=image.pixels[:, indices], visible=image.visible[:, indices])
+    visible = lifted.object_visibility[:, indices]
+    points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
+    origin = {
+        CAPTURE: f"sha256:{digest_file(capture.folder / CAPTURE)}",
+        "lift": lifted.backend,
+        "shape prior": prior.backend,
+    }
+    if settings.sample.nodes is not None:
+        origin["node spacing"] = f"{voxel:.6g} m"
+    return Observations(
+        scenario=Scenario(
+            name=row.scenario,
+            source=row.source,
+            category=row.category,
+            frame_count=capture.frame_count,
+            train_end=capture.train_end,
+            frame_rate=capture.description.frame_rate,
+            up=capture.description.up,
+            self_collision=row.self_collision,
+            ground=row.ground,
+            obstacles=capture.description.obstacles,
+            provenance=capture.description.provenance | origin,
+        ),
+        object_points=points,
+        object_visibility=visible,
+        object_motion_valid=lifted.object_motion_valid[:, indices],
+        controller_points=lifted.controller_points,
+        controller_valid=lifted.controller_valid,
+        surface_points=surface,
+        interior_points=interior,
+        tracks=capture.tracks(),
+        image=image,
+    )
 
 
 def structure(
@@ -76,6 +130,14 @@ def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.rand
     face = rng.choice(len(area), count, p=area / area.sum())
     weights = rng.dirichlet((1.0, 1.0, 1.0), count)
     return np.asarray(np.einsum("ns,nsc->nc", weights, corners[face]))
+
+
+@wp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]
+def winding(mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, inside: wp.array[bool]):  # type: ignore[no-untyped-def]
+    """Whether each point lies inside the closed mesh; `reach` bounds the search, m."""
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
+    inside[i] = query.result and query.sign < 0.0  # type: ignore[index,attr-defined]
 
 
 def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@
 2. Per frame, the log ratio of both and the height make seeds, and GrabCut draws the border.
 3. Foreground is divided into hands and object by the same kind of ratio. The hands' histogram starts from skin tones and is made
    again from the hands that these show. Only pieces of some size are hands.
-4. Where settings ask for it, pieces are judged over the whole video (`segment_pieces`): sleeves, clutter, which object.
+4. Where settings ask for it, pieces are judged over the whole video: sleeves, clutter that never moves, which of several is the
+   object.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import Self
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.marks.field import solve
-from neuspring.perception.segment_pieces import sort_pieces
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
+from neuspring.perception.lift import heights_above_table
+from neuspring.perception.marks.start import solve
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""
@@ -52,6 +53,18 @@ THIN_HAND_PIECE = 0.03
 """HAND_PIECE where the object is a thin rope: no part of it is as large as what is seen of a hand."""
 THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
 """Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
+SAMPLED = 24
+"""Frames from which it is learned which pixels change."""
+CHANGES = 24
+"""Range of gray over the video from which a pixel changes."""
+MOVING = 0.1
+"""Part of a piece's pixels that change, from which it moves."""
+CONTACT = 5
+"""Distance, pixels, within which things touch."""
+BREAK = 0.03
+"""Step of depth, m, that divides pieces which touch in the image alone."""
+BORDER_RUN = 4
+"""Pixels at the image's border from which a piece reaches it."""
 
 
 @dataclass(frozen=True)
@@ -128,11 +141,7 @@ def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: Op
 
 
 def _heights(capture: Capture, camera: str, frame: int) -> np.ndarray:
-    """Height above the table [H, W], m; NaN where depth is missing."""
-    view, depth = capture.cameras[camera], capture.depth(camera, frame)
-    sign = 1.0 if capture.description.up == "+z" else -1.0
-    pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
-    return np.where(depth > 0, sign * view.lift(pixels, depth)[..., 2], np.nan)
+    return heights_above_table(capture.cameras[camera], capture.depth(camera, frame), capture.description.up_sign)
 
 
 def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings: OpenCvSegmentation) -> np.ndarray:
@@ -287,3 +296,103 @@ def _border(shape: tuple[int, ...]) -> np.ndarray:
     rows, columns = (max(int(BORDER * size), 2) for size in shape)
     edge[rows:-rows, columns:-columns] = False
     return edge
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A connected piece of the object's mask in one frame."""
+
+    mask: np.ndarray
+    area: int
+    moving: float
+    """Part of its pixels that change during the video."""
+    at_border: bool
+    at_hand: bool
+    hand_distance: float
+    """Pixels to the nearest hand; infinite without one."""
+
+
+def sort_pieces(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+    """Labels [T, H, W] in which sleeves are hands, clutter is nothing and one object is left, as far as settings ask for it."""
+    if not settings.sleeves and settings.clutter == "keep" and settings.object == "all":
+        return labels
+    result, changes = labels.copy(), changing(capture, camera)
+    chosen: np.ndarray | None = None
+    for frame in range(len(labels)):
+        if not capture.has(camera, frame):
+            continue
+        own = pieces_of(labels[frame], capture.depth(camera, frame), changes)
+        if settings.sleeves:
+            sleeves = [piece for piece in own if piece.at_border and piece.at_hand and piece.moving > MOVING]
+            for piece in sleeves:
+                result[frame][piece.mask] = HANDS
+            own = [piece for piece in own if piece not in sleeves]
+        if settings.clutter == "drop":
+            still = [piece for piece in own if piece.moving < MOVING and not piece.at_hand]
+            for piece in still:
+                result[frame][piece.mask] = NOTHING
+            own = [piece for piece in own if piece not in still]
+        if settings.object != "all" and own:
+            chosen = _choose(own, chosen, settings.object, f"{capture.folder}, camera {camera}, frame {frame}")
+            result[frame][(result[frame] == OBJECT) & ~chosen] = NOTHING
+    return result
+
+
+def changing(capture: Capture, camera: str) -> np.ndarray:
+    """Which pixels [H, W] bool change during the video: their range of gray, a little blurred."""
+    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    grays = []
+    for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED).astype(int)):
+        gray = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frames[index])), cv2.COLOR_RGB2GRAY)
+        grays.append(cv2.GaussianBlur(gray, (0, 0), 1.0))
+    return np.asarray(np.ptp(np.stack(grays), axis=0) > CHANGES)
+
+
+def pieces_of(labels: np.ndarray, depth: np.ndarray, changes: np.ndarray) -> list[Piece]:
+    """Connected pieces of the object [H, W], divided where the depth [H, W], m, has a step."""
+    own = labels == OBJECT
+    if not own.any():
+        return []
+    kernel = np.ones((3, 3), np.uint8)
+    # Unknown depth divides nothing.
+    far = cv2.dilate(np.where(depth > 0, depth, 0.0).astype(np.float32), kernel)
+    near = cv2.erode(np.where(depth > 0, depth, 100.0).astype(np.float32), kernel)
+    whole = own & ~(far - near > BREAK)
+    count, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
+    if count == 1:
+        whole = own
+        count, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
+    rows, columns = distance_transform_edt(~whole, return_distances=False, return_indices=True)
+    numbers = np.where(own, numbers[rows, columns], 0)
+    hands = labels == HANDS
+    away = cv2.distanceTransform((~hands).astype(np.uint8), cv2.DIST_L2, 5) if hands.any() else np.full(labels.shape, np.inf)
+    pieces = []
+    for number in range(1, count):
+        mask = numbers == number
+        area = int(mask.sum())
+        rim = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())
+        distance = float(away[mask].min())
+        pieces.append(Piece(mask, area, float(changes[mask].mean()), rim >= BORDER_RUN, distance <= CONTACT, distance))
+    return pieces
+
+
+def _choose(pieces: list[Piece], before: np.ndarray | None, rule: str, where: str) -> np.ndarray:
+    """The mask [H, W] bool of the object: what overlaps with the one before, else what the rule says."""
+    if before is not None:
+        reach = cv2.dilate(before.astype(np.uint8), np.ones((2 * CONTACT + 1,) * 2, np.uint8)).astype(bool)
+        kept = [piece.mask for piece in pieces if (piece.mask & reach).sum() > 0.1 * piece.area]
+        return np.any(kept, axis=0) if kept else before
+    scores = {
+        "largest": [float(piece.area) for piece in pieces],
+        "moving": [piece.moving * piece.area for piece in pieces],
+        "nearest_hand": [-piece.hand_distance + 1e-6 * piece.area for piece in pieces],
+    }[rule]
+    best = pieces[int(np.argmax(scores))]
+    if len(pieces) > 1:
+        y, x = (round(float(values.mean())) for values in np.nonzero(best.mask))
+        others = ", ".join(f"{piece.area}" for piece in pieces if piece is not best)
+        print(
+            f"{where}: {len(pieces)} pieces; taken ({rule}): {best.area} pixels around ({x}, {y}); left: {others} pixels",
+            flush=True,
+        )
+    return best.mask

@@ -18,8 +18,7 @@ import numpy as np
 from neuspring.config.perception import GroundedSam2, MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.marks.carry import Carried, frame_mask
-from neuspring.perception.marks.doubt import Cues, doubt_of
+from neuspring.perception.marks.carry import Carried, Cues, doubt_of, frame_mask
 from neuspring.perception.marks.marks import Mark
 from neuspring.perception.marks.store import film_of
 

@@ -22,7 +22,7 @@ from neuspring.data.capture import Capture
 from neuspring.data.mesh_file import read_mesh
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
-from neuspring.perception.shape_seen import seen
+from neuspring.perception.shape import seen
 
 POSES = 24 * 8
 REFINED = 6

@@ -12,11 +12,11 @@ from neuspring.core.findings import told
 from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
-from neuspring.perception.color.from_color import from_color
+from neuspring.perception.color import from_color
+from neuspring.perception.findings import look_at_lifted
 from neuspring.perception.lift import lift
-from neuspring.perception.look_world import look_at_lifted
 from neuspring.perception.results import masks_of_cameras, tracks_of_cameras
-from neuspring.perception.shape_prior import shape_prior
+from neuspring.perception.shape import shape_prior
 from neuspring.stages import options as shared
 
 

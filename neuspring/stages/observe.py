@@ -43,9 +43,9 @@ def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None =
     # Imported here: processed data need nothing of perception, whose code must not start their jobs again.
     from neuspring.core.artifacts import ImageObservations
     from neuspring.data.capture import Capture
-    from neuspring.perception.assemble import assemble
-    from neuspring.perception.look_world import look_at_observations
+    from neuspring.perception.findings import look_at_observations
     from neuspring.perception.results import LiftedTracks, ShapePrior
+    from neuspring.perception.sample import assemble
 
     record = StageRecord.load(lifted_record)
     lifted = LiftedTracks.load(record.file("lifted", lifted_record))

@@ -13,8 +13,7 @@ from neuspring.core.records import Recorder
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.look import WRONG, look_at_masks
-from neuspring.perception.mask_facts import mask_facts
+from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
 from neuspring.perception.results import Masks
 from neuspring.stages import options as shared
 

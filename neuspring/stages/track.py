@@ -12,7 +12,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception import figures
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.look import look_at_tracks
+from neuspring.perception.findings import look_at_tracks
 from neuspring.perception.results import Masks, PixelTracks
 from neuspring.stages import options as shared
 

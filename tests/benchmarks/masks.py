@@ -20,10 +20,9 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.marks import Carried, Mark, Marks, carry
-from neuspring.perception.marks.compare import overlap
-from neuspring.perception.marks.sheet import overlay
-from neuspring.perception.marks.store import carry_camera
+from neuspring.perception.marks.carry import Carried, carry
+from neuspring.perception.marks.marks import Mark, Marks
+from neuspring.perception.marks.store import carry_camera, overlap, overlay
 
 MARKS = Path(__file__).parents[1] / "data" / "marks"
 MOST_MARKS = 5

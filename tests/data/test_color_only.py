@@ -20,9 +20,8 @@ from neuspring.perception import segment_opencv
 from neuspring.perception.annotate.annotations import Annotations, Click, Point
 from neuspring.perception.annotate.tracks import Pointing, tracks_of
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.look import look_at_masks
+from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.marks.store import film_of, save_masks
-from neuspring.perception.mask_facts import mask_facts
 from tests.support.board import BOARD, LENS, board_image
 from tests.support.departures import holds, of_level, serious
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses, write_video

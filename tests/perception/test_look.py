@@ -11,11 +11,9 @@ from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, finding, findings_of, refuse_errors, told
 from neuspring.core.records import Recorder
 from neuspring.data.capture import HANDS, OBJECT, Writer
-from neuspring.perception.look import look_at_masks, look_at_tracks
-from neuspring.perception.look_world import look_at_lifted, look_at_observations
-from neuspring.perception.mask_facts import mask_facts
+from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks, mask_facts
 from neuspring.perception.results import LiftedTracks, ShapePrior
-from neuspring.perception.shape_prior import no_prior
+from neuspring.perception.shape import no_prior
 from tests.support.captures import FRAMES, describe, entry
 
 SIZE = (90, 120)

@@ -8,10 +8,8 @@ import pytest
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
-from neuspring.perception.look import WRONG, look_at_masks
-from neuspring.perception.mask_facts import mask_facts
-from neuspring.perception.segment_opencv import _region, _slim, _thin
-from neuspring.perception.segment_pieces import changing, sort_pieces
+from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
+from neuspring.perception.segment_opencv import _region, _slim, _thin, changing, sort_pieces
 from tests.support.captures import describe, entry
 
 SIZE = (48, 64)

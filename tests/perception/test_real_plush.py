@@ -6,12 +6,11 @@ import pytest
 
 from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, Capture
+from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.lift import clean_masks
-from neuspring.perception.look import look_at_masks
-from neuspring.perception.mask_facts import mask_facts
 from neuspring.perception.results import Masks
 from neuspring.perception.segment_given import segment
-from neuspring.perception.shape_prior import shape_prior
+from neuspring.perception.shape import shape_prior
 from tests.support.real import PLUSH
 
 FIRST = 250

@@ -8,8 +8,8 @@ import pytest
 from neuspring.config.perception import Lift
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.perception.look_world import look_at_observations
-from neuspring.perception.release import ALWAYS, Body, Holding, holding
+from neuspring.perception.controllers import ALWAYS, Body, Holding, holding
+from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
 FRAMES = 30

@@ -14,10 +14,9 @@ from neuspring.data.capture import OBJECT, CameraEntry, Writer
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.render import HAND, Part, Renderer, quantized
-from neuspring.perception import shape_mesh, shape_prior
-from neuspring.perception.assemble import assemble
+from neuspring.perception import shape, shape_mesh
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
-from neuspring.perception.sample import inside, on_table, structure, voxel_for
+from neuspring.perception.sample import assemble, inside, on_table, structure, voxel_for
 from tests.support.captures import FRAMES, K, describe
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
@@ -67,7 +66,7 @@ def closed(faces: np.ndarray) -> bool:
 
 def test_the_hull_is_closed_and_near_the_truth(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3)
-    hull = shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004))
+    hull = shape.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004))
     assert closed(hull.faces)
     assert hull.vertices[:, 2].min() > -0.004
     assert overlap(hull, truth) > 0.8
@@ -77,21 +76,21 @@ def test_more_cameras_make_a_better_hull(tmp_path):
     quality = []
     for cameras in (1, 2, 3):
         capture, masks, cloud, truth = film(tmp_path / str(cameras), cameras)
-        quality.append(overlap(shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth))
+        quality.append(overlap(shape.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth))
     assert quality[0] < quality[1] < quality[2]
 
 
 def test_a_hand_before_the_object_does_not_carve_it(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3, with_hand=True)
     assert (masks["0"].labels == HAND).any()
-    assert overlap(shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth) > 0.8
+    assert overlap(shape.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth) > 0.8
 
 
 def test_contradicting_views_are_refused(tmp_path):
     capture, masks, cloud, _ = film(tmp_path, 2)
     masks["1"] = Masks(labels=np.roll(masks["1"].labels, 55, axis=2), backend="given")
     with pytest.raises(InputError, match="must be consistent with all cameras"):
-        shape_prior.visual_hull(capture, masks, cloud, ShapePriorSettings())
+        shape.visual_hull(capture, masks, cloud, ShapePriorSettings())
 
 
 def test_a_mesh_in_any_pose_and_size_finds_its_place(tmp_path):
@@ -142,7 +141,7 @@ def tracked(points: np.ndarray) -> LiftedTracks:
 def test_one_point_per_voxel():
     points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3))
     points[0] = 0.0
-    indices, _, _, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.02), 1.0, 0)
+    indices, _, _, _ = structure(tracked(points), shape.no_prior(), Sampling(voxel=0.02), 1.0, 0)
     cells = np.floor(points[indices] / 0.02).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells) == 125
 
@@ -168,7 +167,7 @@ def test_sampling_follows_the_seed(tmp_path):
 
 def test_without_a_prior_only_what_was_seen_remains():
     points = np.array([[0.0, 0, 0.01], [0.0, 0, 0.01], [0.05, 0, -0.01], [0.1, 0, 0.02]])
-    indices, outer, inner, _ = structure(tracked(points), shape_prior.no_prior(), Sampling(), 1.0, 0)
+    indices, outer, inner, _ = structure(tracked(points), shape.no_prior(), Sampling(), 1.0, 0)
     assert indices.tolist() == [0, 2, 3]
     assert not len(outer)
     assert not len(inner)
@@ -192,7 +191,7 @@ def test_more_nodes_never_make_a_coarser_spacing_and_are_never_exceeded():
         before = np.inf
         for most in (1, 8, 20, 37, 38, 39, 100, 101, 300, 1000, 3000):
             voxel = voxel_for(points, most, 0.002)
-            kept, _, _, used = structure(tracked(points), shape_prior.no_prior(), Sampling(voxel=0.002, nodes=most), 1.0, 0)
+            kept, _, _, used = structure(tracked(points), shape.no_prior(), Sampling(voxel=0.002, nodes=most), 1.0, 0)
             assert 0.002 <= voxel <= before
             assert len(kept) <= most
             assert used == pytest.approx(voxel, rel=1e-5)
@@ -208,7 +207,7 @@ def test_a_rope_is_sampled_finer_than_a_ball_at_equal_cost():
 
 def test_the_spacing_is_never_below_the_voxel_and_the_voxel_itself_where_nodes_suffice():
     rope, _ = line_and_ball()
-    lifted, prior = tracked(rope), shape_prior.no_prior()
+    lifted, prior = tracked(rope), shape.no_prior()
     plain, plenty = (structure(lifted, prior, Sampling(voxel=0.01, nodes=most), 1.0, 0) for most in (None, 10**6))
     assert plain[3] == plenty[3] == 0.01
     np.testing.assert_array_equal(plain[0], plenty[0])
@@ -228,7 +227,7 @@ def test_a_chosen_spacing_is_written_down_and_only_then(tmp_path):
     )
     for nodes in (None, 30):
         settings = Perception(sample=Sampling(voxel=0.004, nodes=nodes))
-        seen = assemble(row, capture, lifted, shape_prior.no_prior(), settings)
+        seen = assemble(row, capture, lifted, shape.no_prior(), settings)
         written = seen.scenario.provenance.get("node spacing")
         if nodes is None:
             assert written is None

@@ -14,8 +14,7 @@ from neuspring.data.synthetic.render import Part, Renderer, quantized
 from neuspring.perception.figures import lifted_figure
 from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
-from neuspring.perception.shape_back import front, round_chord
-from neuspring.perception.shape_prior import shape_prior, visual_hull
+from neuspring.perception.shape import front, round_chord, shape_prior, visual_hull
 from tests.support.captures import FRAMES, K, describe
 
 RADIUS = 0.05

@@ -12,7 +12,7 @@ import numpy as np
 from neuspring.config.perception import ColorSettings
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer
-from neuspring.perception.color.evidence import silhouettes
+from neuspring.perception.color import silhouettes
 from tests.support import small
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 180.0

@@ -55,7 +55,7 @@ COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0)}
 INSIDE, BORDER = 90, 255
 """Opacity inside a mask and on its border, of 255."""
 JPEG_QUALITY = 95
-ANSWERS = {Stale: 409, Busy: 409, Foreign: 428, InputError: 422}
+ANSWERS: dict[type[Exception], int] = {Stale: 409, Busy: 409, Foreign: 428, InputError: 422}
 """HTTP status of what a request can raise."""
 
 

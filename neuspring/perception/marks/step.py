@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT
-from neuspring.perception.marks.background import Background, apart
-from neuspring.perception.marks.colors import Colors, bins_of, count, mixed
-from neuspring.perception.marks.field import solve
-from neuspring.perception.marks.seeds import FAR, Seeds
-from neuspring.perception.marks.start import LABELS, NEVER
+from neuspring.perception.marks.colors import Background, Colors, apart, bins_of, count, mixed
+from neuspring.perception.marks.marks import FAR, Seeds
+from neuspring.perception.marks.start import LABELS, NEVER, solve
 
 COLOR = 0.5
 """Weight of the log densities of colors: neighboring pixels are not independent."""

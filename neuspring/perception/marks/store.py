@@ -1,4 +1,4 @@
-"""Masks of a capture: made from its marks, and kept in its folder mask/.
+"""Masks of a capture: made from its marks, kept in its folder mask/, shown on a contact sheet, and compared with other masks.
 
 marks = Marks.load(folder / MARKS)
 capture = Capture.load(folder)
@@ -25,13 +25,20 @@ from neuspring.config.types import STRICT, Name
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_atomically, write_text
 from neuspring.core.records import canonical, digest_file
-from neuspring.data.capture import CAPTURE, HANDS, Capture, images_digest
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest
+from neuspring.perception.lift import heights_above_table
 from neuspring.perception.marks.carry import Carried, carry
 from neuspring.perception.marks.marks import Mark, marks_digest
-from neuspring.perception.marks.sheet import save_sheet
 
 MADE = "masks.json"
 """What the masks of a capture were made from, and how far each frame is doubted; in its folder."""
+TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
+"""RGB, as in the other pictures of masks."""
+COLUMNS = 4
+EVEN, DOUBTFUL = 8, 8
+"""How many frames are shown evenly over the video, and in doubt."""
+WIDTH = 424
+"""Of a tile, pixels, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +70,8 @@ class Film:
         depth = self.depth(frame)
         if depth is None:
             return None
-        view, sign = self.capture.cameras[self.camera], 1.0 if self.capture.description.up == "+z" else -1.0
-        pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
-        return np.where(depth > 0, sign * view.lift(pixels, depth)[..., 2], np.nan).astype(np.float32)
+        view, up_sign = self.capture.cameras[self.camera], self.capture.description.up_sign
+        return heights_above_table(view, depth, up_sign).astype(np.float32)
 
 
 def film_of(capture: Capture, camera: str) -> Film:
@@ -206,3 +212,94 @@ def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend:
         for path in sorted((capture.folder / kind / camera).glob("*")):
             digest.update(f"{kind}/{path.name} {digest_file(path)}".encode())
     return f"sha256:{digest.hexdigest()}"
+
+
+def overlay(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """An RGB image [H, W, 3] with object tinted green and hands blue, their borders drawn."""
+    result = image.copy()
+    for label, tint in TINTS.items():
+        own = (labels == label).astype(np.uint8)
+        result[own > 0] = (0.6 * image[own > 0] + 0.4 * np.array(tint)).astype(np.uint8)
+        outlines, _ = cv2.findContours(own, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(result, outlines, -1, tint, 1)
+    return result
+
+
+def sheet_of(capture: Capture, camera: str) -> Path:
+    """Where the sheet of a camera lies: beside the masks."""
+    return capture.folder / f"mask_{camera}.png"
+
+
+def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
+    """Write `sheet_of` a camera: the most doubtful frames first, then frames evenly spaced."""
+    path = sheet_of(capture, camera)
+    frames = np.array([frame for frame in range(capture.frame_count) if capture.has(camera, frame)])
+    doubtful = frames[np.argsort(-carried.doubt[frames], kind="stable")][:DOUBTFUL]
+    even = frames[np.unique(np.linspace(0, len(frames) - 1, EVEN).astype(int))]
+    tiles = [_tile(capture, camera, carried, int(frame), "doubt") for frame in doubtful]
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
+    tiles += [_tile(capture, camera, carried, int(frame), "even") for frame in even]
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
+    rows = [np.hstack(tiles[index : index + COLUMNS]) for index in range(0, len(tiles), COLUMNS)]
+    ok, png = cv2.imencode(".png", np.vstack(rows)[..., ::-1])
+    assert ok, "a PNG of tiles can be encoded"
+    write_atomically(path, lambda temporary: temporary.write_bytes(png.tobytes()))
+    return path
+
+
+def _tile(capture: Capture, camera: str, carried: Carried, frame: int, why: str) -> np.ndarray:
+    image = overlay(np.ascontiguousarray(capture.color(camera, frame)), carried.labels[frame])
+    height, width = image.shape[:2]
+    if width > WIDTH:
+        image = cv2.resize(image, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
+    text = f"{frame}: doubt {carried.doubt[frame]:.2f}" if why == "doubt" else str(frame)
+    for color, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(image, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, thick, cv2.LINE_AA)
+    return image
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Of one frame. NaN where neither mask shows the thing."""
+
+    frame: int
+    object: float
+    """Intersection over union."""
+    hands: float
+
+
+def overlap(one: np.ndarray, other: np.ndarray) -> float:
+    """Intersection over union of two masks [...] bool; NaN if both are empty."""
+    union = int((one | other).sum())
+    return float((one & other).sum() / union) if union else float("nan")
+
+
+def compare(masks: Path, truth: Path) -> list[Agreement]:
+    """Of all frames in `truth`, by their number. Raises InputError where masks lack one or differ in size."""
+    there, known = (_numbered(folder) for folder in (masks, truth))
+    rows = []
+    for frame, path in known.items():
+        if frame not in there:
+            raise InputError(masks, f"a mask of frame {frame} is required: {truth} has one", sorted(there)[:5])
+        one, other = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in (there[frame], path))
+        if one is None or other is None or one.shape != other.shape or one.ndim != 2:
+            sizes = [None if image is None else image.shape for image in (one, other)]
+            raise InputError(there[frame], f"must be a gray image of the size of {path}", sizes)
+        rows.append(Agreement(frame, *(overlap(one == label, other == label) for label in (OBJECT, HANDS))))
+    return rows
+
+
+def table(rows: list[Agreement]) -> str:
+    """Text of a table: IoU per frame, and the mean."""
+    lines = ["frame  object  hands"] + [f"{row.frame:5d}  {row.object:6.3f}  {row.hands:5.3f}" for row in rows]
+    values = np.array([[row.object, row.hands] for row in rows])
+    known = np.isfinite(values)
+    means = np.where(known, values, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+    return "\n".join([*lines, f" mean  {means[0]:6.3f}  {means[1]:5.3f}"]) + "\n"
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    found = {int(path.stem): path for path in sorted(Path(folder).glob("*.png")) if path.stem.isdigit()}
+    if not found:
+        raise InputError(folder, "a folder of masks named by their frame is required: 00000.png", "none")
+    return found

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from neuspring.config.perception import ColorSettings, Perception, Sampling
+from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.color.first_frame import FirstFrame, beneath_hands, camera_depth
-from neuspring.perception.color.from_color import from_color
+from neuspring.perception.color import FirstFrame, beneath_hands, camera_depth, from_color
 from neuspring.perception.results import Masks, PixelTracks
 from neuspring.perception.sample import structure
 from neuspring.perception.track_opencv import choose
@@ -24,7 +24,7 @@ PIXEL = 0.005
 
 def capture_of(category: str, up: str = "+z") -> SimpleNamespace:
     view = camera(np.zeros(3))
-    described = SimpleNamespace(up=up, category=category)
+    described = SimpleNamespace(up_sign=up_sign(up), category=category)
     return SimpleNamespace(folder=Path("painted"), cameras={"0": view}, description=described, frame_count=1, train_end=1)
 
 

@@ -7,9 +7,8 @@ import pytest
 from neuspring.config import Config
 from neuspring.config.perception import ColorSettings
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.color.evidence import lift_color, silhouettes
-from neuspring.perception.color.first_frame import FirstFrame
-from neuspring.perception.color.hands import along_arms, follow_hands, grips
+from neuspring.perception.color import FirstFrame, lift_color, silhouettes
+from neuspring.perception.color_hands import along_arms, follow_hands, grips
 from neuspring.perception.results import PixelTracks
 from neuspring.stages import lift, segment, track
 from tests.support.colored import paint

@@ -6,7 +6,7 @@ import pytest
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.marks import carry, frame_mask
+from neuspring.perception.marks.carry import carry, frame_mask
 from tests.support.marked import SQUARE, Painted, mark, overlap, painted, rope
 
 SETTINGS = MarksSegmentation()

@@ -9,7 +9,8 @@ import pytest
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.marks import Marks, carry, frame_mask
+from neuspring.perception.marks.carry import carry, frame_mask
+from neuspring.perception.marks.marks import Marks
 from tests.support.marked import Painted, overlap
 from tests.support.real import FOOTAGE, PLUSH
 

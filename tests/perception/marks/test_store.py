@@ -12,7 +12,8 @@ from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.marks import Marks, store
+from neuspring.perception.marks import store
+from neuspring.perception.marks.marks import Marks
 from neuspring.perception.marks.store import Made, MadeCamera, film_of, has_masks, save_masks
 from tests.support.filmed import FRAMES, film
 from tests.support.marked import mark, overlap

@@ -1,25 +1,47 @@
-"""What lifted points, the shape and the observations say about themselves: findings after lifting and observing.
+"""What the steps of perception notice about their own results: masks, tracks, lifted points, the shape and the observations.
 
-Limits were chosen so that the synthetic scenes pass; lengths in m, of things that hands hold on a table.
+Limits were chosen so that the synthetic scenes pass, whose perception is known to be good; lengths in m, of things that hands hold
+on a table.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import ImageObservations, Observations
-from neuspring.core.findings import Finding, finding
-from neuspring.data.plausible_world import place_findings
+from neuspring.core.findings import Finding, Level, finding
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.plausible_masks import REMEDY, Shown, mask_findings
+from neuspring.data.plausible_world import Sample, depth_findings, hand_findings, place_findings, sampled
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
+SAME_GRAY = 6
+"""Change of gray below which a pixel did not change."""
+PAIRS = 16
+"""How many pairs of frames are looked at for pixels that change their label alone."""
+HANDS_INSIDE = 0.25
+"""Part of the hands' pixels that lie in pieces enclosed by the object, from which they are its print."""
+FLICKER = 0.08
+"""Pixels that change their label and not their color, as part of object and hands, from which labels are noise."""
+WRONG = ("background in the mask", "mask flickers", "hands too large", "hands inside the object", "labels are noise")
+"""Findings of masks that cannot be right, by name: `perception.segment.verdict` decides what happens."""
+TRACKS = 50
+"""Points on the object in frame 0."""
+FOLLOWED = 0.1
+"""Share of the points of frame 0 that are still followed."""
+OFTEN = 0.1
+"""Share of the frames with fewer, from which that is a warning: a rope that turns away from one camera for two frames is none."""
 VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
 TRUSTED = 0.5
 """Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
-ALIVE = 0.05
+SEEN = 0.05
 """Share of the object's points that are seen in a frame."""
 GRIP = 0.04
 """m from the object within which a controller can hold it."""
@@ -33,6 +55,107 @@ FASTEST = 5.0
 """m/s: no hand that manipulates is faster."""
 NODES = (30, 5000)
 """Structure points that can deform, and that a search can pay for."""
+
+
+def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
+    """Shares and counts of labels [T, H, W]; `look_at_masks` says what they mean."""
+    shown = shown_by(capture, camera, labels)
+    frames, areas = shown.frames, shown.areas[:, shown.frames]
+    return {
+        "object_share": float((labels == OBJECT).mean()),
+        "hand_share": float((labels == HANDS).mean()),
+        "objects": float(shown.objects),
+        "frames_without_object": float((areas[OBJECT] == 0).sum()),
+        "frames_missing": float(len(labels) - len(frames)),
+        "object_at_border": shown.bordered,
+        "area_jumps": shown.steps,
+        "hands_to_object": _median(areas[HANDS] / np.maximum(areas[OBJECT], 1.0)),
+        "hands_inside": _median([_inside(labels[frame]) for frame in frames]),
+        "flicker": _flicker(capture, camera, labels, frames),
+    }
+
+
+def shown_by(capture: Capture, camera: str, labels: np.ndarray) -> Shown:
+    """Counts of labels [T, H, W], over the frames that the camera has."""
+    shown = Shown(len(labels), (labels.shape[2], labels.shape[1]))
+    for frame in range(capture.frame_count):
+        if capture.has(camera, frame):
+            shown.see(frame, labels[frame])
+    return shown
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """0 of none: a camera may have no frame."""
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarray) -> float:
+    """Pixels that change their label and not their color from one frame to the next, as part of object and hands."""
+    flips = total = 0
+    for index in np.unique(np.linspace(0, max(len(frames) - 2, 0), min(PAIRS, max(len(frames) - 1, 0))).astype(int)):
+        here, there = frames[index], frames[index + 1]
+        gray = [cv2.cvtColor(np.ascontiguousarray(capture.color(camera, int(k))), cv2.COLOR_RGB2GRAY) for k in (here, there)]
+        still = cv2.blur(cv2.absdiff(*gray), (5, 5)) < SAME_GRAY
+        flips += int((still & (labels[here] != labels[there])).sum())
+        total += int((labels[here] > 0).sum())
+    return flips / max(total, 1)
+
+
+def _inside(labels: np.ndarray) -> float:
+    """Part of the hands' pixels [H, W] in pieces whose surroundings are nearly all object."""
+    hands = (labels == HANDS).astype(np.uint8)
+    count, pieces, boxes, _ = cv2.connectedComponentsWithStats(hands)
+    inside = 0
+    for piece in range(1, count):
+        own = (pieces == piece).astype(np.uint8)
+        around = cv2.dilate(own, np.ones((5, 5), np.uint8)).astype(bool) & (own == 0)
+        if around.any() and (labels[around] == OBJECT).mean() > 0.8:
+            inside += int(boxes[piece, cv2.CC_STAT_AREA])
+    return inside / max(int(hands.sum()), 1)
+
+
+def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
+    """Findings about labels [T, H, W] of one camera, with their `mask_facts`."""
+    view, where = capture.cameras[camera], f"camera {camera}"
+    found = mask_findings(camera, shown_by(capture, camera, labels))
+    if capture.has_depth:
+        samples = {
+            frame: Sample(capture.depth(camera, frame), labels[frame])
+            for frame in sorted(sampled(capture.frame_count))
+            if capture.has(camera, frame)
+        }
+        found += [one for one in depth_findings(view, samples) if one.level != "note"]
+        found += hand_findings(view, samples)
+    if facts["hands_inside"] > HANDS_INSIDE:
+        value = f"{facts['hands_inside']:.0%} of the hands' pixels lie inside of the object"
+        rule = f"at most {HANDS_INSIDE:.0%} are expected; its own colors are taken for hands"
+        found.append(finding("hands inside the object", "warning", where, value, rule, REMEDY))
+    if facts["flicker"] > FLICKER:
+        value = f"{facts['flicker']:.0%} of the masks changes its label where the image does not change"
+        found.append(finding("labels are noise", "warning", where, value, f"at most {FLICKER:.0%} is expected", REMEDY))
+    return found
+
+
+def look_at_tracks(camera: str, labels: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> list[Finding]:
+    """Findings about tracks: pixels [T, Q, 2] and visible [T, Q], with the masks' labels [T, H, W]."""
+    if not pixels.shape[1]:
+        return []
+    x, y = np.round(pixels[0]).astype(int).T
+    own = labels[0][y, x] == OBJECT
+    if not own.any():
+        return []
+    where, found = f"camera {camera}", []
+    if own.sum() < TRACKS:
+        value, rule = f"{own.sum()} points are followed on the object", f"at least {TRACKS} are expected"
+        remedy = "Film from nearer by, or raise points of perception.track."
+        found.append(finding("few tracks", "warning", where, value, rule, remedy))
+    alive = visible[:, own].mean(axis=1)
+    if low := np.flatnonzero(alive < FOLLOWED).tolist():
+        value = f"{alive.min():.0%} of the object's points are followed in frame {int(alive.argmin())}; few in {len(low)} frames"
+        level: Level = "warning" if len(low) >= OFTEN * len(visible) else "note"
+        remedy = f"Look at tracks.png; end the capture before frame {low[0]}, use more light or shorter exposures, or cotracker3."
+        found.append(finding("tracks lost", level, where, value, f"at least {FOLLOWED:.0%} are expected in every frame", remedy))
+    return found
 
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
@@ -98,9 +221,9 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
         rule = "springs of hands are made for their place in frame 0, so nothing moves the twin there"
         found.append(finding("grip elsewhere", "warning", "controllers", value, rule, f"End the capture before frame {frame}."))
     alive = lifted.object_visibility.mean(axis=1)
-    if (low := np.flatnonzero(alive < ALIVE)).size:
+    if (low := np.flatnonzero(alive < SEEN)).size:
         value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
-        rule = f"at least {ALIVE:.0%} are expected in every frame"
+        rule = f"at least {SEEN:.0%} are expected in every frame"
         found.append(finding("points lost", "warning", where, value, rule, f"End the capture before frame {low[0]}. {remedy}"))
     return found
 
@@ -109,9 +232,9 @@ def _in_image(image: ImageObservations) -> list[Finding]:
     """Points of the object that are lost in the image, and hands that were not followed."""
     found = []
     alive = image.visible[: len(image.inside)].mean(axis=1)
-    if (low := np.flatnonzero(alive < ALIVE)).size:
+    if (low := np.flatnonzero(alive < SEEN)).size:
         value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
-        rule = f"at least {ALIVE:.0%} are expected in every training frame; silhouettes alone say where the object is in the others"
+        rule = f"at least {SEEN:.0%} are expected in every training frame; silhouettes alone say where the object is in the others"
         found.append(finding("points lost", "warning", "tracks", value, rule, "Look at tracks.png."))
     if image.hand_sizes.max() > RESIZED or image.hand_sizes.min() < 1 / RESIZED:
         value = f"a hand appears {image.hand_sizes.min():.2f} to {image.hand_sizes.max():.2f} times as large as in frame 0"

@@ -5,28 +5,40 @@ camera contradicts a voxel if its mask shows neither the object nor a hand befor
 Without the second condition a hand that all cameras see would belong to the hull. Nothing under the table belongs to it.
 
 Where one camera alone shows the object there is no other witness: pixels of its mask without depth carve with the depth nearest to
-them, and the hull ends at the back that `perception.shape.back` guesses.
+them, and the hull ends at a back that is guessed, in depths along the optical axis, m. The local width of a silhouette at a pixel
+is the diameter 2 r of the largest disc inside it that covers the pixel; at a distance d from the edge a round body of that width is
+c(d) = 2 sqrt(r^2 - (r - d)^2) thick.
+
+fraction: back = seen + f c. symmetry: back = 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (a
+harmonic one, held at seen + c / 2 on the rim). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal
 
+import cv2
 import numpy as np
+import trimesh
 import warp as wp
 from scipy import ndimage
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
 from warp.geometry import IsoSurfaceMarchingCubes
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.results import Masks, ShapePrior
-from neuspring.perception.shape_back import back, front
-from neuspring.perception.shape_seen import invented_share, seen
 
 SEEN_WITHIN = 4.0
 """Voxels between a vertex of the shape and the depth of a camera that saw it: carving and smoothing move a surface by less."""
+RIM = 3
+"""Pixels that a rim is wide; depth is doubtful at its first."""
+LEAST = 0.006
+"""m: a body is at least this thick."""
 
 
 def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
@@ -68,7 +80,6 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     """Carve the surroundings of the object's `cloud` [P, 3], m, of frame 0. Raises InputError if nothing remains."""
     # A camera that does not have the object in view says nothing about it.
     showing = [name for name in capture.cameras if (masks[name].labels[0] == OBJECT).any()]
-    sign = 1.0 if capture.description.up == "+z" else -1.0
     # Measured depth by camera, and where the object ends, if that is guessed.
     sides: dict[str, tuple[np.ndarray, np.ndarray | None]] = {name: (capture.depth(name, 0), None) for name in showing}
     space, facts = cloud, dict[str, float]()
@@ -84,7 +95,7 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     counts = np.ceil((high - low) / settings.voxel).astype(int) + 1
     # Voxel centers [nx, ny, nz, 3].
     grid = low + settings.voxel * np.moveaxis(np.indices(counts), 0, -1)
-    hull = sign * grid[..., 2] > 0
+    hull = capture.description.up_sign * grid[..., 2] > 0
     shown = np.zeros_like(hull)
     for name in showing:
         admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], settings.tolerance)
@@ -149,3 +160,99 @@ def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float
     corners = points[faces]
     volume = (np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum()
     return points, faces if volume > 0 else faces[:, ::-1].copy()
+
+
+def front(mask: np.ndarray, depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Depth [H, W] of the seen surface: pixels of `mask` [H, W] without a depth between `near` and `far` get that of the nearest
+    pixel of the mask that has one. Zero outside the mask, and everywhere if no pixel has one."""
+    usable = mask & (depth > near) & (depth < far)
+    if not usable.any():
+        return np.zeros(depth.shape)
+    nearest = ndimage.distance_transform_edt(~usable, return_distances=False, return_indices=True)
+    return np.where(mask, depth[tuple(nearest)], 0.0)
+
+
+def back(labels: np.ndarray, seen: np.ndarray, focal: float, how: Literal["symmetry", "fraction"], share: float) -> np.ndarray:
+    """Depth [H, W] of the back, from labels [H, W], the `seen` surface [H, W] and the focal length in pixels; zero outside the
+    object. `share` is f of `fraction`."""
+    mask = labels == OBJECT
+    chord = round_chord(mask) * seen / focal
+    if how == "fraction":
+        thickness = share * chord
+    else:
+        # Beyond the edge as at the edge, so that the median of a rim's pixel is one of the object.
+        extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
+        smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
+        open_side = (labels != OBJECT) & (labels != HANDS)
+        rim = mask & _grown(open_side, RIM) & ~_grown(labels == HANDS, RIM + 1)
+        if not rim.any():
+            rim = mask & _grown(~mask, RIM)
+        thickness = 2.0 * (_spanned(smooth + 0.5 * chord, rim, mask) - smooth)
+    return np.where(mask, seen + np.maximum(thickness, LEAST), 0.0)
+
+
+def round_chord(mask: np.ndarray) -> np.ndarray:
+    """c(d) [H, W], pixels, of a silhouette `mask` [H, W]; zero outside it."""
+    distance = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    ridge = mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5)
+    y, x = np.nonzero(ridge)
+    radius = np.ascontiguousarray(distance)
+    # Larger discs are drawn over smaller ones.
+    for k in np.argsort(distance[y, x], kind="stable"):
+        cv2.circle(radius, (int(x[k]), int(y[k])), int(distance[y[k], x[k]]), float(distance[y[k], x[k]]), -1)
+    radius = np.maximum(radius, distance)
+    return np.where(mask, 2.0 * np.sqrt(np.maximum(distance * (2.0 * radius - distance), 0.0)), 0.0)
+
+
+def _grown(mask: np.ndarray, reach: int) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+
+
+def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The harmonic surface [H, W] over `mask` that has `values` on its `rim`: each other pixel is the mean of its neighbors."""
+    index = np.full(mask.shape, -1)
+    index[mask] = np.arange(mask.sum())
+    down, right = ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))
+    pairs = np.concatenate([np.stack([a[(a >= 0) & (b >= 0)], b[(a >= 0) & (b >= 0)]]) for a, b in (down, right)], axis=1)
+    graph = coo_matrix((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(int(mask.sum()),) * 2)
+    graph = graph + graph.T
+    held = rim[mask].astype(float)
+    # A piece of the mask without a rim would be free; it is held, weakly, where it is.
+    held = np.where(held > 0, 1.0, 1e-6)
+    laplacian = diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
+    result = np.zeros(mask.shape)
+    result[mask] = spsolve((laplacian + diags(held)).tocsc(), held * values[mask])
+    return result
+
+
+def seen(
+    vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float, faces: np.ndarray | None = None
+) -> np.ndarray:
+    """Whether some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
+
+    With `faces` [F, 3], outward, a vertex must face that camera too: the back of a rope lies within any reach of its front.
+    """
+    result = np.zeros(len(vertices), dtype=bool)
+    normals = None if faces is None else trimesh.Trimesh(vertices, faces, process=False).vertex_normals
+    for name, camera in capture.cameras.items():
+        shown = visible(vertices, camera, masks[name].labels[0] == OBJECT, capture.depth(name, 0), reach)
+        if normals is not None:
+            shown &= ((camera.camera_to_world[:3, 3] - vertices) * normals).sum(axis=1) > 0
+        result |= shown
+    return result
+
+
+def visible(vertices: np.ndarray, camera: Camera, mask: np.ndarray, depth: np.ndarray, reach: float) -> np.ndarray:
+    """Whether the camera shows the object within `reach`, m, of each vertex [V]."""
+    pixels, distance = camera.project(vertices)
+    result = camera.sees(pixels) & (distance > 0)
+    x, y = np.round(pixels[result]).astype(int).T
+    result[result] = mask[y, x] & (np.abs(depth[y, x] - distance[result]) < reach)
+    return np.asarray(result)
+
+
+def invented_share(vertices: np.ndarray, faces: np.ndarray, was_seen: np.ndarray) -> float:
+    """Share of the area of a mesh whose corners [F, 3] no camera saw; a face counts by the share of its corners."""
+    corners = vertices[faces].astype(float)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return float((area * (~was_seen[faces]).mean(axis=1)).sum() / area.sum())

@@ -1,0 +1,285 @@
+"""Captures of color alone: one calibrated camera without depth, the table known. The object in frame 0 is its silhouette, lying on
+the table; hands and silhouettes of later frames are evidence in the image.
+
+With up as +z, the pixel p shows the object's upper side at height t(p), where its ray meets the plane z = t(p):
+
+    sheets   (`flat`, such as cloth)  t = `sheet_thickness`; nodes lie at t / 2
+    ropes    (`round`)                t = c(p) s, a round cross-section on the table
+    bodies   (all others)             t = `body_thickness` c(p) s
+
+The lower side of ropes and bodies is the table: the silhouette is inflated symmetrically about its middle t / 2, and rests. Nodes
+fill it, as single nodes in the middle would fall to the table.
+
+c(p) is the width of the silhouette at p, in pixels, rounded towards its edge (shape.round_chord), and s the width of a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from neuspring.config.perception import ColorSettings, Perception
+from neuspring.core.artifacts import ImageObservations
+from neuspring.core.errors import InputError
+from neuspring.core.geometry import farthest
+from neuspring.data.capture import CAPTURE, HANDS, NOTHING, OBJECT, Camera, Capture
+from neuspring.perception.color_hands import follow_hands, grips
+from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.perception.shape import no_prior, round_chord, shape_prior
+from neuspring.twin.hand_paths import depths_of, place
+
+BAND = 30.0
+"""How far from the object points beside it were drawn, pixels."""
+ROPE_WIDEST = 1.5
+"""Largest thickness of a rope over its median."""
+HIDDEN_STRIDE = 3
+"""Of the object's pixels beneath hands each third gets a point."""
+
+
+@dataclass(frozen=True)
+class FirstFrame:
+    """Where the object is in frame 0; up is +1 or -1."""
+
+    camera: Camera
+    up: float
+    kind: str
+    """flat, round or body."""
+    filled: np.ndarray
+    """[H, W] bool: the object, and what of it lies beneath hands."""
+    heights: np.ndarray
+    """t [H, W], m; 0 outside."""
+    pixel_size: float
+    """Width of a pixel at the object, m (median)."""
+
+    @classmethod
+    def of(cls, capture: Capture, labels: np.ndarray, settings: ColorSettings) -> FirstFrame:
+        """From the labels [H, W] of frame 0. Raises InputError without an object in view of the table."""
+        camera = next(iter(capture.cameras.values()))
+        category = capture.description.category
+        kind = "flat" if category in settings.flat else "round" if category in settings.round else "body"
+        if not (labels == OBJECT).any():
+            raise InputError(f"{capture.folder}, masks of frame 0", "the object must be in view", "none of its pixels")
+        y, x = np.nonzero(labels == OBJECT)
+        below = camera_depth(camera, np.stack([x, y], axis=1), 0.0)
+        if not (np.isfinite(below) & (below > 0)).all():
+            rule = "every pixel of the object in frame 0 must look at the table, z = 0"
+            remedy = "Check camera_to_world and up: without depth the table is where they say."
+            raise InputError(f"{capture.folder / CAPTURE}, camera_to_world", rule, "some look above the horizon", remedy)
+        size = float(np.median(below)) / camera.intrinsics[0, 0]
+        filled = beneath_hands(labels, settings.beneath / size)
+        chord = round_chord(filled) * size
+        factor = settings.body_thickness if kind == "body" else 1.0
+        heights = np.where(filled, settings.sheet_thickness, 0.0) if kind == "flat" else factor * chord
+        if kind == "round":
+            # Where the silhouette is wider than a rope it shows two turns, or a shadow.
+            heights = np.minimum(heights, ROPE_WIDEST * np.median(heights[filled]))
+        return cls(camera, capture.description.up_sign, kind, filled, heights, size)
+
+    @property
+    def front(self) -> np.ndarray:
+        """Depth [H, W], m, of the upper side; 0 outside."""
+        return self._depths(1.0)
+
+    @property
+    def back(self) -> np.ndarray:
+        """Depth [H, W], m, of the lower side: the table."""
+        return self._depths(0.0)
+
+    def points(self, pixels: np.ndarray) -> np.ndarray:
+        """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
+
+        Pixels outside of the silhouette have the height of its nearest pixel.
+        """
+        share = 0.5 if self.kind == "flat" else 1.0
+        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
+
+    def fingers(self, pixels: np.ndarray) -> np.ndarray:
+        """World points [n, 3], m, where fingers hold the object: a sheet by its upper side, others at half their height.
+
+        There is no point of the object there (`points`): a spring between the two would have no length.
+        """
+        share = 1.0 if self.kind == "flat" else 0.5
+        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
+
+    def _up(self, pixels: np.ndarray) -> np.ndarray:
+        """z of the upper side at pixels [n], m."""
+        _, labels = cv2.distanceTransformWithLabels((~self.filled).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        height_of = np.zeros(labels.max() + 1)
+        height_of[labels[self.filled]] = self.heights[self.filled]
+        x, y = np.round(pixels).astype(int).T
+        rows, columns = np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)
+        return np.asarray(self.up * height_of[labels[rows, columns]])
+
+    def _depths(self, share: float) -> np.ndarray:
+        y, x = np.nonzero(self.filled)
+        depth = np.zeros(self.filled.shape)
+        depth[y, x] = camera_depth(self.camera, np.stack([x, y], axis=1), share * self.up * self.heights[y, x])
+        return depth
+
+
+def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> np.ndarray:
+    """Depth [n], m along the optical axis, at which the rays of pixels (x, y) [n, 2] meet the planes at z [n]; inf: never."""
+    rays = camera.lift(pixels.astype(float), np.ones(len(pixels))) - camera.camera_to_world[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (z - camera.camera_to_world[2, 3]) / rays[:, 2]
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
+
+
+def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
+    """The object [H, W] bool with what hands hide of it: their pixels that lie between pixels of the object.
+
+    A hand's pixel lies between them if it is in the object's closing by a disc of radius `reach`, pixels.
+    """
+    radius = max(round(reach), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+    padded = np.pad((labels == OBJECT).astype(np.uint8), radius)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius] > 0
+    return np.asarray((labels == OBJECT) | (closed & (labels == HANDS)))
+
+
+def lift_color(
+    capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, settings: ColorSettings, controllers: int
+) -> tuple[LiftedTracks, ImageObservations]:
+    """Tracks and hands in the world as far as they are known, and the evidence in the image.
+
+    labels [T, H, W] are masks. The object's points are known in frame 0; beneath hands some are added that no track has. Raises
+    InputError without tracks on the object, or without a hand.
+    """
+    camera, name, frames = first.camera, first.camera.name, capture.frame_count
+    where = f"{capture.folder}, perception"
+    start = np.round(tracks.pixels[0]).astype(int)
+    own = labels[0][start[:, 1], start[:, 0]] == OBJECT
+    if not own.any():
+        raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
+    y, x = np.nonzero(first.filled & (labels[0] != OBJECT))
+    hidden = np.stack([x, y], axis=1)[::HIDDEN_STRIDE].astype(np.float32)
+    pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
+    visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
+    # Nothing of the object is handed on from future frames.
+    visible[capture.train_end :] = False
+    pixels = np.where(visible[..., None], pixels, 0.0)
+    places = np.concatenate([tracks.pixels[0, own], hidden])
+    points = np.zeros((frames, len(places), 3))
+    points[0] = first.points(places)
+    known = np.zeros((frames, len(places)), bool)
+    known[0] = True
+    # A hand above a sheet hides more of it than its fingers hold.
+    length = settings.grip_length if first.kind == "flat" else np.inf
+    sizes = (settings.grip_reach, settings.hands_apart, length)
+    held = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
+    if not held:
+        raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", "Mark the hands in frame 0.")
+    motion = follow_hands(capture, name, labels, held, settings.hand_radius / first.pixel_size)
+    chosen = [grip[farthest(grip.astype(float), max(controllers // len(held), 4))] for grip in held]
+    hand_of = np.concatenate([np.full(len(grip), hand) for hand, grip in enumerate(chosen)])
+    image = ImageObservations(
+        width=camera.width,
+        height=camera.height,
+        intrinsics=camera.intrinsics,
+        camera_to_world=camera.camera_to_world,
+        pixel_size=first.pixel_size,
+        pixels=pixels,
+        visible=visible,
+        **silhouettes(labels[: capture.train_end], settings),
+        cell=settings.cell,
+        hand_of=hand_of,
+        hand_centers=motion.centers,
+        hand_angles=motion.angles,
+        hand_sizes=motion.sizes,
+        marked=capture.points(name),
+    )
+    grip_points = np.concatenate([first.fingers(grip) for grip in chosen])
+    guess = depths_of(image, {"hand_tilt": settings.hand_tilt, "hand_size": 0.0}, capture.train_end, first.up)
+    y, x = np.nonzero(first.filled)
+    cloud_pixels = np.stack([x, y], axis=1)
+    colors = capture.color(name, 0) / 255.0
+    place_rows = np.round(places).astype(int)
+    facts = {
+        "object_tracks": float(own.sum()),
+        "hidden_points": float(len(hidden)),
+        "visible_share": float(visible[: capture.train_end].mean()),
+        "controllers": float(len(hand_of)),
+        "hands": float(len(held)),
+        "hand_lost_frames": float(motion.lost),
+        "smallest_hand": float(motion.sizes.min()),
+        "largest_hand": float(motion.sizes.max()),
+        "pixel_size_mm": 1e3 * first.pixel_size,
+        "highest_mm": 1e3 * float(first.heights.max()),
+    }
+    lifted = LiftedTracks(
+        object_points=points,
+        object_visibility=known,
+        object_motion_valid=np.zeros_like(known),
+        object_colors=colors[place_rows[:, 1], place_rows[:, 0]],
+        controller_points=place(image, grip_points, guess),
+        cloud=first.points(cloud_pixels),
+        cloud_colors=colors[y, x],
+        backend=f"color alone, {first.kind}",
+        facts=facts,
+    )
+    return lifted, image
+
+
+def silhouettes(labels: np.ndarray, settings: ColorSettings) -> dict[str, np.ndarray]:
+    """`inside` and `outside` of ImageObservations from labels [E, H, W]."""
+    frames, height, width = labels.shape
+    rng = np.random.default_rng(0)
+    count, cell = settings.samples, settings.cell
+    inside = np.full((frames, count, 2), np.nan, np.float32)
+    outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
+    for frame, label in enumerate(labels):
+        away = cv2.distanceTransform((label == NOTHING).astype(np.uint8), cv2.DIST_L2, 5)
+        padded = np.pad(away, ((0, -height % cell), (0, -width % cell)), mode="edge")
+        outside[frame] = padded.reshape(outside.shape[1], cell, outside.shape[2], cell).mean(axis=(1, 3))
+        from_object = cv2.distanceTransform((label != OBJECT).astype(np.uint8), cv2.DIST_L2, 5)
+        if not (label == OBJECT).any():
+            # Out of view: nothing says where it is.
+            outside[frame] = 0.0
+            continue
+        y, x = np.nonzero(label == OBJECT)
+        rows = rng.choice(len(x), min(count, len(x)), replace=False)
+        inside[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
+        # As many points were once drawn beside the object too; without that draw the samples of later frames would be others.
+        near = int(((label == NOTHING) & (from_object <= BAND)).sum())
+        rng.choice(near, min(count, near), replace=False)
+    return {"inside": inside, "outside": outside}
+
+
+@dataclass(frozen=True, eq=False)
+class Supposed(Capture):
+    """A capture whose depth in frame 0 is that of the supposed shape."""
+
+    front: np.ndarray
+    """[H, W], m."""
+
+    def depth(self, camera: str, frame: int) -> np.ndarray:
+        """Depth [H, W], m."""
+        return self.front if frame == 0 else super().depth(camera, frame)
+
+
+def from_color(
+    capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception
+) -> tuple[LiftedTracks, ShapePrior, ImageObservations]:
+    """What `lift` and `shape_prior` make of captures with depth, and the evidence of the image.
+
+    The prior of ropes and bodies is what lies between their supposed upper side and the table (`first_frame`), or a mesh that is
+    placed on the upper side. Sheets have none. Raises InputError without object, hands or tracks.
+    """
+    name = next(iter(capture.cameras))
+    labels = masks[name].labels
+    first = FirstFrame.of(capture, labels[0], settings.color)
+    lifted, image = lift_color(capture, labels, tracks[name], first, settings.color, settings.lift.controllers)
+    supposed = Supposed(capture.folder, capture.description, first.front)
+    whole = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
+    shape = settings.shape
+    if first.kind == "flat" and shape.backend == "auto":
+        return lifted, no_prior(), image
+    y, x = np.nonzero(first.filled)
+    lower = first.camera.lift(np.stack([x, y], axis=1).astype(float), first.back[y, x])
+    cloud = lifted.cloud if shape.backend == "mesh" else np.concatenate([lifted.cloud, lower])
+    # Behind the upper side all belongs to the object, down to the table.
+    prior = shape_prior(supposed, {name: whole}, cloud, replace(shape, back="none"))
+    return lifted, replace(prior, backend=f"{prior.backend}, {lifted.backend}"), image
