@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from neuspring.core.artifacts import Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
@@ -14,6 +18,7 @@ from neuspring.physics import reference
 from neuspring.twin import rollout
 from tests.support.scenes import DEVICES, no_hands, random_scene, scene, solver_for, twin_of
 
+SINGLE, DOUBLE = torch.float32, torch.float64
 DISTANCE = 0.02
 
 
@@ -30,7 +35,7 @@ def clump(crowded: int, pairs: int) -> np.ndarray:
     return np.stack([others, lonely], axis=1).reshape(-1, 3)
 
 
-def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") -> tuple[list[list[int]], int]:
+def lists(x: np.ndarray, capacity: int, frames: int, device: str) -> tuple[list[list[int]], int]:
     """Partner lists after `frames` frames that do not move anything, and the overflow reported."""
     body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
     solver = solver_for(body, 0, device)
@@ -51,25 +56,16 @@ def lists(x: np.ndarray, capacity: int, frames: int = 1, device: str = "cpu") ->
     return [row[:n].tolist() for row, n in zip(partners, count, strict=True)], solver.collision_overflow
 
 
-def expected_lists(x: np.ndarray) -> list[list[int]]:
-    pairs = reference.candidates(x, DISTANCE)
-    return [pairs[pairs[:, 0] == i, 1].tolist() for i in range(len(x))]
-
-
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("capacity", [1, 2, 5, 500])
 def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -> None:
     """Every list holds the first `capacity` partners in node order, whatever its neighbors' lists hold."""
     x = clump(7, 4)
-    partners, overflow = lists(x, capacity, device=device)
-    wanted = expected_lists(x)
+    partners, overflow = lists(x, capacity, frames=3, device=device)
+    wanted = expected(x, DOUBLE, DISTANCE)
     assert sorted(len(row) for row in wanted) == [0] * 15 + [1] * 8 + [6] * 7
     assert partners == [row[:capacity] for row in wanted]
-    assert overflow == 7 * max(6 - capacity, 0)
-
-
-def test_overflow_adds_up_over_frames() -> None:
-    assert lists(clump(7, 4), 2, frames=3)[1] == 3 * 7 * 4
+    assert overflow == 3 * 7 * max(6 - capacity, 0)
 
 
 def test_a_full_list_still_collides_with_its_partners() -> None:
@@ -83,7 +79,7 @@ def test_a_full_list_still_collides_with_its_partners() -> None:
         solver = solver_for(body, 0)
         nobody = torch.zeros(0, 3, dtype=torch.float64)
         states.append(solver.forward(torch.tensor(x), torch.tensor(v), nobody, nobody)[1].numpy())
-    complete = np.array([len(row) == 1 for row in expected_lists(x)])
+    complete = np.array([len(row) == 1 for row in expected(x, DOUBLE, DISTANCE)])
     np.testing.assert_array_equal(states[0][complete], states[1][complete])
     assert (states[1][complete] != v[complete]).any()
     assert np.isfinite(states[0]).all()
@@ -101,6 +97,109 @@ def test_candidates_come_from_the_frame_start() -> None:
         for _ in range(engine_frames):
             state = solver.forward(*state, nobody, nobody)
         np.testing.assert_allclose(state[1], speed[-1], atol=1e-14)
+
+
+# Lists of collision partners ------------------------------------------------------------------------------------------
+
+
+def partners(clouds: Sequence[np.ndarray], dtype: torch.dtype, capacity: int, distance: float) -> tuple[list[Any], list[int]]:
+    """Lists of partners at the start of a frame, of each twin and node, and what did not fit, of each twin."""
+    options: dict[str, Any] = {"self_collision": True, "contact_distance": distance, "collision_capacity": capacity}
+    solver = solver_for([scene(len(cloud), **options) for cloud in clouds], 0, dtype=dtype)
+    x, nobody = torch.tensor(np.stack(clouds), dtype=dtype), torch.zeros(len(clouds), 0, 3, dtype=dtype)
+    solver.forward(x, 0 * x, nobody, nobody)
+    b = solver.buffers
+    near, lanes, counts = (b.indices[name].numpy() for name in ("near", "near_lanes", "near_count"))
+    lists = []
+    for twin in range(len(clouds)):
+        group, lane = divmod(twin, b.width)
+        rows = zip(near[..., group], lanes[..., group] >> lane & 1, counts[:, group], strict=True)
+        lists.append([row[:count][bits[:count] == 1].tolist() for row, bits, count in rows])
+    return lists, solver.overflows
+
+
+def expected(cloud: np.ndarray, dtype: torch.dtype, distance: float) -> list[list[int]]:
+    """The same from the specification, in the engine's precision."""
+    kind = np.float32 if dtype == SINGLE else np.float64
+    pairs = reference.candidates(cloud.astype(kind), kind(distance))
+    return [pairs[pairs[:, 0] == i, 1].tolist() for i in range(len(cloud))]
+
+
+def cloud(kind: str) -> np.ndarray:
+    """[N, 3] around the origin, far from it, on the borders of the grid's cells, or wider than the grid."""
+    rng, steps = np.random.default_rng(3), np.arange(-3, 4) * DISTANCE / 2
+    lattice = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    return {
+        "around the origin": rng.uniform(-0.04, 0.04, (150, 3)),
+        "far away": rng.uniform(-0.04, 0.04, (150, 3)) + np.array([900.0, -700.0, 500.0]),
+        "cell borders": lattice,
+        "far cell borders": lattice + np.array([5000, -3000, 7000]) * DISTANCE,
+        "just off cell borders": lattice + rng.choice([-1e-7, 0.0, 1e-7], lattice.shape),
+        # Points 64 cells apart share a cell.
+        "wider than the grid": rng.uniform(-0.03, 0.03, (150, 3)) + rng.integers(0, 2, (150, 3)) * 64 * DISTANCE,
+        "in one place": np.repeat(rng.uniform(-0.04, 0.04, (5, 3)), 6, axis=0),
+    }[kind]
+
+
+CLOUDS = ("around the origin", "far away", "cell borders", "far cell borders", "just off cell borders", "wider than the grid",
+          "in one place")  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype) -> None:
+    x = cloud(kind)
+    wanted = expected(x, dtype, DISTANCE)
+    assert sum(map(len, wanted)) > len(x)
+    lists, overflow = partners([x], dtype, 500, DISTANCE)
+    assert lists == [wanted]
+    assert overflow == [0]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.005, 0.1), st.floats(-3.0, 3.0), st.sampled_from([SINGLE, DOUBLE]))
+def test_the_grid_finds_all_pairs_of_any_cloud(seed: int, distance: float, decades: float, dtype: torch.dtype) -> None:
+    """Random clouds of random extent, at random distances of up to a kilometer from the origin."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-2, 2, (30, 3)) * distance + rng.uniform(-1, 1, 3) * 10.0**decades
+    assert partners([x], dtype, 500, distance)[0] == [expected(x, dtype, distance)]
+
+
+def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
+    """Twins in which different nodes, 3 to 8 of them, are all near each other; the others are lonely."""
+    clouds = []
+    for twin in range(count):
+        rng = np.random.default_rng(twin)
+        x, crowd = np.arange(1, nodes + 1)[:, None] * [0.0, 1.0, 0.0], rng.permutation(nodes)[: 3 + twin % 6]
+        x[crowd] = rng.uniform(-0.004, 0.004, (len(crowd), 3))
+        clouds.append(x)
+    return clouds
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 50])
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int) -> None:
+    """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
+    clouds = crowds(17 if dtype == SINGLE else 4)
+    clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
+    lists, overflow = partners(clouds, dtype, capacity, DISTANCE)
+    wanted = [expected(x, dtype, DISTANCE) for x in clouds]
+    assert lists == [[row[:capacity] for row in rows] for rows in wanted]
+    assert overflow == [sum(max(len(row) - capacity, 0) for row in rows) for rows in wanted]
+    assert (overflow[2] > 100) == (capacity < 50)
+
+
+def test_contact_distances_are_those_of_each_twin() -> None:
+    """The grid's cells are as wide as the largest; a twin with a smaller one lists no more than its own."""
+    x = cloud("around the origin")
+    scenes = [scene(len(x), self_collision=True, contact_distance=distance) for distance in (0.005, 0.02, 0.011)]
+    solver, nobody = solver_for(scenes, 0), torch.zeros(3, 0, 3, dtype=DOUBLE)
+    stacked = torch.tensor(np.stack([x] * 3))
+    solver.forward(stacked, 0 * stacked, nobody, nobody)
+    found = solver.buffers.indices["near_lanes"][..., 0]
+    listed = torch.arange(found.shape[1]) < solver.buffers.indices["near_count"]
+    counts = [int(((found >> lane & 1) * listed).sum()) for lane in range(3)]
+    assert counts == [len(reference.candidates(x, distance)) for distance in (0.005, 0.02, 0.011)]
 
 
 # Rollouts -------------------------------------------------------------------------------------------------------------
@@ -130,7 +229,7 @@ def thrown(frames: int, when: int, speed: float) -> tuple[Twin, np.ndarray]:
     return twin_of(body, np.zeros((1, 3)), hands[0]), hands
 
 
-def test_a_diverged_rollout_is_a_named_result() -> None:
+def test_a_diverged_rollout_is_a_named_result(tmp_path) -> None:
     """It keeps the frames before, says when and why, and round-trips through its file."""
     twin, hands = thrown(8, 4, 1e7)
     result = rollout.roll_out(twin, hands)
@@ -138,22 +237,14 @@ def test_a_diverged_rollout_is_a_named_result() -> None:
     assert result.reason == "node 0 left the scene in frame 4"
     assert result.frame_count == 8
     assert result.positions.shape == (4, 1, 3)
-    assert np.isfinite(result.positions).all()
+    result.save(tmp_path / "trajectory.npz")
+    again = Trajectory.load(tmp_path / "trajectory.npz")
+    assert (again.diverged_frame, again.reason, len(again.positions)) == (4, result.reason, 4)
 
 
 def test_a_rollout_that_ends_in_nan_is_diverged_too() -> None:
     """NaN compares false with everything; infinite forces make NaN within the frame."""
-    twin, hands = thrown(5, 2, np.finfo(np.float32).max)
-    result = rollout.roll_out(twin, hands)
-    assert result.diverged_frame == 2
-    assert np.isfinite(result.positions).all()
-
-
-def test_a_saved_divergence_stays_one(tmp_path) -> None:
-    result = rollout.roll_out(*thrown(8, 4, 1e7))
-    result.save(tmp_path / "trajectory.npz")
-    again = Trajectory.load(tmp_path / "trajectory.npz")
-    assert (again.diverged_frame, again.reason, len(again.positions)) == (4, result.reason, 4)
+    assert rollout.roll_out(*thrown(5, 2, np.finfo(np.float32).max)).diverged_frame == 2
 
 
 def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
@@ -173,15 +264,6 @@ def test_an_unstable_rollout_is_refused() -> None:
     twin = twin_of(replace(body, simulation=replace(body.simulation, frame_time=1.0, substeps=1)), x, hands[0])
     with pytest.raises(InputError, match="substep must stay below"):
         rollout.roll_out(twin, hands)
-
-
-def test_a_missing_device_is_named() -> None:
-    from neuspring.core.device import resolve_device
-
-    assert resolve_device("cpu") == "cpu"
-    assert resolve_device("auto") in ("cpu", "cuda:0")
-    with pytest.raises(InputError, match=r"CUDA devices|build for the CPU alone"):
-        resolve_device("cuda:99")
 
 
 def test_a_topology_without_springs_rolls_out() -> None:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from neuspring.core.artifacts import Simulation
 from neuspring.physics import reference
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import PARAMETERS, pack
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
-from tests.support.scenes import VARIANTS, packed, random_scene, scene, solver_for, tensors, with_values
+from tests.support.scenes import VARIANTS, packed, random_scene, solver_for, tensors, with_values
 
 FRAMES = 1e-5
 """Relative to the largest entry of the gradient compared, over one to three frames of 10 substeps."""
@@ -178,18 +175,3 @@ def test_contact_distance_only_selects() -> None:
     after, _ = simulate_frame(solver_for(body, 2), parameters, torch.tensor(x), torch.tensor(v), motion[0], motion[1])
     after.sum().backward()
     assert values["contact_distance"].grad is None
-
-
-def test_one_spring_by_hand() -> None:
-    """One substep of one spring between a controller and a node: v' = dt Y (l / l0 - 1), so dv'/dY = dt (l / l0 - 1)."""
-    body = scene(1, [(1, 0)], [0.5], stiffness=7.0, substeps=1, frame_time=0.01)
-    assert isinstance(body.simulation, Simulation)
-    stiffness = torch.tensor([7.0], dtype=torch.float64, requires_grad=True)
-    values = tensors(replace(body)) | {"stiffness": stiffness}
-    hand = torch.tensor([[0.6, 0.0, 0.0]], dtype=torch.float64)
-    zero = torch.zeros(1, 3, dtype=torch.float64)
-    _, v = simulate_frame(solver_for(body, 1), pack(**values, substep=0.01), zero, zero, hand, hand)
-    v[0, 0].backward()
-    assert float(v[0, 0].detach()) == pytest.approx(0.01 * 7.0 * 0.2)
-    assert stiffness.grad is not None
-    assert float(stiffness.grad) == pytest.approx(0.01 * 0.2)

@@ -1,4 +1,4 @@
-"""Grips that begin later than frame 0: no force when they begin, the reference, closed forms, gradients, all ways to run."""
+"""Controllers that hold in a part of the frames, or take hold later: closed forms, the reference, gradients, all ways to run."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.physics import solver as frame_solver
 from neuspring.physics.controllers import Grips, waypoints
@@ -38,6 +39,36 @@ def run(body, x, v, rows, device="cpu", threads=False):
     for begin, end in pairwise(rows):
         states.append(solver.forward(*states[-1], begin.to(device), end.to(device)))
     return tuple(torch.stack(values).cpu().numpy() for values in zip(*states, strict=True))
+
+
+@pytest.mark.parametrize(("device", "threads"), WAYS)
+def test_a_body_let_go_in_the_air_falls_freely(device, threads):
+    """Two nodes and the spring between them, held above by a controller; frames of 10 ms."""
+    springs = {"stiffness": [50.0, 80.0], "dashpot": [0.5, 0.3]}
+    body = scene(2, [(0, 1), (0, 2)], [0.1, 0.1], **springs, gravity=9.8, frame_time=0.01, substeps=20)
+    x, v = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.9]]), np.zeros((2, 3))
+    hands = np.array([0.0, 0.0, 1.1]) + np.arange(9)[:, None, None] * np.array([0.002, 0.0, 0.001])
+    valid = np.arange(9)[:, None] < 4
+    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
+    momentum, dt = vs.sum(axis=1), body.simulation.substep
+    # Held up to frame 3, so that the fall begins there: each substep adds 2 g dt to the momentum of two kilograms.
+    for frame in range(3, 8):
+        gained = np.array([0.0, 0.0, -2 * 9.8 * 0.01])
+        np.testing.assert_allclose(momentum[frame + 1] - momentum[frame], gained, atol=ROUNDING)
+    assert np.abs(momentum[3] - momentum[2] - [0.0, 0.0, -2 * 9.8 * 0.01]).max() > 1e-3
+    # Symplectic Euler of a center that falls from v0: after n substeps n v0 dt - g dt^2 n (n + 1) / 2.
+    n = 20 * 5
+    fallen = n * momentum[3] / 2 * dt - np.array([0, 0, 9.8]) * dt**2 * n * (n + 1) / 2
+    np.testing.assert_allclose(xs[8].mean(axis=0) - xs[3].mean(axis=0), fallen, atol=ROUNDING)
+
+
+def test_where_all_hold_nothing_changes_bit_for_bit():
+    body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02)
+    plain, every = (waypoints(torch.tensor(hands), valid) for valid in (None, np.ones(hands.shape[:2], bool)))
+    assert torch.equal(plain, every)
+    flagged = torch.cat([plain, torch.ones(*plain.shape[:2], 1, dtype=plain.dtype)], dim=-1)
+    for one, other in zip(run(body, x, v, plain), run(body, x, v, flagged), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def caught(frames):
@@ -128,7 +159,7 @@ def test_gradients_through_grips_are_exact(name):
     assert_gradients({name: learned.grad.numpy()}, wanted, FRAMES)
 
 
-def test_gradients_straight_from_the_solver_refuse_grips_that_it_took_itself():
+def test_rows_of_another_width_and_gradients_of_grips_that_a_solver_took_itself_are_refused():
     body, x, v, hands, valid = late_scene()
     rows, state = waypoints(torch.tensor(hands), valid), (torch.tensor(x), torch.tensor(v))
     solver = solver_for(body, hands.shape[1])
@@ -136,6 +167,8 @@ def test_gradients_straight_from_the_solver_refuse_grips_that_it_took_itself():
         state = solver.forward(*state, begin, end)
     with pytest.raises(AssertionError, match="simulate_frame"):
         solver.backward(*state)
+    with pytest.raises(InputError, match="3 numbers per controller are required, or 4"):
+        solver.forward(*state, rows[0], rows[0, :, :3])
 
 
 def test_all_ways_to_roll_out_take_the_same_grips():
