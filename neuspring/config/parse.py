@@ -24,7 +24,6 @@ RENAMED = {
     "colour_rate": "color_rate",
     "neighbourhood": "neighborhood",
     "outlier_neighbours": "outlier_neighbors",
-    "least_neighbours": "least_neighbors",
     "carry_over": REMOVED,
     "average_seeds": REMOVED,
     "ranges": "now variables.NAME: {low: ..., high: ...}",
@@ -40,6 +39,18 @@ RENAMED |= dict.fromkeys(
         *("rest_lengths_by", "field.scale", "field.controllers"),
     ),
     REMOVED,
+)
+RENAMED |= dict.fromkeys(("sequential_motion_filter", "coordinate_outliers", "whole_pixels", "depth_window"), "lift.released")
+RENAMED |= dict.fromkeys(
+    (
+        *("perception.segment.marks.smoothness", "perception.segment.marks.reach"),
+        *("perception.segment.opencv.smoothing", "perception.segment.opencv.smallest"),
+        *("perception.track.opencv.levels", "perception.track.opencv.forward_backward", "perception.lift.least_neighbors"),
+        *("perception.shape.margin", "perception.shape.tolerance", "perception.shape.smoothing", "perception.shape.bend_reach"),
+        *("perception.sample.surface", "perception.sample.interior"),
+        *(f"perception.color.{name}" for name in ("beneath", "hands_apart", "hand_radius", "samples", "band", "cell")),
+    ),
+    "a constant beside its user in neuspring/perception now",
 )
 """Keys of older versions -> their name now, or a sentence that says where they went. An entry is a key or its dotted path."""
 

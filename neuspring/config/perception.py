@@ -20,10 +20,6 @@ class OpenCvSegmentation(Section):
     """Hue of hands or gloves in Lab, degrees (atan2(b, a)); the default is skin."""
     hand_chroma: Range = (9.0, 36.0)
     """Chroma of hands or gloves in Lab."""
-    smoothing: Positive = 1.5
-    """Width, pixels, over which the decision between hand and object is averaged."""
-    smallest: NonNegative = 0.0004
-    """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
     boxes: dict[Name, tuple[Finite, Finite, Finite, Finite]] = field(default_factory=dict)
     """Region of interest: by camera, left, top, right and bottom, pixels. Cameras that are not named have none."""
     table: tuple[Range, Range] | None = None
@@ -44,10 +40,6 @@ class OpenCvSegmentation(Section):
 class MarksSegmentation(Section):
     """Segmentation from the marks of a user (`marks.json` of the capture), carried through the video."""
 
-    smoothness: NonNegative = 1.5
-    """Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
-    reach: Positive = 4.0
-    """How far the border may be from where the flow carries it, pixels at a width of 848."""
     background: bool = True
     """Learn the color of every pixel of the background; for a camera that stands still."""
     scale: Annotated[float, Field(gt=0, le=4)] = 1.0
@@ -64,10 +56,6 @@ class OpenCvTracking(Section):
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
     window: Annotated[int, Field(ge=5)] = 9
     """Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
-    levels: Annotated[int, Field(ge=0)] = 3
-    """Levels of the image pyramid, beside the image itself."""
-    forward_backward: Positive = 0.5
-    """Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
     reacquire: bool = True
     """Look for lost points again by their appearance in frame 0."""
     likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
@@ -112,16 +100,10 @@ class Lift(Section):
 
     depth_range: Range = (0.2, 1.5)
     """Depth that is used, m along the optical axis."""
-    depth_window: Count = 3
-    """Side of the window, pixels, whose median depth inside the mask a track gets; 1: as released."""
-    whole_pixels: bool = False
-    """Lift the nearest whole pixel of a track, as released."""
     neighborhood: Positive = 0.01
     """Distance, m, within which masks and motions look for neighbors."""
     outlier_neighbors: NonNegative = 40.0
     """Number of neighbors that a masked pixel must exceed, at a focal length of 430 pixels."""
-    least_neighbors: Count = 5
-    """Smallest number of neighbors of a motion that is trusted, itself included."""
     agreement: Positive = 0.005
     """Distance, m, within which at least half of a motion's neighbors must move alike."""
     controllers: Count = 30
@@ -142,10 +124,9 @@ class Lift(Section):
     of the object again, it takes hold again. null: hands hold to the end, as released."""
     release_after: Count = 10
     """With `release`: frames without any hand in view after which hands have let go too, and the fewest that a hand is away."""
-    sequential_motion_filter: bool = False
-    """Judge motions in the order of the points, each by the motions that were not dropped before it, as released."""
-    coordinate_outliers: bool = False
-    """Drop masked pixels that share any one coordinate with an outlier, as released."""
+    released: bool = False
+    """As the released processing: a track is lifted at its nearest whole pixel with its own depth, motions are judged in the order
+    of the points, and a masked pixel that shares any one coordinate with an outlier is dropped."""
     mirrored_principal_point: bool = False
     """Measure x from W - cx, as the released processing did before July 2025."""
 
@@ -161,8 +142,6 @@ class ShapePriorSettings(Section):
     """Categories that need no prior."""
     voxel: Positive = 0.003
     """Side of a voxel of the visual hull, m."""
-    margin: Positive = 0.02
-    """Margin around the cloud of frame 0 within which voxels are carved, m."""
     back: Literal["none", "symmetry", "fraction"] = "symmetry"
     """Where the hull ends if one camera alone shows the object in frame 0, so that its back is invented (with several cameras it is
     carved, and this is not used). fraction: behind the seen surface by `back_fraction` of the silhouette's local width, rounded to
@@ -170,16 +149,10 @@ class ShapePriorSettings(Section):
     `margin` behind what was seen."""
     back_fraction: Positive = 1.2
     """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
-    tolerance: Positive = 0.004
-    """Distance, m, by which measured depth may lie behind a voxel before the voxel is carved."""
-    smoothing: Positive = 1.0
-    """Width, voxels, by which the hull is smoothed."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
     bend: bool = True
     """Move the visible part of the mesh, once it is placed, to where it was seen; the rest follows."""
-    bend_reach: Positive = 0.02
-    """Largest distance, m, of a visible vertex from the cloud that it is moved onto."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,10 +164,6 @@ class Sampling(Section):
     nodes: Count | None = None
     """Most structure points: the voxel grows from `voxel` until no more are left, so that a rope is sampled finer than a plush
     animal at the same cost. null: `voxel` as it is."""
-    surface: Count = 1024
-    """Points drawn on the prior's surface."""
-    interior: Count = 10000
-    """Points drawn in the prior's bounding box, of which those inside are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,22 +178,12 @@ class ColorSettings(Section):
     """Thickness of a sheet, m."""
     body_thickness: Positive = 0.8
     """Height of a body above the table in local widths of its silhouette, of all categories that are neither flat nor round."""
-    beneath: NonNegative = 0.03
-    """What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
     grip_reach: Positive = 0.02
     """Distance from the object, m at the object, up to which pixels of a hand hold it in frame 0."""
     grip_length: Positive = 0.04
     """Distance from a hand's tip, its pixel farthest along the arm, up to which its pixels hold a sheet, m at the object."""
-    hands_apart: Positive = 0.04
-    """Distance between the grips of different hands, m at the object."""
-    hand_radius: Positive = 0.08
-    """Corners of a hand are followed this far around its grip, m at the object."""
     hand_tilt: Finite = 0.0
     """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.variables.hand_tilt)."""
-    samples: Count = 300
-    """Points of the object's silhouette per frame."""
-    cell: Count = 4
-    """Side of the cells of the distance from object and hands, pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

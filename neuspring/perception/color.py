@@ -33,6 +33,16 @@ from neuspring.twin.hand_paths import depths_of, place
 
 BAND = 30.0
 """How far from the object points beside it were drawn, pixels."""
+BENEATH = 0.03
+"""What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
+HANDS_APART = 0.04
+"""Distance between the grips of different hands, m at the object."""
+HAND_RADIUS = 0.08
+"""Corners of a hand are followed this far around its grip, m at the object."""
+SAMPLES = 300
+"""Points of the object's silhouette per frame."""
+CELL = 4
+"""Side of the cells of the distance from object and hands, pixels."""
 ROPE_WIDEST = 1.5
 """Largest thickness of a rope over its median."""
 HIDDEN_STRIDE = 3
@@ -69,7 +79,7 @@ class FirstFrame:
             remedy = "Check camera_to_world and up: without depth the table is where they say."
             raise InputError(f"{capture.folder / CAPTURE}, camera_to_world", rule, "some look above the horizon", remedy)
         size = float(np.median(below)) / camera.intrinsics[0, 0]
-        filled = beneath_hands(labels, settings.beneath / size)
+        filled = beneath_hands(labels, BENEATH / size)
         chord = round_chord(filled) * size
         factor = settings.body_thickness if kind == "body" else 1.0
         heights = np.where(filled, settings.sheet_thickness, 0.0) if kind == "flat" else factor * chord
@@ -168,11 +178,11 @@ def lift_color(
     known[0] = True
     # A hand above a sheet hides more of it than its fingers hold.
     length = settings.grip_length if first.kind == "flat" else np.inf
-    sizes = (settings.grip_reach, settings.hands_apart, length)
+    sizes = (settings.grip_reach, HANDS_APART, length)
     held = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
     if not held:
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", "Mark the hands in frame 0.")
-    motion = follow_hands(capture, name, labels, held, settings.hand_radius / first.pixel_size)
+    motion = follow_hands(capture, name, labels, held, HAND_RADIUS / first.pixel_size)
     chosen = [grip[farthest(grip.astype(float), max(controllers // len(held), 4))] for grip in held]
     hand_of = np.concatenate([np.full(len(grip), hand) for hand, grip in enumerate(chosen)])
     image = ImageObservations(
@@ -183,8 +193,8 @@ def lift_color(
         pixel_size=first.pixel_size,
         pixels=pixels,
         visible=visible,
-        **silhouettes(labels[: capture.train_end], settings),
-        cell=settings.cell,
+        **silhouettes(labels[: capture.train_end]),
+        cell=CELL,
         hand_of=hand_of,
         hand_centers=motion.centers,
         hand_angles=motion.angles,
@@ -223,11 +233,11 @@ def lift_color(
     return lifted, image
 
 
-def silhouettes(labels: np.ndarray, settings: ColorSettings) -> dict[str, np.ndarray]:
+def silhouettes(labels: np.ndarray, samples: int = SAMPLES) -> dict[str, np.ndarray]:
     """`inside` and `outside` of ImageObservations from labels [E, H, W]."""
     frames, height, width = labels.shape
     rng = np.random.default_rng(0)
-    count, cell = settings.samples, settings.cell
+    count, cell = samples, CELL
     inside = np.full((frames, count, 2), np.nan, np.float32)
     outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
     for frame, label in enumerate(labels):

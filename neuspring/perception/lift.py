@@ -20,6 +20,10 @@ from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""
+DEPTH_WINDOW = 3
+"""Side of the window, pixels, whose median depth inside the mask a track gets."""
+LEAST_NEIGHBORS = 5
+"""Smallest number of neighbors of a motion that is trusted, itself included."""
 STRIDE = 3
 """Of the pixels of object and hands each third says how near they are."""
 
@@ -85,7 +89,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         controller_valid=holds.valid,
         cloud=cloud,
         cloud_colors=colors,
-        backend="released" if settings.sequential_motion_filter else "vectorised",
+        backend="released" if settings.released else "vectorised",
         facts=facts,
     )
 
@@ -156,7 +160,7 @@ def clean_masks(
                 y, x = pixels[name]
                 points.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
             needed = np.concatenate([np.full(len(part), least[name]) for name, part in zip(names, points, strict=True)])
-            stays = _crowded(np.concatenate(points), settings.neighborhood, needed, settings.coordinate_outliers)
+            stays = _crowded(np.concatenate(points), settings.neighborhood, needed, settings.released)
             for name, own in zip(names, np.split(stays, np.cumsum([len(part) for part in points])[:-1]), strict=True):
                 y, x = pixels[name]
                 labels[name][frame, y[own], x[own]] = label
@@ -168,7 +172,7 @@ def clean_masks(
 
 def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
     """[T, n] bool, row t for the motion from t to t + 1: the point is visible in both, and half of its neighbors move alike."""
-    test = _sequential if settings.sequential_motion_filter else _simultaneous
+    test = _sequential if settings.released else _simultaneous
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):
         moving = np.flatnonzero(seen.visible[frame] & seen.visible[frame + 1])
@@ -184,7 +188,7 @@ def _simultaneous(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.
     alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < settings.agreement
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
     agreeing = np.bincount(pairs[alike].ravel(), minlength=len(points)) + 1
-    return (count >= settings.least_neighbors) & (agreeing >= 0.5 * count)
+    return (count >= LEAST_NEIGHBORS) & (agreeing >= 0.5 * count)
 
 
 def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
@@ -193,7 +197,7 @@ def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.nd
     for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighborhood)):
         neighbors = np.array([j for j in near if valid[j]], dtype=int)
         alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < settings.agreement
-        valid[i] = len(neighbors) >= settings.least_neighbors and alike.sum() >= 0.5 * len(neighbors)
+        valid[i] = len(neighbors) >= LEAST_NEIGHBORS and alike.sum() >= 0.5 * len(neighbors)
     return valid
 
 
@@ -206,12 +210,12 @@ def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.nd
         seen[seen] = inside[frame, y, x]
     own = visible[0]
     rounded, visible = rounded[:, own], visible[:, own]
-    places = rounded if settings.whole_pixels else tracks.pixels[:, own]
+    places = rounded if settings.released else tracks.pixels[:, own]
     points = np.zeros((*visible.shape, 3))
     for frame, seen in enumerate(visible):
         if seen.any():
             x, y = rounded[frame, seen].T
-            depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y, settings.depth_window)
+            depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y, 1 if settings.released else DEPTH_WINDOW)
             points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
     x, y = rounded[0].T
     return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)

@@ -19,6 +19,8 @@ from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
+SURFACE, INTERIOR = 1024, 10000
+"""Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""
 GROWTH = 1.01
 """Ratio of the voxel sizes that are tried one after the other."""
 
@@ -87,7 +89,7 @@ def structure(
     _, unique = np.unique(start, axis=0, return_index=True)
     if rank is not None:
         unique = unique[np.argsort(-rank[unique], kind="stable")]
-    surface, interior = (on_table(points, up) for points in _samples(prior, settings, seed))
+    surface, interior = (on_table(points, up) for points in _samples(prior, seed))
     everything = np.concatenate([start[unique], surface, interior])
     voxel = settings.voxel if settings.nodes is None else voxel_for(everything, settings.nodes, settings.voxel)
     first_of_cell = np.zeros(len(everything), dtype=bool)
@@ -150,11 +152,11 @@ def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
     return np.asarray(result.numpy())
 
 
-def _samples(prior: ShapePrior, settings: Sampling, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _samples(prior: ShapePrior, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Points on the surface, and those of uniform points of its bounding box that lie inside."""
     if not len(prior.faces):
         return np.zeros((0, 3)), np.zeros((0, 3))
     rng = np.random.default_rng(seed)
-    surface = on_surface(prior.vertices, prior.faces, settings.surface, rng)
-    box = rng.uniform(prior.vertices.min(axis=0), prior.vertices.max(axis=0), (settings.interior, 3))
+    surface = on_surface(prior.vertices, prior.faces, SURFACE, rng)
+    box = rng.uniform(prior.vertices.min(axis=0), prior.vertices.max(axis=0), (INTERIOR, 3))
     return surface, box[inside(prior, box)]

@@ -46,6 +46,10 @@ HAND_PIECE = 0.15
 """A piece of hand color smaller than this part of the largest belongs to the object, which may have such colors too."""
 LARGEST_HOLE = 0.0015
 """Holes in the foreground up to this part of the image are filled: print that has the table's color."""
+DECISION = 1.5
+"""Width, pixels, over which the decision between hand and object is averaged."""
+SMALLEST = 0.0004
+"""Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
 SPECK = np.ones((3, 3), np.uint8)
 THIN_WIDTH = 7
 """What is as wide, pixels, is no thin rope."""
@@ -160,7 +164,7 @@ def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings
         seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
         foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) & region if seeds.any() else seeds
     foreground |= _holes(foreground)
-    hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), settings.smoothing) > 0
+    hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), DECISION) > 0
     labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
     return _slim(_tidy(labels, settings)) if settings.thin else _tidy(labels, settings)
 
@@ -254,7 +258,7 @@ def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     for label, share in ((HANDS, THIN_HAND_PIECE if settings.thin else HAND_PIECE), (OBJECT, 0.0)):
         count, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
-        least = max(settings.smallest * labels.size, share * areas.max()) if count > 1 else 0.0
+        least = max(SMALLEST * labels.size, share * areas.max()) if count > 1 else 0.0
         for piece in 1 + np.flatnonzero(areas < least):
             own = pieces == piece
             around = cv2.dilate(own.astype(np.uint8), SPECK).astype(bool) & ~own

@@ -33,6 +33,12 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.results import Masks, ShapePrior
 
+MARGIN = 0.02
+"""m around the cloud of frame 0 within which voxels are carved."""
+TOLERANCE = 0.004
+"""m by which measured depth may lie behind a voxel before the voxel is carved."""
+SMOOTHING = 1.0
+"""Width, voxels, by which the hull is smoothed."""
 SEEN_WITHIN = 4.0
 """Voxels between a vertex of the shape and the depth of a camera that saw it: carving and smoothing move a surface by less."""
 RIM = 3
@@ -91,17 +97,17 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
         if end is not None:
             y, x = np.nonzero(labels == OBJECT)
             space = np.concatenate([cloud, camera.lift(np.stack([x, y], axis=1).astype(float), end[y, x])])
-    low, high = space.min(axis=0) - settings.margin, space.max(axis=0) + settings.margin
+    low, high = space.min(axis=0) - MARGIN, space.max(axis=0) + MARGIN
     counts = np.ceil((high - low) / settings.voxel).astype(int) + 1
     # Voxel centers [nx, ny, nz, 3].
     grid = low + settings.voxel * np.moveaxis(np.indices(counts), 0, -1)
     hull = capture.description.up_sign * grid[..., 2] > 0
     shown = np.zeros_like(hull)
     for name in showing:
-        admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], settings.tolerance)
+        admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], TOLERANCE)
         hull, shown = hull & admitted, shown | shows
     hull = _largest_piece(hull & shown)
-    vertices, faces = _surface(hull, low, settings.voxel, settings.smoothing)
+    vertices, faces = _surface(hull, low, settings.voxel, SMOOTHING)
     if not len(faces):
         rule = f"more than specks of {1e3 * settings.voxel:g} mm must be consistent with all cameras"
         remedy = "Masks, depth and calibration of frame 0 contradict each other; or take perception.shape.backend: none."
@@ -117,7 +123,7 @@ def one_sided(
     """Depth of the seen surface [H, W], m, without holes, and of the back; None where that is not guessed."""
     distance = camera.project(cloud)[1]
     # What lies far before or behind all usable points shines through, or is noise.
-    near, far = float(distance.min()) - settings.margin, float(distance.max()) + settings.margin
+    near, far = float(distance.min()) - MARGIN, float(distance.max()) + MARGIN
     filled = np.where(labels == OBJECT, front(labels == OBJECT, depth, near, far), depth)
     if settings.back == "none":
         return filled, None

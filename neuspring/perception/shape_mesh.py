@@ -32,6 +32,8 @@ SAMPLES = 1500
 """Points of cloud and mesh that are compared."""
 INLIERS = 0.85
 """Share of the nearest pairs that a step uses; the rest count as outliers."""
+BEND_REACH = 0.02
+"""Largest distance, m, of a visible vertex from the cloud that it is moved onto."""
 STIFFNESS = 5.0
 """Weight of smoothness against data in the last, non-rigid step."""
 
@@ -95,12 +97,12 @@ def bend(
     """Vertices moved by displacements d [V, 3], m, with the least |S (d - t)|^2 + k |L d|^2.
 
     S selects the visible vertices: those whose pixel shows the object at about their depth in some camera. t points to the nearest
-    point of the cloud, within `settings.bend_reach`. L is the uniform graph Laplacian, k the stiffness. (`nricp_amberg` of trimesh
+    point of the cloud, within BEND_REACH. L is the uniform graph Laplacian, k the stiffness. (`nricp_amberg` of trimesh
     is no substitute: it pulls hidden vertices as well and fails where no point of the cloud is near enough.)
     """
-    visible = seen(vertices, capture, masks, settings.bend_reach)
+    visible = seen(vertices, capture, masks, BEND_REACH)
     distance, nearest = cKDTree(cloud).query(vertices)
-    pulled = visible & (distance < settings.bend_reach)
+    pulled = visible & (distance < BEND_REACH)
     target = np.where(pulled[:, None], cloud[nearest] - vertices, 0.0)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     laplacian = identity(len(vertices)) - trimesh.smoothing.laplacian_calculation(mesh)

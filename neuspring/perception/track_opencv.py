@@ -17,6 +17,10 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import NOTHING, Capture
 
+LEVELS = 3
+"""Levels of the image pyramid, beside the image itself."""
+FORWARD_BACKWARD = 0.5
+"""Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
 PATCH = 9
 """Side of compared patches, pixels."""
 GUIDES = 6
@@ -69,14 +73,23 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
         own[beside] = _nearest_label(labels[0], start[beside])
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
-    first = before = gray(capture, camera, 0, settings)
-    flow = _dense_flow() if settings.method == "dis" else None
+    flow = None
+    if settings.method == "dis":
+        # Down to whole pixels; the presets stop at every second or fourth.
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        flow.setFinestScale(0)
+
+    def seen(frame: int) -> np.ndarray:
+        image = gray(capture, camera, frame)
+        return image if flow is not None else equalized(image)
+
+    first = before = seen(0)
     last = 0
     for frame in range(1, capture.frame_count):
         pixels[frame] = pixels[frame - 1]
         if not capture.has(camera, frame):
             continue
-        now = gray(capture, camera, frame, settings)
+        now = seen(frame)
         place, alive = pixels[last].copy(), visible[last].copy()
         if alive.any():
             place[alive], alive[alive] = _follow(before, now, place[alive], settings, flow)
@@ -100,36 +113,29 @@ def choose(labels: np.ndarray, count: int, seed: int) -> np.ndarray:
     return pixels[np.sort(np.random.default_rng(seed).choice(len(pixels), count, replace=False))]
 
 
-def _dense_flow() -> cv2.DISOpticalFlow:
-    """DIS flow down to whole pixels; its presets stop at every second or fourth."""
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setFinestScale(0)
-    return flow
-
-
 def _follow(
     before: np.ndarray, now: np.ndarray, points: np.ndarray, settings: OpenCvTracking, flow: cv2.DISOpticalFlow | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the next frame [n, 2], and whether going back returns to the start [n]."""
     if flow is None:
-        return lucas_kanade(before, now, points, points, settings)
+        return lucas_kanade(before, now, points, points, settings.window)
     there, back = flow.calc(before, now, None), flow.calc(now, before, None)  # type: ignore[call-overload]
     moved = points + _sample(there, points)
     returned = moved + _sample(back, moved)
-    return moved, np.linalg.norm(returned - points, axis=1) < settings.forward_backward
+    return moved, np.linalg.norm(returned - points, axis=1) < FORWARD_BACKWARD
 
 
 def lucas_kanade(
-    source: np.ndarray, target: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: OpenCvTracking
+    source: np.ndarray, target: np.ndarray, points: np.ndarray, guess: np.ndarray, window: int, levels: int = LEVELS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the target [n, 2] near the `guess`, and whether going back returns to the start [n]."""
-    size, flags = (settings.window, settings.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-    options: dict[str, Any] = {"winSize": size, "maxLevel": settings.levels, "criteria": STOP, "flags": flags}
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    options: dict[str, Any] = {"winSize": (window, window), "maxLevel": levels, "criteria": STOP, "flags": flags}
     points = np.ascontiguousarray(points, dtype=np.float32)
     # OpenCV writes its result into the guess.
     moved, there, _ = cv2.calcOpticalFlowPyrLK(source, target, points, np.array(guess, dtype=np.float32), **options)
     returned, back, _ = cv2.calcOpticalFlowPyrLK(target, source, moved, points.copy(), **options)
-    near = np.linalg.norm(returned - points, axis=1) < settings.forward_backward
+    near = np.linalg.norm(returned - points, axis=1) < FORWARD_BACKWARD
     return np.asarray(moved), there.ravel().astype(bool) & back.ravel().astype(bool) & near
 
 
@@ -145,7 +151,7 @@ def _reacquire(
     if len(guides) >= GUIDES:
         nearest = guides[cKDTree(start[guides]).query(start[lost], k=GUIDES)[1]]
         guess = start[lost] + np.median((place - start)[nearest], axis=1)
-    moved, ok = lucas_kanade(first, now, start[lost], guess, settings)
+    moved, ok = lucas_kanade(first, now, start[lost], guess, settings.window)
     ok &= np.linalg.norm(moved - guess, axis=1) < settings.window
     ok &= inside(moved, now.shape)
     if ok.any():
@@ -217,11 +223,13 @@ def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
 
 
-def gray(capture: Capture, camera: str, frame: int, settings: OpenCvTracking) -> np.ndarray:
-    """The gray image [H, W] uint8; for Lucas-Kanade less its local mean and divided by its local deviation."""
-    plain = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY)
-    if settings.method == "dis":
-        return np.asarray(plain)
-    centered = plain.astype(np.float32) - cv2.GaussianBlur(plain.astype(np.float32), (0, 0), LOCAL)
+def gray(capture: Capture, camera: str, frame: int) -> np.ndarray:
+    """The gray image [H, W] uint8."""
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY))
+
+
+def equalized(image: np.ndarray) -> np.ndarray:
+    """A gray image [H, W] uint8, less its local mean and divided by its local deviation: what Lucas-Kanade gets."""
+    centered = image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), LOCAL)
     deviation = np.sqrt(cv2.GaussianBlur(centered**2, (0, 0), LOCAL) + FAINT**2)
     return np.asarray(np.clip(128.0 + CONTRAST * centered / deviation, 0, 255).astype(np.uint8))

@@ -16,7 +16,7 @@ from neuspring.perception.controllers import choose_controllers, fill_rigidly, h
 from neuspring.perception.results import Masks, PixelTracks
 from tests.support.captures import FRAMES, describe, entry
 
-SETTINGS = Lift(neighborhood=0.03, outlier_neighbors=460.0, least_neighbors=3, least_controllers=3, controllers=4)
+SETTINGS = Lift(neighborhood=0.03, outlier_neighbors=460.0, least_controllers=3, controllers=4)
 
 NEAR = np.zeros((1, 3))
 """An object's cloud, for hands whose distance from it does not matter."""
@@ -117,12 +117,12 @@ def grid(count: int = 6) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(count) * 0.004] * 2, [0.0]), axis=-1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("sequential", [False, True])
-def test_a_point_that_moves_alone_is_not_trusted(sequential):
+@pytest.mark.parametrize("released", [False, True])
+def test_a_point_that_moves_alone_is_not_trusted(released):
     points = np.stack([grid(), grid() + np.array([0.002, 0, 0])])
     points[1, 7] += [0.0, 0.0, 0.02]
     seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((36, 3)))
-    valid = lifting.agreeing_motion(seen, Lift(sequential_motion_filter=sequential))
+    valid = lifting.agreeing_motion(seen, Lift(released=released))
     assert np.flatnonzero(~valid[0]).tolist() == [7]
 
 
@@ -137,10 +137,10 @@ def test_the_order_of_points_does_not_matter():
 
 
 def test_few_neighbors_are_not_enough():
-    points = np.stack([grid(2), grid(2)])
-    seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((4, 3)))
-    assert not lifting.agreeing_motion(seen, Lift()).any()
-    assert lifting.agreeing_motion(seen, Lift(least_neighbors=4))[0].all()
+    for side, trusted in ((2, False), (3, True)):
+        points = np.stack([grid(side), grid(side)])
+        seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((side**2, 3)))
+        assert lifting.agreeing_motion(seen, Lift())[0].all() == trusted
 
 
 def test_depth_at_an_edge_comes_from_the_same_mask():
@@ -294,7 +294,8 @@ def with_subpixel_motion(tracks: dict[str, PixelTracks]) -> dict[str, PixelTrack
 def test_whole_pixels_as_released_lift_the_pixel_that_a_track_is_in(scene):
     tracks = with_subpixel_motion(tracks_of(scene))
     exact, released = (
-        lifting.lift(scene, masks_of(scene), tracks, replace(SETTINGS, whole_pixels=whole)).object_points for whole in (False, True)
+        lifting.lift(scene, masks_of(scene), tracks, replace(SETTINGS, released=released)).object_points
+        for released in (False, True)
     )
     rounded = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS).object_points
     np.testing.assert_array_equal(released, rounded)

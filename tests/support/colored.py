@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neuspring.config.perception import ColorSettings
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer
 from neuspring.perception.color import silhouettes
@@ -56,7 +55,7 @@ def observed(path: str = "rope/lift/smooth") -> Observations:
         pixel_size=float(np.median(depth[0])) / FOCAL,
         pixels=np.where(visible[..., None], pixels, 0.0),
         visible=visible,
-        **silhouettes(labels, ColorSettings(samples=60)),
+        **silhouettes(labels, 60),
         cell=4,
         hand_of=np.zeros(seen.controller_points.shape[1], int),
         hand_centers=hands,

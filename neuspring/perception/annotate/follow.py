@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Lock
 
 import cv2
 import numpy as np
 
-from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.annotations import Click
-from neuspring.perception.track_opencv import gray, inside, likeness, lucas_kanade
+from neuspring.perception.track_opencv import LEVELS, equalized, gray, inside, likeness, lucas_kanade
 
 WINDOW = 13
 """Side of the Lucas-Kanade window, pixels: a point alone has no neighbors that vote, so it needs more texture than one of many."""
@@ -28,7 +27,9 @@ CROP = 80
 SLIP = 3.0
 """Pixels by which the click's patch may lie beside the place that was followed, for it to correct the place."""
 ALIKE = 0.7
-"""Smallest correlation with the click's patch for it to correct a place, or for the point to be found again."""
+"""Smallest correlation with the click's patch for it to correct a place."""
+FOUND_AGAIN = 0.85
+"""Smallest correlation with the click's patch for a lost point to be found again."""
 SURROUND = 17
 """Side of the part of an image, pixels, from which compared patches are cut."""
 CACHE_BYTES = 400_000_000
@@ -63,9 +64,8 @@ class OneWay:
 class GrayImages:
     """Gray images of a capture for Lucas-Kanade; the last ones asked for are kept."""
 
-    def __init__(self, capture: Capture, settings: OpenCvTracking | None = None) -> None:
+    def __init__(self, capture: Capture) -> None:
         self.capture = capture
-        self.settings = replace(settings or OpenCvTracking(), method="lucas_kanade", window=WINDOW)
         self._kept: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes, self._lock = 0, Lock()
 
@@ -76,7 +76,7 @@ class GrayImages:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        image = gray(self.capture, camera, frame, self.settings)
+        image = equalized(gray(self.capture, camera, frame))
         with self._lock:
             if key not in self._kept:
                 self._bytes += image.nbytes
@@ -122,14 +122,14 @@ def follow_from(images: GrayImages, camera: str, click: Click, stop: int, aim: C
         if not images.capture.has(camera, frame):
             continue
         now = images(camera, frame)
-        place = _best(before, now, last, [last + motion, last], images.settings) if alive else None
+        place = _best(before, now, last, [last + motion, last]) if alive else None
         if place is not None:
-            sharper = _look(template, now, start, place, images.settings)
+            sharper = _look(template, now, start, place)
             near = sharper is not None and np.linalg.norm(sharper - place) < SLIP
             if sharper is not None and near and _alike(template, now, start, sharper) > ALIKE:
                 place = sharper
         else:
-            place = _again(template, now, start, _guess(last, click, frame, stop, aim), images.settings)
+            place = _again(template, now, start, _guess(last, click, frame, stop, aim))
         alive = place is not None
         if place is not None:
             found.places[frame], found.alike[frame] = place, _alike(template, now, start, place)
@@ -162,33 +162,27 @@ def _guess(last: np.ndarray, click: Click, frame: int, stop: int, aim: Click | N
     return (1 - share) * np.array(click.place) + share * np.array(aim.place)
 
 
-def _best(
-    source: np.ndarray, target: np.ndarray, point: np.ndarray, guesses: Sequence[np.ndarray], settings: OpenCvTracking
-) -> np.ndarray | None:
+def _best(source: np.ndarray, target: np.ndarray, point: np.ndarray, guesses: Sequence[np.ndarray]) -> np.ndarray | None:
     """The place in the target that looks most like the point in the source: from several guesses, with all levels and with few."""
-    places = [_look(source, target, point, guess, replace(settings, levels=n)) for guess in guesses for n in (settings.levels, 1)]
+    places = [_look(source, target, point, guess, levels) for guess in guesses for levels in (LEVELS, 1)]
     known = [place for place in places if place is not None]
     return max(known, key=lambda place: _alike(source, target, point, place), default=None)
 
 
-def _again(
-    template: np.ndarray, now: np.ndarray, start: np.ndarray, guess: np.ndarray, settings: OpenCvTracking
-) -> np.ndarray | None:
+def _again(template: np.ndarray, now: np.ndarray, start: np.ndarray, guess: np.ndarray) -> np.ndarray | None:
     """A lost point, where it is seen again near the guess."""
-    place = _look(template, now, start, guess, settings)
-    if place is None or np.linalg.norm(place - guess) > 2 * WINDOW or _alike(template, now, start, place) < settings.likeness:
+    place = _look(template, now, start, guess)
+    if place is None or np.linalg.norm(place - guess) > 2 * WINDOW or _alike(template, now, start, place) < FOUND_AGAIN:
         return None
     return place
 
 
-def _look(
-    source: np.ndarray, target: np.ndarray, point: np.ndarray, guess: np.ndarray, settings: OpenCvTracking
-) -> np.ndarray | None:
+def _look(source: np.ndarray, target: np.ndarray, point: np.ndarray, guess: np.ndarray, levels: int = LEVELS) -> np.ndarray | None:
     """Lucas-Kanade in parts of the images around the point and the guess; None where it fails or leaves the image."""
     if not inside(guess[None], target.shape)[0]:
         return None
     here, there = _corner(point, source.shape), _corner(guess, target.shape)
-    place, ok = lucas_kanade(_part(source, here), _part(target, there), (point - here)[None], (guess - there)[None], settings)
+    place, ok = lucas_kanade(_part(source, here), _part(target, there), (point - here)[None], (guess - there)[None], WINDOW, levels)
     found = place[0].astype(float) + there
     return found if ok[0] and inside(found[None], target.shape)[0] else None
 

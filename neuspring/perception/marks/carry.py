@@ -32,7 +32,9 @@ WHOLE = {"disagreement": 0.35, "flow": 0.8, "misfit": 0.5, "unsure": 0.5, "jump"
 MISFIT = 2.0
 """Log ratio from which a color contradicts its label."""
 WIDTH = 848
-"""Width, pixels, for which `reach` is given."""
+"""Width of images, pixels, for which REACH is given."""
+REACH = 4.0
+"""How far the border may be from where the flow carries it, pixels."""
 BACKGROUND_FRAMES = 60
 """How many frames the background of the whole film is learned from."""
 APART = 4
@@ -175,7 +177,7 @@ def frame_mask(images: Images, frame: int, marks: Sequence[Mark], settings: Mark
     if not any(mark.label != "ignore" for mark in own):
         raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
     film = _Film.of(images, own, settings, whole=False)
-    return film.labels(start(film.lab(frame), film.seeds(frame), settings.smoothness, film.height(frame)).probability)
+    return film.labels(start(film.lab(frame), film.seeds(frame), film.height(frame)).probability)
 
 
 def carry(
@@ -215,7 +217,7 @@ class _Walker:
     def _start(self) -> Start:
         """That frame, solved from its marks."""
         lab, seeds, height = self.film.lab(self._begin), self.film.seeds(self._begin), self.film.height(self._begin)
-        return start(lab, seeds, self.settings.smoothness, height, self.background)
+        return start(lab, seeds, height, self.background)
 
     def first_pass(self) -> np.ndarray:
         """Labels [T, h, w], from the first frame with an object marked on; marked frames on the way correct them."""
@@ -275,14 +277,13 @@ class _Walker:
 
     def _pass(self, key: int, *, learns: bool) -> Pass:
         own = self.starts[key]
-        reach = self.settings.reach * max(self.film.size) / WIDTH
+        reach = REACH * max(self.film.size) / WIDTH
         return Pass(
             lab=self.film.lab(key),
             probability=own.probability,
             first=self._colors(),
             background=self.background,
             learns=learns,
-            smoothness=self.settings.smoothness,
             reach=reach,
         )
 

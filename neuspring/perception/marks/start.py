@@ -13,6 +13,8 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT
 from neuspring.perception.marks.colors import Background, Colors, bins_of, count, mixed, shaded_density
 from neuspring.perception.marks.marks import UNKNOWN, Seeds
 
+SMOOTHNESS = 1.5
+"""Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
 ROUNDS = 10
 NEIGHBORS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.7071), (1, -1, 0.7071))
 """Steps down and right, and weights: the inverse of the distance. The other four neighbors are opposite."""
@@ -46,7 +48,7 @@ CERTAIN_WEIGHT = 1.0
 """Weight of the colors beneath clicks, scribbles and polygons, against those of the whole mask so far."""
 
 
-def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float, rounds: int = ROUNDS) -> np.ndarray:
+def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> np.ndarray:
     """Probabilities [K, H, W] of labels from log likelihoods [K, H, W] and an image [H, W, 3].
 
     q_l(p) ~ exp(u_l(p) + sum_n w_pn q_l(n)),   w_pn = s exp(-|c_p - c_n|^2 / (2 m)) / |p - n|
@@ -72,7 +74,7 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float, rounds: int = RO
     mean = max(float(np.mean(squares)), 1.0)
     links = [weight * np.exp(-square / (2 * mean)) for weight, square in zip(weights, squares, strict=True)]
     part = q[:, pixels]
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         message = flat.copy()
         for place, link in zip(beside, links, strict=True):
             message += link * q[:, place]
@@ -122,7 +124,6 @@ class Start:
 def start(
     lab: np.ndarray,
     seeds: Seeds,
-    smoothness: float,
     height: np.ndarray | None = None,
     background: Background | None = None,
 ) -> Start:
@@ -139,7 +140,7 @@ def start(
         if background is not None:
             logs[NOTHING] = background.explain(logs[NOTHING], lab, np.zeros(3, np.float32))
         logs = place + COLOR * logs
-        probability = solve(logs.astype(np.float32), lab, smoothness)
+        probability = solve(logs.astype(np.float32), lab)
         labels = tidy(probability.argmax(axis=0).astype(np.uint8), seeds)
     probability[:, labels != probability.argmax(axis=0)] = np.array([1.0, 0.0, 0.0])[:, None]
     return Start.of(lab, probability, seeds)

@@ -66,7 +66,6 @@ class Pass:
     background: Background | None
     learns: bool
     """Whether the background is learned on the way."""
-    smoothness: float
     reach: float
     running: list[np.ndarray] = field(init=False)
     colors: list[Colors] = field(init=False)
@@ -92,7 +91,7 @@ class Pass:
         logs = np.log(place) + color
         if part is not None:
             logs += corrections(place, part, self.reach)
-        solved = self.tidy(solve(logs.astype(np.float32), near, self.smoothness), place, window, part)
+        solved = self.tidy(solve(logs.astype(np.float32), near), place, window, part)
         self.probability = np.zeros_like(self.probability)
         self.probability[NOTHING] = 1.0
         self.probability[(slice(None), *window)] = solved

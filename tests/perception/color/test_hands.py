@@ -138,7 +138,7 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, category, fingers):
 def test_silhouettes_of_frames():
     labels = np.zeros((2, 64, 62), np.uint8)
     labels[0, 20:40, 20:40], labels[0, 10:20, 20:40] = OBJECT, HANDS
-    found = silhouettes(labels, ColorSettings(samples=50, cell=4))
+    found = silhouettes(labels, 50)
     inside = found["inside"][0].astype(int)
     assert (labels[0, inside[:, 1], inside[:, 0]] == OBJECT).all()
     assert found["outside"].shape == (2, 16, 16)
