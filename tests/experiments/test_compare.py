@@ -12,7 +12,7 @@ from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.experiments.tracking import compare
 from neuspring.experiments.tracking import log as tracking
-from neuspring.experiments.tracking.query import LoggedRun
+from neuspring.experiments.tracking.store import LoggedRun
 from tests.support.stores import write_run
 
 OLD, NEW = "1111111aaaaaaaaaaaaa", "2222222bbbbbbbbbbbbb"

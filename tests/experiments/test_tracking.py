@@ -15,7 +15,6 @@ from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
-from neuspring.experiments.tracking import query as tracking_query
 from neuspring.experiments.tracking import store as tracking_store
 from neuspring.experiments.tracking.payload import _system_metrics
 from tests.support import loggers
@@ -236,7 +235,7 @@ def test_results_that_another_commit_made_again_are_one_run_of_both(results: Pat
     again = write_run(results, commit="def456-dirty", ended="2026-11-21T12:00:00+00:00")
     for _ in range(2):
         assert tracking.log_run(again, results, SETTINGS) == "already logged"
-    (run,) = tracking_query.logged_runs(results, SETTINGS)
+    (run,) = tracking_store.logged_runs(results, SETTINGS)
     assert run.commits == {"abc123": ENDED_MS, "def456-dirty": STARTED_MS + 2 * 3600_000}
 
 

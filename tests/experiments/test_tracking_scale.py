@@ -19,7 +19,7 @@ import pytest
 
 from neuspring.config import Tracking
 from neuspring.experiments.tracking import log as tracking
-from neuspring.experiments.tracking import query as tracking_query
+from neuspring.experiments.tracking import store as tracking_store
 from tests.support import loggers, stores
 
 pytestmark = pytest.mark.slow
@@ -65,19 +65,19 @@ def all_runs(results: Path, settings: Tracking) -> list[Any]:
     from mlflow import MlflowClient
 
     client = MlflowClient(tracking_uri=settings.uri or tracking.default_uri(results))
-    return tracking_query.search(client, client.get_experiment_by_name(settings.experiment).experiment_id)
+    return tracking_store.search(client, client.get_experiment_by_name(settings.experiment).experiment_id)
 
 
 def assert_every_run_is_there_once(results: Path, settings: Tracking, groups: list[list[Path]]) -> None:
     """Complete runs are the records on disk, one each; nothing runs any more; what was cut off is closed and marked."""
     runs = all_runs(results, settings)
-    complete = Counter(run.info.run_name for run in runs if tracking_query.is_complete(run))
+    complete = Counter(run.info.run_name for run in runs if tracking_store.is_complete(run))
     records = [path.parent.relative_to(results).as_posix() for group in groups for path in group]
     assert complete == Counter(records)
-    others = [run for run in runs if not tracking_query.is_complete(run)]
+    others = [run for run in runs if not tracking_store.is_complete(run)]
     assert {(run.info.status, run.data.tags.get("superseded")) for run in others} <= {("KILLED", "true")}
     for run in runs:
-        if tracking_query.is_complete(run):
+        if tracking_store.is_complete(run):
             assert run.data.params == {"fit.epochs": "3"} and run.data.metrics["future.chamfer"] == 0.005
 
 

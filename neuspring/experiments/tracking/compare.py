@@ -19,7 +19,7 @@ from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.text import markdown
-from neuspring.experiments.tracking.query import LoggedRun, logged_runs
+from neuspring.experiments.tracking.store import LoggedRun, logged_runs
 from neuspring.scores.metrics import METRICS, TASKS, UNITS
 from neuspring.scores.statistics import paired_differences
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -21,8 +21,18 @@ from neuspring.core.files import write_text
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.core.text import masked
 from neuspring.experiments.tracking.payload import Payload, cut, milliseconds, payload
-from neuspring.experiments.tracking.query import AGAIN, is_complete, search
-from neuspring.experiments.tracking.store import ARTIFACTS, connect, default_uri, lock, lock_path, prepare, uri_of
+from neuspring.experiments.tracking.store import (
+    AGAIN,
+    ARTIFACTS,
+    connect,
+    default_uri,
+    is_complete,
+    lock,
+    lock_path,
+    prepare,
+    search,
+    uri_of,
+)
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -93,8 +103,13 @@ def sync(
         outcomes.setdefault(outcome, []).append(name)
         progress(f"{name}: {outcome}")
 
+    records: list[Path] = []
+    for folder, folders, files in os.walk(under):
+        # Neither the copies among MLflow's artifacts, nor hidden folders.
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
+        records += [Path(folder) / RUN_RECORD] if RUN_RECORD in files else []
     down = _close_leftovers(results, settings, note) if settings.enabled else None
-    for path in _records(under):
+    for path in records:
         name = path.parent.relative_to(results).as_posix()
         if down:
             note(name, down)
@@ -191,14 +206,6 @@ def _chunks(items: list[T], size: int) -> Iterator[list[T]]:
 # --- records, leftovers, messages ---------------------------------------------------------------------------------------------
 
 
-def _records(results: Path) -> Iterator[Path]:
-    """Every run.json under `results`, in order, but not the copies among MLflow's artifacts, and no hidden folders."""
-    for folder, folders, files in os.walk(results):
-        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
-        if RUN_RECORD in files:
-            yield Path(folder) / RUN_RECORD
-
-
 def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str], None]) -> str | None:
     """Close RUNNING runs that nobody is logging. Returns why the store cannot be used, None if it can."""
     try:
@@ -229,15 +236,11 @@ def _close_if_free(client: MlflowClient, run: Run, path: Path) -> bool:
 
 
 def _unreachable(error: Exception, consequence: str) -> str:
-    outcome = f"unreachable: {_line(error)}"
+    """The outcome, with the first line of the error, short and without passwords; told as a warning with its consequence."""
+    line = (str(error).strip().splitlines() or [""])[0] or type(error).__name__
+    outcome = f"unreachable: {masked(cut(line, 300))}"
     _warn(f"{outcome}; {consequence}.")
     return outcome
-
-
-def _line(error: Exception) -> str:
-    """The first line of an error, short and without passwords."""
-    lines: Iterable[str] = str(error).strip().splitlines()
-    return masked(cut(next(iter(lines), "") or type(error).__name__, 300))
 
 
 def _warn(message: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shlex
@@ -55,9 +54,11 @@ def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
     if doubles := [target for target in targets if targets.count(target) > 1]:
         raise InputError(run_json, "artifacts of one folder must have different file names", doubles[0])
     metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
-    for name in {point.name for point in metrics}:
-        _checked_name(run_json, name)
-    return Payload(tags=_tags(record) | _player(folder), params=_params(record, run_json), metrics=metrics, files=files)
+    for name in [*record.params, *{point.name for point in metrics}]:
+        if not METRIC_NAME.fullmatch(name):
+            raise InputError(run_json, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
+    params = [(name, cut(str(value), PARAM_LENGTH)) for name, value in record.params.items()]
+    return Payload(tags=_tags(record, folder), params=params, metrics=metrics, files=files)
 
 
 def milliseconds(time: str) -> int:
@@ -70,24 +71,16 @@ def cut(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
-def _tags(record: RunRecord) -> dict[str, str]:
+def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
     names = ("scenario", "category", "source", "method", "seed", "attempt", "status", "reason", "commit", "data_digest", "device")
     tags = {name: str(getattr(record, name)) for name in (*names, "run_key")}
     tags |= {f"variant.{name}": str(value) for name, value in record.variant.items()}
     if record.commit:
         tags["mlflow.source.git.commit"] = record.commit  # MLflow's pages show this one as the version
+    # How to look at the run and pull its twin: as a tag, and in the description on MLflow's page.
+    tags["play"] = command = shlex.join(["neuspring", "play", str(folder)])
+    tags["mlflow.note.content"] = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
     return {name: cut(value, TAG_LENGTH) for name, value in tags.items()}
-
-
-def _player(folder: Path) -> dict[str, str]:
-    """How to look at the run and pull its twin: as a tag, and in the description on MLflow's page."""
-    command = shlex.join(["neuspring", "play", str(folder)])
-    about = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
-    return {"play": cut(command, TAG_LENGTH), "mlflow.note.content": cut(about, TAG_LENGTH)}
-
-
-def _params(record: RunRecord, where: Path) -> list[tuple[str, str]]:
-    return [(_checked_name(where, name), cut(str(value), PARAM_LENGTH)) for name, value in record.params.items()]
 
 
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
@@ -97,10 +90,10 @@ def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
         yield Point(f"seconds.{stage}", seconds, 0, end)
     if record.scores_file:
         for task, metric, value in _table(run_json, record.scores_file, ("task", "metric", "value")):
-            yield Point(f"{task}.{metric}", _number(value), 0, end)
+            yield Point(f"{task}.{metric}", value, 0, end)
     for history, name in record.histories.items():
         for step, metric, value in _table(run_json, name, ("step", "metric", "value")):
-            yield Point(f"{history}.{metric}", _number(value), int(step), end)
+            yield Point(f"{history}.{metric}", value, int(step), end)
 
 
 def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Point]:
@@ -164,13 +157,3 @@ def _named_file(run_json: Path, path: Path) -> Path:
     if not path.is_file():
         raise InputError(path, f"named by {run_json}", "no such file", f"Delete {run_json} and run again.")
     return path
-
-
-def _checked_name(where: Path, name: str) -> str:
-    if not METRIC_NAME.fullmatch(name):
-        raise InputError(where, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
-    return name
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)

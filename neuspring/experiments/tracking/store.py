@@ -1,4 +1,4 @@
-"""The MLflow store: where it is, how it is created and upgraded, a client of it, and the locks that tell loggers apart.
+"""The MLflow store: where it is, how it is created and upgraded, what it holds, and the locks that tell loggers apart.
 
 mlflow is imported only when it is used, after its environment is set.
 """
@@ -6,18 +6,23 @@ mlflow is imported only when it is used, after its environment is set.
 from __future__ import annotations
 
 import os
+import re
 import socket
 import sqlite3
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from neuspring.config import Tracking
+from neuspring.core.errors import InputError
+from neuspring.core.text import masked
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
     from mlflow import MlflowClient
+    from mlflow.entities import Run
 
 ENVIRONMENT = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -31,6 +36,8 @@ ENVIRONMENT = {
 and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
+AGAIN = "commit."
+"""Prefix of the tags that name further commits, or a later time, at which the same results were made."""
 PATIENCE = 600.0
 """Seconds to wait for another process that logs the same record or creates the database."""
 
@@ -66,10 +73,105 @@ def prepare(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
     uri = uri_of(results, settings)
     database = _database_file(uri)
     with lock(database.with_name(f"{database.name}.lock") if database else lock_path(results, "init")):
-        if _is_database(uri):
-            _migrate(uri)
+        if database and _is_missing(uri):
+            # Built aside: a process killed in the middle of the migrations would leave a database that no client can open again.
+            part = database.with_name(f"{database.name}.part")
+            part.unlink(missing_ok=True)
+            _upgrade(f"sqlite:///{part}")
+            part.replace(database)
+        elif _is_database(uri):
+            _probe(uri)
+            _upgrade(uri)
         client = _client(uri)
-        return client, _experiment(client, results, settings) or _create_experiment(client, results, settings)
+        if identifier := _experiment(client, results, settings):
+            return client, identifier
+        # A server has its own place for artifacts. Without a server MLflow would take ./mlruns of the first process, for ever.
+        location = _artifact_location(results, settings) if _is_database(uri) else None
+        try:
+            return client, client.create_experiment(settings.experiment, artifact_location=location)
+        except Exception:
+            # Another machine may have created it between our question and our request; our lock does not reach that far.
+            if identifier := _experiment(client, results, settings):
+                return client, identifier
+            raise
+
+
+# --- what it holds ---
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggedRun:
+    """A complete run, as MLflow holds it."""
+
+    run_key: str
+    """Equal for equal results."""
+    scenario: str
+    category: str
+    method: str
+    seed: int
+    status: str
+    """ok or failed."""
+    reason: str
+    device: str
+    data_digest: str
+    commits: dict[str, int]
+    """Commit -> when it last made this run, ms since 1970."""
+    params: dict[str, str]
+    metrics: dict[str, float]
+    """Last values."""
+
+    @property
+    def place(self) -> tuple[str, str, int]:
+        """Scenario, method and seed."""
+        return self.scenario, self.method, self.seed
+
+
+def logged_runs(results: Path, settings: Tracking) -> list[LoggedRun]:
+    """All complete runs of the experiment. Raises InputError where MLflow does not answer or has no such experiment."""
+    uri = masked(uri_of(Path(results), settings))
+    try:
+        store = find(Path(results), settings)
+        runs = search(*store, logged="complete") if store else None
+    except Exception as error:
+        reason = masked(str(error).partition("\n")[0])
+        raise InputError(
+            uri, "MLflow must answer", reason or type(error).__name__, "Start its server, or correct tracking.uri."
+        ) from error
+    if runs is None:
+        raise InputError(uri, f"MLflow must hold the experiment {settings.experiment}", "none", "Run `neuspring sync` first.")
+    names = ("run_key", "scenario", "category", "method", "status", "reason", "device", "data_digest")
+    found = []
+    for run in runs:
+        tags = run.data.tags
+        if not is_complete(run) or "run_key" not in tags:
+            continue
+        commits = {tags["commit"]: run.info.end_time or 0}
+        commits |= {name.removeprefix(AGAIN): int(value) for name, value in tags.items() if name.startswith(AGAIN)}
+        plain = {name: tags[name] for name in names}
+        found.append(LoggedRun(**plain, seed=int(tags["seed"]), commits=commits, params=run.data.params, metrics=run.data.metrics))
+    return found
+
+
+def search(client: MlflowClient, experiment: str, status: str | None = None, **tags: str) -> list[Run]:
+    """All runs of the experiment with this status and these tags (values without quotes: keys, names and numbers)."""
+    terms = [f"tags.{name} = '{value}'" for name, value in tags.items()]
+    terms += [f"attributes.status = '{status}'"] if status else []
+    runs: list[Run] = []
+    token: str | None = None
+    while True:
+        page = client.search_runs([experiment], " and ".join(terms), page_token=token)
+        runs += page
+        token = page.token
+        if not token:
+            return runs
+
+
+def is_complete(run: Run) -> bool:
+    """Whether everything of a run was sent."""
+    return run.data.tags.get("logged") == "complete" and run.info.status in ("FINISHED", "FAILED")
+
+
+# --- locks and details ---
 
 
 def lock_path(results: Path, name: str) -> Path:
@@ -96,19 +198,6 @@ def _client(uri: str) -> MlflowClient:
     from mlflow import MlflowClient
 
     return MlflowClient(tracking_uri=uri)
-
-
-def _migrate(uri: str) -> None:
-    database = _database_file(uri)
-    if database is None or not _is_missing(uri):
-        _probe(uri)
-        _upgrade(uri)
-        return
-    # Built aside: a process killed in the middle of the migrations would leave a database that no client can open again.
-    part = database.with_name(f"{database.name}.part")
-    part.unlink(missing_ok=True)
-    _upgrade(f"sqlite:///{part}")
-    part.replace(database)
 
 
 def _upgrade(uri: str) -> None:
@@ -138,28 +227,12 @@ def _experiment(client: MlflowClient, results: Path, settings: Tracking) -> str 
     return experiment.experiment_id
 
 
-def _create_experiment(client: MlflowClient, results: Path, settings: Tracking) -> str:
-    # A server has its own place for artifacts. Without a server MLflow would take ./mlruns of the first process, for ever.
-    location = _artifact_location(results, settings) if _is_database(uri_of(results, settings)) else None
-    try:
-        return client.create_experiment(settings.experiment, artifact_location=location)
-    except Exception:
-        # Another machine may have created it between our question and our request; our lock does not reach that far.
-        if identifier := _experiment(client, results, settings):
-            return identifier
-        raise
-
-
 def _artifact_location(results: Path, settings: Tracking) -> str:
     return (results.resolve() / ARTIFACTS / settings.experiment).as_uri()
 
 
 def _is_database(uri: str) -> bool:
-    return _scheme(uri) in ("sqlite", *PORTS)
-
-
-def _scheme(uri: str) -> str:
-    return uri.split(":", 1)[0].split("+", 1)[0]
+    return re.split("[:+]", uri)[0] in ("sqlite", *PORTS)
 
 
 def _database_file(uri: str) -> Path | None:
@@ -180,4 +253,4 @@ def _probe(uri: str) -> None:
         with closing(sqlite3.connect(database, timeout=20)) as connection:
             connection.execute("PRAGMA schema_version").fetchone()
     elif _is_database(uri) and (address := urlsplit(uri)).hostname:
-        socket.create_connection((address.hostname, address.port or PORTS[_scheme(uri)]), timeout=5).close()
+        socket.create_connection((address.hostname, address.port or PORTS[re.split("[:+]", uri)[0]]), timeout=5).close()
