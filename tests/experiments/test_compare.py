@@ -131,11 +131,12 @@ def test_a_commit_without_runs_is_an_error_that_lists_the_known_ones(logged: lis
         compare.compare(Path(), Tracking(), "111", "2222")
 
 
-def test_commits_are_compared_from_the_index_alone(tmp_path: Path) -> None:
-    results, settings = tmp_path / "results", Tracking()
-    with pytest.raises(InputError, match="neuspring sync"):
-        compare.compare(results, settings, OLD, NEW)
-    assert not results.exists()
+def test_commits_are_compared_from_the_index_alone(tracked: Path, tmp_path: Path) -> None:
+    results, settings = tracked, Tracking()
+    for empty in (tmp_path / "none", results):
+        with pytest.raises(InputError, match="neuspring sync"):
+            compare.compare(empty, settings, OLD, NEW)
+    assert not (tmp_path / "none").exists()
 
     # The first run's results change; the second's are the same again, so that MLflow keeps one run.
     for i, commit in enumerate((OLD, NEW)):

@@ -1,9 +1,12 @@
-"""The MLflow index: complete, never doubled, never fatal, rebuilt from the files."""
+"""The MLflow index: complete, never doubled, never fatal, rebuilt from the files; created once, upgraded, moved, damaged, away."""
 
 from __future__ import annotations
 
+import importlib
 import json
-import signal
+import multiprocessing
+import socket
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -17,11 +20,11 @@ from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import store as tracking_store
 from neuspring.experiments.tracking.payload import _system_metrics
-from tests.support import loggers
 from tests.support.stores import STEPS, client_of, python, runs_of, write_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = Tracking()
+FORK = multiprocessing.get_context("fork")
 STARTED_MS, ENDED_MS = 1795255200000, 1795255530000
 
 
@@ -145,32 +148,30 @@ def test_a_failed_run_is_logged_as_failed(results: Path) -> None:
     assert set(run.data.metrics) == {"seconds.fit"}
 
 
-def test_a_killed_logger_leaves_one_closed_and_one_complete_run(results: Path, tmp_path: Path) -> None:
+def test_a_killed_logger_leaves_one_closed_and_one_complete_run(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mlflow import MlflowClient
+
     record, mark = write_run(results), tmp_path / "uploading"
-    code = """
-import sys, time
-from pathlib import Path
-from neuspring.experiments.tracking import log as tracking
-from neuspring.config import Tracking
-from mlflow import MlflowClient
 
-def hang(*_):
-    Path(sys.argv[3]).touch()
-    time.sleep(60)
+    def hang(*_: Any) -> None:
+        mark.touch()
+        time.sleep(60)
 
-MlflowClient.log_artifact = hang
-tracking.log_run(Path(sys.argv[1]), Path(sys.argv[2]), Tracking())
-"""
-    logger = python(code, record, results, mark)
+    with monkeypatch.context() as patch:
+        patch.setattr(MlflowClient, "log_artifact", hang)
+        logger = FORK.Process(target=tracking.log_run, args=(record, results, SETTINGS))
+        logger.start()
     deadline = time.monotonic() + 30
     while not mark.exists():
-        assert time.monotonic() < deadline and logger.poll() is None
+        assert time.monotonic() < deadline and logger.is_alive()
         time.sleep(0.05)
     (alive,) = runs_of(results)
     client = client_of(results)
     assert not tracking._close_if_free(client, alive, tracking_store.lock_path(results, alive.data.tags["run_key"]))
-    logger.send_signal(signal.SIGKILL)
-    logger.wait()
+    logger.kill()
+    logger.join()
 
     assert tracking.sync(results, SETTINGS) == {"closed": ["rope/ours/0"], "logged": ["rope/ours/0"]}
     states = {run.info.status: run.data.tags for run in runs_of(results)}
@@ -220,13 +221,15 @@ def test_a_server_that_fails_midway_leaves_nothing_double(results: Path, monkeyp
     assert sorted(run.info.status for run in runs_of(results)) == ["FINISHED", "KILLED"]
 
 
-def test_processes_that_log_the_same_records_at_once_double_none(results: Path, tmp_path: Path) -> None:
-    records = [write_run(results, scenario=f"s{i}") for i in range(8)]
-    assert loggers.start([records] * 4, results, SETTINGS, tmp_path).wait(300) == 0, (tmp_path / "stderr").read_text()
-    words = [word for _, word, _ in loggers.outcomes(tmp_path)]
-    assert sorted(words) == ["already logged"] * 24 + ["logged"] * 8
+def test_processes_that_log_the_same_records_at_once_double_none(results: Path) -> None:
+    records = [write_run(results, scenario=f"s{i}") for i in range(4)]
+    answers = FORK.SimpleQueue()
+    for _ in range(4):
+        FORK.Process(target=lambda: answers.put([tracking.log_run(record, results, SETTINGS) for record in records])).start()
+    outcomes = [outcome for _ in range(4) for outcome in answers.get()]
+    assert sorted(outcomes) == ["already logged"] * 12 + ["logged"] * 4
     runs = runs_of(results)
-    assert len(runs) == 8 and {run.data.tags["scenario"] for run in runs} == {f"s{i}" for i in range(8)}
+    assert len(runs) == 4 and {run.data.tags["scenario"] for run in runs} == {f"s{i}" for i in range(4)}
     assert {run.info.status for run in runs} == {"FINISHED"}
 
 
@@ -290,3 +293,107 @@ def test_damaged_records_are_input_errors(results: Path) -> None:
     assert tracking.sync(results, SETTINGS, lines.append) == {"damaged": ["rope/ours/0"], "logged": ["rope/ours/1"]}
     assert lines == ["rope/ours/0: damaged", "rope/ours/1: logged"]
     assert len(runs_of(results)) == 1, "nothing was sent of the damaged ones"
+
+
+def test_init_twice_and_by_two_processes_at_once(tmp_path: Path) -> None:
+    (tmp_path / "mlflow.db.part").write_text("left by a killed init")
+    answers = FORK.SimpleQueue()
+    processes = [FORK.Process(target=lambda: answers.put(tracking.init(tmp_path, SETTINGS))) for _ in range(2)]
+    for process in processes:
+        process.start()
+    first, second = answers.get(), answers.get()
+    assert first == second == tracking.init(tmp_path, SETTINGS)
+    assert first["outcome"] == "ready"
+    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
+    assert not (tmp_path / "mlflow.db.part").exists()
+
+
+def test_init_upgrades_an_older_database(tmp_path: Path) -> None:
+    from alembic import command
+    from mlflow.store.tracking.dbmodels.initial_models import Base
+
+    utils: Any = importlib.import_module("mlflow.store.db.utils")
+    engine = utils.create_sqlalchemy_engine(tracking.default_uri(tmp_path))
+    Base.metadata.create_all(engine)
+    settings = utils._get_alembic_config(str(engine.url))
+    with engine.begin() as connection:
+        settings.attributes["connection"] = connection
+        command.upgrade(settings, "451aebb31d03")  # MLflow 1.0
+    engine.dispose()
+    assert tracking.init(tmp_path, SETTINGS)["outcome"] == "ready"
+    assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
+
+
+def test_a_moved_results_folder_is_refused_with_a_way_out(results: Path, tmp_path: Path) -> None:
+    """Its index would write artifacts to the old place."""
+    tracking.log_run(write_run(results), results, SETTINGS)
+    moved = results.rename(tmp_path / "moved")
+    ((word, _),) = tracking.sync(moved, SETTINGS).items()
+    assert word.startswith("unreachable: ") and "has moved" in word
+    assert not results.exists()
+
+
+def test_disabled_touches_nothing(tmp_path: Path) -> None:
+    off = Tracking(enabled=False)
+    record = write_run(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert tracking.init(tmp_path, off)["outcome"] == "disabled"
+    assert tracking.log_run(record, tmp_path, off) == "disabled"
+    assert tracking.sync(tmp_path, off) == {"disabled": ["rope/ours/0"]}
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    away = Tracking(uri=f"http://secret@127.0.0.1:{port}")
+    records = [write_run(results, seed=seed) for seed in range(3)]
+    start = time.monotonic()
+    outcome = tracking.log_run(records[0], results, away)
+    assert outcome.startswith("unreachable: ")
+    assert tracking.init(results, away)["outcome"].startswith("unreachable: ")
+    ((word, names),) = tracking.sync(results, away).items()
+    assert word.startswith("unreachable: ") and len(names) == 3
+    assert time.monotonic() - start < 15
+    text = capsys.readouterr().err
+    assert "warning: tracking: unreachable" in text and "secret" not in text + outcome
+
+    outcome_file = records[0].with_name("mlflow.txt")
+    outcome_file.write_text(f"{outcome}\n")
+    assert tracking.sync(results, SETTINGS) == {"logged": [f"rope/ours/{seed}" for seed in range(3)]}
+    assert outcome_file.read_text() == "logged\n", "the workflow must not count the run as waiting for ever"
+    assert not records[1].with_name("mlflow.txt").exists()
+
+
+@pytest.mark.parametrize("damage", ["text", "postgres"])
+def test_a_damaged_database_or_absent_host_fails_at_once(results: Path, damage: str) -> None:
+    """MLflow itself would retry these for about two minutes."""
+    settings = SETTINGS
+    if damage == "text":
+        (results / "mlflow.db").write_text("not a database " * 100)
+    else:
+        settings = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
+    start = time.monotonic()
+    assert tracking.log_run(write_run(results), results, settings).startswith("unreachable: ")
+    assert tracking.init(results, settings)["outcome"].startswith("unreachable: ")
+    assert "secret" not in tracking.init(results, settings)["uri"]
+    assert time.monotonic() - start < 10
+
+
+def test_mlflow_is_imported_late_with_telemetry_off(results: Path) -> None:
+    code = """
+import os, sys
+from pathlib import Path
+os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = "7"
+from neuspring.experiments.tracking import log as tracking
+from neuspring.config import Tracking
+assert not {"mlflow", "pandas", "filelock"} & set(sys.modules)
+tracking.init(Path(sys.argv[1]), Tracking())
+import mlflow.telemetry.client
+print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"],
+      mlflow.telemetry.client.get_telemetry_client())
+"""
+    process = python(code, results, stderr=subprocess.PIPE)
+    text, errors = process.communicate(timeout=240)
+    assert (text.split(), errors) == (["true", "true", "7", "None"], "")

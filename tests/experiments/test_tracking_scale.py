@@ -98,19 +98,14 @@ def kill_in_the_middle(index: int, out: Path, process: subprocess.Popen[str], re
     os.kill(pid, signal.SIGKILL)
 
 
-def test_sixteen_processes_write_to_one_sqlite_file(tmp_path: Path, template: Path) -> None:
-    results, settings = tmp_path / "results", Tracking()
+@pytest.mark.parametrize("backend", ["sqlite", "postgres"])
+def test_sixteen_processes_write_to_one_database(
+    tmp_path: Path, template: Path, backend: str, request: pytest.FixtureRequest
+) -> None:
+    results = tmp_path / "results"
     groups = write_runs(results, writers=16, each=3)
     shutil.copy(template, results / "mlflow.db")
-    assert tracking.init(results, settings)["outcome"] == "ready"
-    assert finish(loggers.start(groups, results, settings, tmp_path), tmp_path) == {"logged": 48}
-    assert len(all_runs(results, settings)) == 48
-    assert_every_run_is_there_once(results, settings, groups)
-
-
-def test_sixteen_processes_write_to_postgresql(tmp_path: Path, cluster: stores.Postgres) -> None:
-    results, settings = tmp_path / "results", Tracking(uri=cluster.database("direct"))
-    groups = write_runs(results, writers=16, each=3)
+    settings = Tracking(uri=request.getfixturevalue("cluster").database("direct") if backend == "postgres" else None)
     assert tracking.init(results, settings)["outcome"] == "ready"
     assert finish(loggers.start(groups, results, settings, tmp_path), tmp_path) == {"logged": 48}
     assert len(all_runs(results, settings)) == 48
