@@ -29,6 +29,7 @@ from neuspring.config import (
     read_yaml,
 )
 from neuspring.config.images import Appearance
+from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, read_scenarios
 from neuspring.perception.backends import BACKENDS
@@ -431,11 +432,18 @@ def _require_alike(
             raise InputError("configuration, mocap.rings", rule, None)
 
 
+def _with_hint(name: str, known: Mapping[str, Any]) -> str:
+    """An unknown row, and what to name in its place: its name now, or one that is spelled alike."""
+    if now := RENAMED_ROWS.get(name):
+        return f"{name!r} ({now if ' ' in now else f'now {now!r}'})"
+    alike = difflib.get_close_matches(name, known, n=1)
+    return f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}"
+
+
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
-        close = {name: difflib.get_close_matches(name, known, n=1) for name in unknown}
-        hints = [f"{name!r}" + (f" (did you mean {match[0]!r}?)" if match else "") for name, match in close.items()]
+        hints = [_with_hint(name, known) for name in unknown]
         raise InputError(
             f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
         )

@@ -76,10 +76,10 @@ def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run)
 
 
 def test_methods_share_searches_and_fits(project):
-    names = ["search_only", "baseline", "phystwin", "model_a", "model_b", "neuspring", "pt_only", "clusters_1", "clusters_5"]
+    names = ["search_only", "baseline", "model_a", "model_b", "neuspring", "pt_only", "neuspring_plus", "oracle_neuspring"]
     jobs = plan(project, {"methods": names, "seeds": [0, 1]})
-    # Uniform and five regions; baseline, model_a, model_b and neuspring; two seeds each.
-    assert (jobs["search"], jobs["fit"]) == (2 * 2, 4 * 2)
+    # Uniform and five regions; all but search_only and pt_only have a fit; two seeds each.
+    assert (jobs["search"], jobs["fit"]) == (2 * 2, 6 * 2)
     assert jobs["rollout"] == jobs["score"] == len(names) * 2
 
 

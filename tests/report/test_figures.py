@@ -307,7 +307,7 @@ STUDY = {
     ("b", "clusters_1", 1): 0.030,
     ("b", "clusters_10", 0): 0.040,
     ("b", "clusters_10", 1): 0.048,
-    ("a", "neuspring", 0): 0.9,
+    ("a", "search_only", 0): 0.9,
 }
 
 
@@ -327,17 +327,18 @@ def test_cluster_curves_are_the_means_and_deviations_over_seeds():
 def test_cluster_methods_are_sorted_by_number():
     assert list(
         figures_clusters.cluster_methods(["clusters_10", "neuspring", "clusters_2", "clusters_2", "clusters_x"]).values()
-    ) == [2, 10]
+    ) == [2, 5, 10]
+    assert figures_clusters.cluster_methods(["model_b", "neuspring"]) == {}
 
 
 @pytest.mark.parametrize(
     ("methods", "made"),
-    [(("clusters_1", "clusters_10", "neuspring"), True), (("clusters_1", "neuspring"), False), (("neuspring",), False)],
+    [(("clusters_1", "clusters_10", "search_only"), True), (("clusters_1", "search_only"), False), (("search_only",), False)],
 )
 def test_the_cluster_picture_is_made_for_two_counts_or_more(tmp_path, methods, made):
     found = chamfer({key: value for key, value in STUDY.items() if key[1] in methods})
     (tmp_path / "clusters.png").write_text("of an earlier run")
-    tables.write(found, "neuspring", tmp_path)
+    tables.write(found, "search_only", tmp_path)
     assert (tmp_path / "clusters.png").exists() == made
     assert ("(clusters.png)" in (tmp_path / "summary.md").read_text()) == made
     if made:

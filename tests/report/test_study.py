@@ -108,24 +108,24 @@ def test_a_study_does_not_take_the_name_of_another_table(tmp_path):
 def test_rounding_makes_no_difference_to_the_paper(ours, verdict):
     """PhysTwin's Chamfer distance is printed as 0.005."""
     key = ("reconstruction", "chamfer")
-    found = cells_of("table1", collected(everywhere("phystwin", {key: ours}))).loc[("PhysTwin", *key)]
+    found = cells_of("table1", collected(everywhere("baseline", {key: ours}))).loc[("PhysTwin", *key)]
     assert found["verdict"] == verdict
     assert found["difference"] == pytest.approx(ours - 0.005)
 
 
 def test_the_overlap_of_silhouettes_is_compared_in_per_cent():
-    found = cells_of("table1", collected(everywhere("phystwin", {IOU: 0.7252}))).loc[("PhysTwin", *IOU)]
+    found = cells_of("table1", collected(everywhere("baseline", {IOU: 0.7252}))).loc[("PhysTwin", *IOU)]
     assert found["ours"] == pytest.approx(72.52)
     assert found["verdict"] == "within"
-    assert cells_of("table1", collected(everywhere("phystwin", {IOU: 0.8}))).loc[("PhysTwin", *IOU), "verdict"] == "better"
+    assert cells_of("table1", collected(everywhere("baseline", {IOU: 0.8}))).loc[("PhysTwin", *IOU), "verdict"] == "better"
 
 
 def test_absolute_values_are_compared_on_the_papers_scenarios_alone():
-    some = everywhere("phystwin", {CD: 0.012}, RELEASED[:8])
+    some = everywhere("baseline", {CD: 0.012}, RELEASED[:8])
     assert cells_of("table1", collected(some)).loc[("PhysTwin", *CD), "verdict"] == "partial (8 of 22): within"
-    one = everywhere("phystwin", {CD: 0.1}, RELEASED[:1])
+    one = everywhere("baseline", {CD: 0.1}, RELEASED[:1])
     assert cells_of("table1", collected(one)).loc[("PhysTwin", *CD), "verdict"] == "partial (1 of 22): no interval"
-    for others in (collected(some | everywhere("phystwin", {CD: 0.012}, ["toy"])), collected(some, source="phystwin_raw")):
+    for others in (collected(some | everywhere("baseline", {CD: 0.012}, ["toy"])), collected(some, source="phystwin_raw")):
         found = cells_of("table1", others).loc[("PhysTwin", *CD)]
         assert found["verdict"] == "other data"
         assert np.isnan(found["difference"])
@@ -133,17 +133,17 @@ def test_absolute_values_are_compared_on_the_papers_scenarios_alone():
 
 
 def test_what_is_not_there_is_said():
-    runs = collected(everywhere("phystwin", {CD: 0.012}), failed=tuple((s, "neuspring", 0) for s in RELEASED))
+    runs = collected(everywhere("baseline", {CD: 0.012}), failed=tuple((s, "neuspring", 0) for s in RELEASED))
     found = cells_of("table1", runs)["verdict"]
     assert found[("Spring-Gaus", *CD)] == "not run"
     assert found[("NeuSpring", *CD)] == "not run (22 failed)"
     assert found[("PhysTwin", *PSNR)] == "not computed"
-    apart = everywhere("phystwin", {CD: 0.012}, RELEASED[:2]) | everywhere("neuspring", {CD: 0.012}, RELEASED[2:4])
+    apart = everywhere("baseline", {CD: 0.012}, RELEASED[:2]) | everywhere("neuspring", {CD: 0.012}, RELEASED[2:4])
     assert cells_of("table1", collected(apart)).loc[("NeuSpring", *CD), "verdict"] == "nothing to compare"
 
 
 def test_errors_weigh_scenarios_and_pictures_weigh_frames():
-    values = {("a", "phystwin", 0): {CD: 0.01, PSNR: 20.0}, ("b", "phystwin", 0): {CD: 0.03, PSNR: 40.0}}
+    values = {("a", "baseline", 0): {CD: 0.01, PSNR: 20.0}, ("b", "baseline", 0): {CD: 0.03, PSNR: 40.0}}
     found = cells_of("table1", collected(values, {"a": 30, "b": 10})).loc["PhysTwin"]
     assert found.loc[CD, ["ours", "other_average"]].tolist() == pytest.approx([0.02, 0.015])
     assert found.loc[PSNR, ["ours", "other_average"]].tolist() == pytest.approx([25.0, 30.0])
@@ -184,8 +184,8 @@ def test_changes_are_paired(metric):
 
 def test_intervals_and_spreads_of_pictures_are_weighted_too():
     """A short recording counts for little, also in a resample that holds it twice."""
-    values = {(name, "phystwin", seed): {PSNR: 20.0 + seed} for name in RELEASED[:9] for seed in (0, 1)}
-    values |= {("short", "phystwin", seed): {PSNR: 40.0 - seed} for seed in (0, 1)}
+    values = {(name, "baseline", seed): {PSNR: 20.0 + seed} for name in RELEASED[:9] for seed in (0, 1)}
+    values |= {("short", "baseline", seed): {PSNR: 40.0 - seed} for seed in (0, 1)}
     found = cells_of("table1", collected(values, dict.fromkeys(RELEASED, 1000) | {"short": 1})).loc[("PhysTwin", *PSNR)]
     assert found["ours"] == pytest.approx(20.5, abs=0.01)
     assert found["spread"] == pytest.approx(np.sqrt(0.5), abs=0.001)
@@ -256,7 +256,7 @@ def test_a_table_of_nothing_holds_the_papers_values(tmp_path):
     assert set(table["verdict"]) == {"not run"}
     assert len(table) == 48
     assert table["ours"].isna().all()
-    missing = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED, [0], ["phystwin"], tmp_path / "out")
+    missing = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED, [0], ["baseline"], tmp_path / "out")
     assert "0/22 (22 missing)" in missing
     assert "and 16 more: missing: no run.json" in missing
 
@@ -266,11 +266,11 @@ def written(tmp_path_factory):
     """Tables of a benchmark of two seeds on eight of the paper's scenarios, in which a run failed and a record is damaged."""
     folder = tmp_path_factory.mktemp("results")
     names = RELEASED[:8]
-    write_benchmark(folder, names, {"phystwin": 1.0, "neuspring": 0.8})
+    write_benchmark(folder, names, {"baseline": 1.0, "neuspring": 0.8})
     write_run(folder, names[0], "neuspring", 1, {}, status="failed", reason="rollout: node 3 left | the scene")
-    (folder / names[1] / "phystwin" / "0" / "scores.parquet").write_bytes(b"half a fi")
+    (folder / names[1] / "baseline" / "0" / "scores.parquet").write_bytes(b"half a fi")
     out = folder / "tables" / "studies"
-    text = tables_paper.write_study("table1", STUDIES["table1"], folder, names, [0, 1], ["phystwin", "neuspring"], out)
+    text = tables_paper.write_study("table1", STUDIES["table1"], folder, names, [0, 1], ["baseline", "neuspring"], out)
     return folder, out, text
 
 
@@ -335,28 +335,28 @@ def test_breakdowns_hold_every_finished_run(written):
 def test_ours_stands_beside_the_released_values(written):
     folder, out, text = written
     name = RELEASED[2]
-    row = pd.read_csv(out / "table1_released_phystwin.csv").set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
+    row = pd.read_csv(out / "table1_released_baseline.csv").set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
     known = paper.released().set_index(["scenario", "task", "metric"])["value"]
-    scores = [pd.read_parquet(folder / name / "phystwin" / str(seed) / "scores.parquet") for seed in (0, 1)]
+    scores = [pd.read_parquet(folder / name / "baseline" / str(seed) / "scores.parquet") for seed in (0, 1)]
     ours = np.mean([table.set_index(["task", "metric"]).loc[CD, "value"] for table in scores])
     assert row["released"] == known[(name, *CD)]
     assert row["ours"] == pytest.approx(ours)
     assert row["ratio"] == pytest.approx(ours / known[(name, *CD)])
-    assert "[Per scenario](table1_released_phystwin.md): 8 of 22 scenarios have finished." in text
-    assert "mean of 8" in (out / "table1_released_phystwin.md").read_text()
+    assert "[Per scenario](table1_released_baseline.md): 8 of 22 scenarios have finished." in text
+    assert "mean of 8" in (out / "table1_released_baseline.md").read_text()
 
 
 def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values():
-    runs = collected(everywhere("phystwin", {CD: 0.012}), source="phystwin_raw")
+    runs = collected(everywhere("baseline", {CD: 0.012}), source="phystwin_raw")
     own = tables_cells.of_study(STUDIES["table1"], runs)
-    assert tables_paper.released_comparison(own, "phystwin")["ours"].isna().all()
+    assert tables_paper.released_comparison(own, "baseline")["ours"].isna().all()
 
 
 def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_path):
     folder, out, _ = written
-    everything = collect(folder, RELEASED[:8], ["neuspring", "search_only", "phystwin"], [0, 1])
+    everything = collect(folder, RELEASED[:8], ["neuspring", "search_only", "baseline"], [0, 1])
     tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
-    for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
+    for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_baseline.md"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
 
 
@@ -372,7 +372,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     assert "same direction, confirmed" in capsys.readouterr().out
     for name in ("table2.csv", "table2_scenarios.csv", "table2.md"):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
-    assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
+    assert not (tmp_path / "scores" / "table2_released_baseline.md").exists(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
     write_run(
         tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
@@ -394,14 +394,14 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
 
 def test_how_pictures_were_scored_is_said(tmp_path):
     facts = {"quirks": ["any_alpha"], "lpips": "no weights"}
-    write_run(tmp_path, RELEASED[0], "phystwin", 0, all_scores(), images=facts)
-    text = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED[:1], [0], ["phystwin"], tmp_path / "out")
+    write_run(tmp_path, RELEASED[0], "baseline", 0, all_scores(), images=facts)
+    text = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED[:1], [0], ["baseline"], tmp_path / "out")
     assert "Quirks of the released evaluation of pictures that were on: any_alpha." in text
     assert "LPIPS not computed in some runs: no weights." in text
 
 
 def test_the_number_of_regions_is_a_curve_without_the_papers_numbers(tmp_path):
-    methods = {"clusters_1": 1.0, "clusters_5": 0.7, "clusters_10": 1.2}
+    methods = {"model_b": 1.0, "neuspring": 0.7, "clusters_10": 1.2}
     names = [f"rope_{index}" for index in range(6)]
     write_benchmark(tmp_path, names, methods, source="toy")
     text = tables_paper.write_study("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], methods, tmp_path)

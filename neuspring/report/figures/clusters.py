@@ -18,19 +18,23 @@ NAME = "clusters.png"
 MM = 1e3
 MOST_PANELS = 4
 """For more scenarios than this, one panel shows their mean."""
+NAMED = {"model_b": 1, "neuspring": 5}
+"""Rows of this study that have names of their own."""
 STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
 
 
 def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
-    """The methods named clusters_<K>, each once, with K; sorted by K."""
-    counts = {method: int(match[1]) for method in methods if (match := re.fullmatch(r"clusters_(\d+)", method))}
+    """The methods named clusters_<K> and, beside such, model_b and neuspring, each once, with K; sorted by K."""
+    names = set(methods)
+    counts = {method: int(match[1]) for method in names if (match := re.fullmatch(r"clusters_(\d+)", method))}
+    counts |= {method: count for method, count in NAMED.items() if counts and method in names}
     return dict(sorted(counts.items(), key=lambda item: item[1]))
 
 
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     """The curves: scenario, task, clusters (K), mean and std [mm] over seeds. Rows of the mean over scenarios have the scenario "".
 
-    `scores` are rows of `metrics.COLUMNS`, meters; methods that are not named clusters_<K> are ignored. The standard deviation
+    `scores` are rows of `metrics.COLUMNS`, meters; other methods are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.
     """
     methods = cluster_methods(scores["method"])
