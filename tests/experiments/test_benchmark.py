@@ -541,7 +541,11 @@ def test_every_method_that_is_shipped_is_valid():
 
 def test_every_row_that_is_shipped_is_named_somewhere():
     """By a study, by a file of config/data or config/studies, or on the page of the twin or of the baselines."""
-    files = [*(ROOT / "config" / "data").glob("*.yaml"), *(ROOT / "config" / "studies").glob("*.yaml"), ROOT / "config" / "studies.yaml"]
+    files = [
+        *(ROOT / "config" / "data").glob("*.yaml"),
+        *(ROOT / "config" / "studies").glob("*.yaml"),
+        ROOT / "config" / "studies.yaml",
+    ]
     files += [ROOT / "neuspring" / room / "README.md" for room in ("twin", "baselines")]
     words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in files)))
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
@@ -549,11 +553,12 @@ def test_every_row_that_is_shipped_is_named_somewhere():
     assert set(tables.read_searches(ROOT / "config" / "searches.yaml")) == {row.search for row in methods.values() if row.search}
 
 
-@pytest.mark.parametrize(("name", "hint"), [("phystwin", "now 'baseline'"), ("plus_average", "removed; "), ("baselin", "did you mean")])
+@pytest.mark.parametrize(
+    ("name", "hint"), [("phystwin", "now 'baseline'"), ("plus_average", "removed; "), ("baselin", "did you mean")]
+)
 def test_rows_of_older_tables_are_refused_with_what_became_of_them(name, hint):
     with pytest.raises(InputError, match=hint):
         Benchmark.of(shipped("toy") | {"methods": [name]}, ROOT)
-
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():

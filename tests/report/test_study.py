@@ -335,15 +335,15 @@ def test_breakdowns_hold_every_finished_run(written):
 def test_ours_stands_beside_the_released_values(written):
     folder, out, text = written
     name = RELEASED[2]
-    row = pd.read_csv(out / "table1_released_baseline.csv").set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
+    row = pd.read_csv(out / "table1_released_phystwin.csv").set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
     known = paper.released().set_index(["scenario", "task", "metric"])["value"]
     scores = [pd.read_parquet(folder / name / "baseline" / str(seed) / "scores.parquet") for seed in (0, 1)]
     ours = np.mean([table.set_index(["task", "metric"]).loc[CD, "value"] for table in scores])
     assert row["released"] == known[(name, *CD)]
     assert row["ours"] == pytest.approx(ours)
     assert row["ratio"] == pytest.approx(ours / known[(name, *CD)])
-    assert "[Per scenario](table1_released_baseline.md): 8 of 22 scenarios have finished." in text
-    assert "mean of 8" in (out / "table1_released_baseline.md").read_text()
+    assert "[Per scenario](table1_released_phystwin.md): 8 of 22 scenarios have finished." in text
+    assert "mean of 8" in (out / "table1_released_phystwin.md").read_text()
 
 
 def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values():
@@ -356,7 +356,7 @@ def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_p
     folder, out, _ = written
     everything = collect(folder, RELEASED[:8], ["neuspring", "search_only", "baseline"], [0, 1])
     tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
-    for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_baseline.md"):
+    for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
 
 
@@ -372,7 +372,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     assert "same direction, confirmed" in capsys.readouterr().out
     for name in ("table2.csv", "table2_scenarios.csv", "table2.md"):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
-    assert not (tmp_path / "scores" / "table2_released_baseline.md").exists(), "none of these is a released scenario"
+    assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
     write_run(
         tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
