@@ -320,7 +320,9 @@ def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
 def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
     names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
     rows = config.read_yaml(ROOT / "config" / "methods.yaml")
-    write(tmp_path / "methods.yaml", json.dumps(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}}))
+    write(
+        tmp_path / "methods.yaml", yaml.safe_dump(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}})
+    )
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
     values["method_table"] = str(tmp_path / "methods.yaml")
     values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
