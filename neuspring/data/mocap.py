@@ -25,7 +25,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from neuspring.config import Mocap, ScenarioRow
+from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
@@ -89,6 +89,11 @@ MAX_STRETCH = 0.5
 below a third."""
 OVERSAMPLING = 64
 """Evaluations of the spline per marker interval, for its arc length."""
+
+
+def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
+    """See `neuspring.data.sources`."""
+    return read(row, path, config.mocap)
 
 
 def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:

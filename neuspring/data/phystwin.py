@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuspring.config import ScenarioRow
+from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -85,6 +85,16 @@ ARRAYS = (
 IGNORED = ("controller_mask",)
 """A left-over key of the released processing, which is accepted and not read."""
 KIND_NAMES = {"f": "floating point", "b": "bool"}
+
+
+def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
+    """See `neuspring.data.sources`."""
+    return read(row, path)
+
+
+def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
+    """See `neuspring.data.sources`."""
+    convert(row, path, folder)
 
 
 def read(row: ScenarioRow, folder: Path) -> Observations:

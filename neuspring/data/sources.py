@@ -1,6 +1,12 @@
-"""Where scenarios come from: `SOURCES` declares every kind of data, and the workflow asks it.
+"""Where scenarios come from: `SOURCES` declares every kind of data, and everybody asks it.
 
-To add a source: a reader (`observations`) or an importer to the capture format (`write_capture`), and its line here.
+To add a source: a module that reads it, its line here, and rows of the scenario table; if it has settings, a section of
+`neuspring.config.data`. Its module has
+
+    observe(row, path, config, output) -> Observations     where it is not filmed; truth may be written beside `output`
+    write_capture(row, path, config, folder)                where it is filmed, or has images beside processed data
+
+with `path` where its data lie.
 """
 
 from __future__ import annotations
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A kind of data. Modules are named, and imported when they are used."""
+    """A kind of data. Its module is named, and imported when it is used."""
 
     module: str
     """Reads its data; rules carry the digest of this module's code."""
@@ -30,12 +36,8 @@ class Source:
     """Keys of the configuration that reading depends on."""
     films: bool = False
     """Raw video: perception makes observations of its capture."""
-    observations: Callable[[Any, ScenarioRow, Config, Path], Observations] | None = None
-    """(module, row, settings, output) -> observations, of sources that are not filmed."""
-    write_capture: Callable[[Any, ScenarioRow, Config, Path], None] | None = None
-    """(module, row, settings, folder): write a capture folder. None if the user supplies the capture, or there are no images."""
-    capture_module: str = ""
-    """Writes captures, where that is another module."""
+    write_capture: bool = False
+    """Its module writes captures. No: the user supplies the capture, or there are no images."""
     needs_data: bool = True
     """Whether it lies under data_root."""
     has_truth: bool = False
@@ -50,29 +52,32 @@ class Source:
     """Whether images lie beside processed data, so that a capture can be made of them for pictures."""
     required: Callable[[Path], None] = lambda folder: None
     """Raises InputError where its folder lacks what no run can do without."""
+    require_alike: Callable[[Config], None] = lambda config: None
+    """Raises InputError where settings do not promise that recordings of one object have as many nodes, as transfers need."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
     """Names of the cameras before the capture is made. Raises InputError."""
 
     @property
     def importer(self) -> str:
         """The module that writes its captures."""
-        return self.capture_module or self.module
+        return self.module
 
 
 def read_observations(row: ScenarioRow, settings: Config, output: Path) -> Observations:
     """The observations of a scenario that is not filmed; the truth of a toy scene is written beside `output`."""
     source = SOURCES[row.source]
-    assert source.observations, f"{row.source} scenarios are filmed"
-    return source.observations(import_module(source.module), row, settings, output)
+    assert not source.films, f"{row.source} scenarios are filmed"
+    observations: Observations = import_module(source.module).observe(row, location(row, settings), settings, output)
+    return observations
 
 
 def write_capture(row: ScenarioRow, settings: Config, folder: Path) -> None:
     """A capture folder of a synthetic scene, or of PhysTwin's raw layout. Raises InputError for other sources."""
     source = SOURCES[row.source]
-    if source.write_capture is None:
+    if not source.write_capture:
         makers = ", ".join(name for name, other in SOURCES.items() if other.write_capture)
         raise InputError(f"scenario {row.scenario}, source", f"captures are made of {makers} scenarios", row.source)
-    source.write_capture(import_module(source.importer), row, settings, folder)
+    import_module(source.module).write_capture(row, location(row, settings), settings, folder)
 
 
 def location(row: ScenarioRow, settings: Config) -> Path:
@@ -106,67 +111,30 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     return rows
 
 
-def _toy(module: Any, row: ScenarioRow, settings: Config, output: Path) -> Observations:
-    scene = module.make(row, settings.toy)
-    # Never read by a method.
-    scene.truth.save(output.with_name("truth.npz"))
-    observations: Observations = scene.observations
-    return observations
-
-
-def _mocap(module: Any, row: ScenarioRow, settings: Config, output: Path) -> Observations:
-    observations: Observations = module.read(row, location(row, settings), settings.mocap)
-    return observations
-
-
-def _phystwin(module: Any, row: ScenarioRow, settings: Config, output: Path) -> Observations:
-    observations: Observations = module.read(row, location(row, settings))
-    return observations
-
-
-def _synthetic_capture(module: Any, row: ScenarioRow, settings: Config, folder: Path) -> None:
-    _, truth = module.make(row, settings.synthetic, folder)
-    moved = f"{1e3 * truth.certificate:.2g} mm by twice as many, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
-    energy = truth.kinetic[-1] + truth.potential[-1]
-    print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
-    print(f"{row.scenario}: smallest det F {truth.least_jacobian.min():.2f}; energy at the end {energy:.3f} J", flush=True)
-
-
-def _phystwin_capture(module: Any, row: ScenarioRow, settings: Config, folder: Path) -> None:
-    module.convert(row, location(row, settings), folder)
-
-
 def _required_capture(folder: Path) -> None:
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
 
 
+def _require_rings(config: Config) -> None:
+    if config.mocap.rings is None:
+        rule = "must be set where twins are transferred, so that all recordings have as many nodes"
+        raise InputError("configuration, mocap.rings", rule, None)
+
+
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
     return tuple(map(str, range(phystwin.camera_count(folder))))
 
 
-def _described(folder: Path, config: Config) -> tuple[str, ...]:
-    return tuple(camera.name for camera in capture.read_description(folder / capture.CAPTURE).cameras)
-
-
 SOURCES = {
-    "toy": Source(
-        module="neuspring.data.synthetic.toy",
-        reads=("toy",),
-        observations=_toy,
-        needs_data=False,
-    ),
-    "mocap": Source(
-        module="neuspring.data.mocap",
-        reads=("data_root", "mocap"),
-        observations=_mocap,
-    ),
+    "toy": Source(module="neuspring.data.synthetic.toy", reads=("toy",), needs_data=False),
+    "mocap": Source(module="neuspring.data.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
     "synthetic": Source(
         module="neuspring.data.synthetic.make",
         reads=("synthetic",),
         films=True,
-        write_capture=_synthetic_capture,
+        write_capture=True,
         needs_data=False,
         has_truth=True,
         cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
@@ -177,22 +145,21 @@ SOURCES = {
         films=True,
         own=True,
         required=_required_capture,
-        cameras=_described,
+        cameras=lambda folder, config: tuple(c.name for c in capture.read_description(folder / capture.CAPTURE).cameras),
     ),
     "phystwin_raw": Source(
         module="neuspring.data.phystwin",
         reads=("data_root",),
         films=True,
-        write_capture=_phystwin_capture,
+        write_capture=True,
         capture_files=phystwin.RAW_FILES,
         cameras=_counted,
     ),
     "phystwin": Source(
         module="neuspring.data.phystwin",
         reads=("data_root",),
-        observations=_phystwin,
+        write_capture=True,
         files=phystwin.FILES,
-        write_capture=_phystwin_capture,
         capture_files=phystwin.RAW_FILES,
         images_beside=phystwin.has_images,
         cameras=_counted,

@@ -421,15 +421,13 @@ def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
 def _require_alike(
     config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]], key: str = "transfers"
 ) -> None:
-    """Twins go to recordings of the same object; those of `mocap` with as many nodes, which `mocap.spacing` does not promise."""
+    """Twins go to recordings of the same object with as many nodes."""
     for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
         here, there = scenarios[source], scenarios[target]
         if (here.source, here.category) != (there.source, there.category):
             rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
             raise InputError(f"configuration, {key}", rule, f"source {there.source}, category {there.category}")
-        if here.source == "mocap" and config.mocap.rings is None:
-            rule = "must be set where twins are transferred, so that all recordings have as many nodes"
-            raise InputError("configuration, mocap.rings", rule, None)
+        SOURCES[here.source].require_alike(config)
 
 
 def _with_hint(name: str, known: Mapping[str, Any]) -> str:

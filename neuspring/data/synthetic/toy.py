@@ -8,10 +8,11 @@ law of the true stiffness. Observation adds noise and occlusion; the truth (a Tw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from neuspring.config import ScenarioRow, Toy
+from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference, stability
@@ -116,6 +117,13 @@ class ToyScene:
     truth: Twin
     motion: np.ndarray
     """True node positions [T, N, 3], m."""
+
+
+def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
+    """See `neuspring.data.sources`. The truth is written beside `output`; no method reads it."""
+    scene = make(row, config.toy)
+    scene.truth.save(output.with_name("truth.npz"))
+    return scene.observations
 
 
 def make(row: ScenarioRow, settings: Toy) -> ToyScene:
