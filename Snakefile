@@ -9,10 +9,7 @@ configfile: "config/config.yaml"
 
 include: "workflow/rules/common.smk"
 include: "workflow/rules/hooks.smk"
-include: "workflow/rules/perceive.smk"
-include: "workflow/rules/twin.smk"
-include: "workflow/rules/images.smk"
-include: "workflow/rules/baselines.smk"
+include: "workflow/rules/stages.smk"
 include: "workflow/rules/results.smk"
 include: "workflow/rules/sweep.smk"
 
@@ -34,7 +31,7 @@ rule all:
         tables=rules.tables.output,
         report=rules.report.input,
         page=rules.report.output,
-        logged=INPUTS.logged_runs(),
+        logged=GRAPH.logged_runs(),
 
 
 # A job that fails is tried twice again, with more memory. On a cluster it is the main process that tries again: inside a submitted

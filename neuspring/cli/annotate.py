@@ -8,7 +8,7 @@ import webbrowser
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from neuspring.stages import options as shared
+from neuspring.cli import options as shared
 
 
 def annotate_options(parser: ArgumentParser) -> None:

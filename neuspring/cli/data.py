@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuspring.stages import options as shared
+from neuspring.cli import options as shared
 
 if TYPE_CHECKING:
     from neuspring.data.departure import Departure

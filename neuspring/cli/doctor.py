@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from neuspring.stages import options as shared
+from neuspring.cli import options as shared
 
 
 def doctor_options(parser: ArgumentParser) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from neuspring.cli import options as shared
+
 KINDS = {
     "strip": "observed frames on top, each method's prediction and error below -> PDF or PNG",
     "twin": "stiffness and regions of twins, from any side -> PDF or PNG",
@@ -23,11 +25,9 @@ def words(given: list[str]) -> list[str]:
 
 def draw_options(parser: ArgumentParser) -> None:
     """Add the kinds of pictures and their options."""
-    from neuspring.stages import draw as frames
-
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="kind")
     parts = {name: kinds.add_parser(name, help=about, description=about) for name, about in KINDS.items()}
-    frames.options(parts["frames"])
+    _frames(parts["frames"])
     _runs(parts["strip"], "pdf")
     parts["strip"].add_argument(
         "--frames", type=int, nargs="+", help="default: first, last of training, middle of the future, last"
@@ -52,10 +52,21 @@ def draw_options(parser: ArgumentParser) -> None:
     parts["film"].add_argument("--megabytes", type=float, default=MEGABYTES, help=about)
 
 
+def _frames(parser: ArgumentParser) -> None:
+    """A prediction's splats, seen by a camera."""
+    parser.add_argument("--capture", type=Path, required=True, help="capture.json")
+    shared.add_record(parser, "appearance", "appearance.json")
+    shared.add_record(parser, "rollout", "rollout.json")
+    parser.add_argument("--camera", required=True)
+    parser.add_argument("--frames", type=int, nargs="+", help="all by default")
+    parser.add_argument("--background", choices=("black", "white"), default="black")
+    shared.add_settings(parser)
+    shared.add_device(parser)
+    shared.add_output(parser, "folder to write to")
+
+
 def _runs(parser: ArgumentParser, ending: str) -> None:
     """Which runs, seen from where, as which file."""
-    from neuspring.stages import options as shared
-
     about = "results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario"
     parser.add_argument("results", type=Path, nargs="+", help=about)
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="METHOD or METHOD/SEED, in the order of the picture")
@@ -88,9 +99,13 @@ def _page(parser: ArgumentParser) -> None:
 def draw(a: Namespace) -> None:
     """`neuspring draw`."""
     if a.kind == "frames":
-        from neuspring.stages import draw as frames
+        from neuspring.core.records import Before
+        from neuspring.stages.render import draw_frames
 
-        frames.command(a)
+        records = (Before.load(a.appearance), Before.load(a.rollout))
+        settings = shared.read_settings(a.settings)
+        made = draw_frames(a.capture.parent, *records, a.camera, a.frames, a.background, settings, a.device, a.output)
+        print(f"{len(made)} pictures: {a.output}")
         return
     from neuspring.cli import pictures
 

@@ -29,8 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words = importlib.import_module("neuspring.cli.draw").words(words)
     for name in THREADS:
         os.environ.setdefault(name, _threads(words))
-    parsed = _parser(words[0] if words else "").parse_args(words)
     try:
+        if words and words[0] in STAGES:
+            STAGES[words[0]](**STAGES[words[0]].parse(words[1:]))
+            return 0
+        parsed = _parser(words[0] if words else "").parse_args(words)
         return parsed.command(parsed) or 0
     except (InputError, NumericalFailure) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
@@ -56,7 +59,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="neuspring", description="Spring-mass twins of deformable objects from RGBD video.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(required=True, metavar="command")
-    about = {stage: declaration.about for stage, declaration in STAGES.items()} | {tool: text for tool, (_, text) in TOOLS.items()}
+    about = {stage: declared.about for stage, declared in STAGES.items()} | {tool: text for tool, (_, text) in TOOLS.items()}
     for command, text in about.items():
         own = commands.add_parser(command, help=text, description=text)
         if command == name:
@@ -68,8 +71,5 @@ def _parser(name: str) -> argparse.ArgumentParser:
 
 def _functions(command: str) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int | None]]:
     """What adds a command's options, and what runs it."""
-    if command in STAGES:
-        module = importlib.import_module(f"neuspring.stages.{command}")
-        return module.options, module.command
     module, name = importlib.import_module(TOOLS[command][0]), command.replace("-", "_")
     return getattr(module, f"{name}_options"), getattr(module, name)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuspring.cli import options as shared
 from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
@@ -26,7 +27,6 @@ from neuspring.report.paper.film import write_film
 from neuspring.report.paper.look import broad_side, seen_from
 from neuspring.report.paper.scene import Scene, Take, shown_points
 from neuspring.report.paper.strip import caption, strip_figure
-from neuspring.stages import options as shared
 
 ELEVATION = 25.0
 """Degrees above the horizon of a view that is not asked for."""

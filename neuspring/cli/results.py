@@ -6,10 +6,10 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from neuspring.cli import options as shared
 from neuspring.cli.tracking import add_results
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.stages import options as shared
 
 
 def tables_options(parser: ArgumentParser) -> None:
@@ -35,7 +35,7 @@ def tables(a: Namespace) -> None:
     from neuspring.report.tables.ratios import Judging
     from neuspring.scores.runs import collect, collect_transfers, read_scores
 
-    aims = tuple(parse(Aim, row, "--aims") for row in shared.json_rows("--aims", a.aims))
+    aims = tuple(parse(Aim, row, "--aims") for row in shared.json_value("--aims", a.aims, list))
     judging = Judging(objects=a.objects, aims=aims)
     if a.scores:
         scores = read_scores(a.scores)
@@ -64,7 +64,7 @@ def perception_table(a: Namespace) -> None:
     """`neuspring perception-table`."""
     from neuspring.report.tables import perception
 
-    scenarios = [(name, str(category)) for name, category in shared.json_mapping("--scenarios", a.scenarios).items()]
+    scenarios = [(name, str(category)) for name, category in shared.json_value("--scenarios", a.scenarios).items()]
     print(perception.write(perception.collect(a.results, scenarios), a.output.parent))
 
 
@@ -170,7 +170,7 @@ def _add_left_out(parser: ArgumentParser) -> None:
 
 def _read_left_out(text: str) -> dict[str, tuple[str, ...]]:
     """Method -> scenarios to which it does not apply, from JSON text. Raises InputError."""
-    values = shared.json_mapping("--left-out", text)
+    values = shared.json_value("--left-out", text)
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in values.values()):
         raise InputError("--left-out", "must map methods to lists of scenarios", text)
     return {method: tuple(names) for method, names in values.items() if isinstance(names, list)}

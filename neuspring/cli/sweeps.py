@@ -6,8 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuspring.cli import options as shared
 from neuspring.core.errors import InputError
-from neuspring.stages import options as shared
 
 if TYPE_CHECKING:
     from neuspring.config import Config

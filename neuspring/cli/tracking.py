@@ -8,9 +8,9 @@ import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from neuspring.cli import options as shared
 from neuspring.core.files import write_text
 from neuspring.core.provenance import commit_named
-from neuspring.stages import options as shared
 
 
 def track_init_options(parser: ArgumentParser) -> None:

@@ -88,6 +88,8 @@ class StageRecord:
         if role not in self.files:
             raise InputError(record_path, f"this record must name a {role}", sorted(self.files))
         name, digest = self.files[role]
+        if Path(name).name != name:
+            raise InputError(record_path, "files must lie beside their record", name, "Do not use this folder.")
         path = Path(record_path).parent / name
         if not path.is_file():
             raise InputError(path, f"named by {record_path}", "no such file", f"Delete {record_path} and run again.")
@@ -96,6 +98,27 @@ class StageRecord:
                 path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and run again."
             )
         return path
+
+
+@dataclass(frozen=True)
+class Before:
+    """An earlier stage, by its record."""
+
+    path: Path
+    record: StageRecord
+
+    @classmethod
+    def load(cls, path: Path) -> Before:
+        """Raises InputError for a record that is missing or damaged."""
+        return cls(Path(path), StageRecord.load(path))
+
+    def has(self, role: str) -> bool:
+        """Whether the stage wrote such a file."""
+        return role in self.record.files
+
+    def file(self, role: str) -> Path:
+        """The file of a role. Raises InputError if it is missing or has changed since."""
+        return self.record.file(role, self.path)
 
 
 def read_json(path: Path, version: int) -> dict[str, Any]:
@@ -122,7 +145,8 @@ class Recorder:
         self, stage: str, output: Path, *, inputs: Mapping[str, Path] | None = None, settings: Any = None, device: str = "cpu"
     ) -> None:
         self.stage, self.output = stage, output
-        self.inputs = {role: _digest_input(path) for role, path in (inputs or {}).items()}
+        self.input_paths = dict(inputs or {})
+        self.inputs = {role: _digest_input(path) for role, path in self.input_paths.items()}
         self.settings: dict[str, Any] = dict(settings or {})
         self.device = device
         self._started, self._start = now(), time.perf_counter()

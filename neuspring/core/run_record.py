@@ -23,8 +23,6 @@ from neuspring.core.records import RECORD_FORMAT, canonical, read_json
 RUN_RECORD = "run.json"
 CONTENT = ("scenario", "method", "variant", "seed", "status", "reason", "notes", "settings", "data_digest")
 """Fields that the key of a run is made of, beside the digests of its results."""
-RESULT_ROLES = ("twin", "model", "trajectory", "centers")
-"""Roles of a stage's files that are results; its other files say how it got there."""
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
 
 

@@ -21,7 +21,8 @@ from neuspring import config
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.core.run_record import RESULT_ROLES, RUN_RECORD, RunRecord, key_of
+from neuspring.core.run_folder import RESULTS
+from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
 from neuspring.report.tables.cells import accounted, cells, counted, of_study
 from neuspring.report.tables.study import Made
 from neuspring.scores import paper
@@ -236,7 +237,7 @@ def check_files(path: Path, record: RunRecord, observations: Path) -> tuple[int,
                 stage.file(role, place)
             except InputError as error:
                 problems.append(str(error))
-    digests = {name: stage.files[role][1] for name, stage in stages.items() for role in RESULT_ROLES if role in stage.files}
+    digests = {name: stage.files[role][1] for name, stage in stages.items() for role in RESULTS if role in stage.files}
     scores = path.parent / (record.scores_file or "")
     digests["scores"] = digest_file(scores) if scores.is_file() else ""
     if key_of(record.content, digests) != record.run_key:

@@ -2,119 +2,77 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
-import torch
-import trimesh
-from scipy.spatial import cKDTree
 
-from neuspring import config
 from neuspring.config import Config
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
-from neuspring.core.device import resolve_device
-from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.files import write_table
-from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.errors import InputError
+from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
-from neuspring.perception.lift import clean_masks, lifting_cameras
-from neuspring.perception.results import LiftedTracks, Masks, ShapePrior, masks_of_cameras
-from neuspring.report.figures import images as figures
-from neuspring.scores.images import psnr
-from neuspring.splats.draw import COVERED, orbit_view, picture, view_of
-from neuspring.splats.losses import HAND_MARGIN, REFERENCE_WIDTH, Shot
-from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterize import choose_backend
-from neuspring.splats.train import NEAREST, first_splats, train
-from neuspring.stages import options as shared
-from neuspring.stages.lengths import require_length
+from neuspring.stages.stage import Written, paths, require_length, stage
+
+if TYPE_CHECKING:
+    from neuspring.config.images import Images
+    from neuspring.perception.results import Masks, ShapePrior
+    from neuspring.splats.losses import Shot
 
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring appearance`."""
-    shared.add_capture(parser)
-    shared.add_masks(parser)
-    shared.add_record(parser, "lifted", "lifted.json, where perception made the observations", required=False)
-    shared.add_observations(parser, required=False, help="observations.npz, of processed data")
-    shared.add_settings(parser)
-    shared.add_seed(parser)
-    shared.add_device(parser)
-    shared.add_output(parser)
-
-
-def command(a: Namespace) -> None:
-    """`neuspring appearance`."""
-    run(
-        a.capture.parent,
-        a.masks,
-        shared.read_settings(a.settings),
-        a.seed,
-        a.device,
-        a.output,
-        lifted_record=a.lifted,
-        observations_path=a.observations,
-    )
-
-
-def run(
-    folder: Path,
-    masks_records: Sequence[Path],
+@stage(
+    output="{scenario}/{looks}/{seed}/appearance.json",
+    reads=lambda settings, given: (
+        *("images.backend", "images.appearance", "images.released_quirks.corner_pixels"),
+        # Perception has not lifted the masks of processed data.
+        *(() if given.get("lifted") else ("perception.lift",)),
+    ),
+    gpu="always",
+    memory_mb=8000,
+    minutes=240,
+)
+def appearance(
+    capture: Capture,
+    masks: Sequence[Before],
     settings: Config,
-    seed: int,
-    device: str,
-    output: Path,
-    *,
-    lifted_record: Path | None = None,
-    observations_path: Path | None = None,
-) -> None:
-    """Write splats.ply, history.parquet, appearance.png and the record `output`. A failure to train is recorded.
+    run: Recorder,
+    lifted: Before | None = None,
+    observations: Observations | None = None,
+    seed: int = 0,
+    device: str = "auto",
+) -> Written:
+    """Frame 0 of a capture -> splats: splats.ply, history.parquet, appearance.png.
 
-    The first splats lie on the points that perception lifted and its shape prior (`lifted_record`), or, of processed data, on the
-    lifted masks and the surface points of `observations_path`.
+    The first splats lie on the points that perception lifted and its shape prior (`lifted`), or, of processed data, on the lifted
+    masks and the surface points of `observations`.
     """
-    device, images = resolve_device(device), settings.images
-    inputs = {"capture": folder / CAPTURE, **{f"masks{index}": path for index, path in enumerate(masks_records)}}
-    inputs |= {"lift": lifted_record} if lifted_record else {}
-    inputs |= {"observations": observations_path} if observations_path else {}
-    record = Recorder(
-        "appearance",
-        output,
-        inputs=inputs,
-        settings={
-            "backend": images.backend,
-            "appearance": config.plain(images.appearance),
-            "corner_pixels": images.released_quirks.corner_pixels,
-            "seed": seed,
-        }
-        | ({} if lifted_record else {"lift": config.plain(settings.perception.lift)}),
-        device=device,
-    )
-    capture = Capture.load(folder)
-    masks = masks_of_cameras(capture, masks_records)
+    import pandas as pd
+
+    from neuspring.core.files import write_table
+    from neuspring.perception.results import masks_of_cameras
+    from neuspring.report.figures import images as figures
+    from neuspring.splats.draw import orbit_view, picture
+    from neuspring.splats.model import Gaussians
+    from neuspring.splats.rasterize import choose_backend
+    from neuspring.splats.train import first_splats, train
+
+    images = settings.images
+    masks_of = masks_of_cameras(capture, paths(masks))
     backend = choose_backend(images.backend, device)
-    depths = {} if capture.has_depth or lifted_record is None else _guessed_depth(capture, lifted_record)
-    shots = _shots(capture, masks, images, device, depths)
+    depths = {} if capture.has_depth or lifted is None else _guessed_depth(capture, lifted)
+    shots = _shots(capture, masks_of, images, device, depths)
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
-    surface = _surface(capture, masks, settings, seed, width, lifted_record, observations_path)
+    surface = _surface(capture, masks_of, settings, seed, width, lifted, observations)
     _require_outside(capture, np.concatenate([surface.cloud, surface.prior]))
     start = images.appearance.start
-    try:
-        points, colors = surface.first(start)
-        trained = train(first_splats(points, colors, images.appearance, width), shots, images.appearance, seed, backend)
-    except NumericalFailure as failure:
-        record.save(failure=str(failure))
-        return
-    files = record.beside(splats="splats.ply", history="history.parquet", picture="appearance.png")
+    points, colors = surface.first(start)
+    trained = train(first_splats(points, colors, images.appearance, width), shots, images.appearance, seed, backend)
+    files = run.beside(splats="splats.ply", history="history.parquet", picture="appearance.png")
     trained.splats.save(files["splats"])
     write_table(pd.DataFrame(trained.history).melt("step", var_name="metric", value_name="value"), files["history"])
     gaussians = Gaussians.of(trained.splats, device)
@@ -137,12 +95,14 @@ def run(
     unseen = "a part that is unknown without a shape prior" if surface.hidden is None else f"{surface.hidden:.0%} of the surface"
     hands = ", ".join(f"camera {name} {share:.0%}" for name, share in behind.items())
     print(f"{facts['splats']} splats; frame 0 hides {unseen}; of the picture behind hands: {hands}", flush=True)
-    record.save(files, facts)
+    return Written(files=files, facts=facts)
 
 
-def _guessed_depth(capture: Capture, lifted_record: Path) -> dict[str, np.ndarray]:
+def _guessed_depth(capture: Capture, before: Before) -> dict[str, np.ndarray]:
     """Depth of frame 0 [H, W], m, of a camera without depth: where perception put what each pixel shows."""
-    lifted = LiftedTracks.load(StageRecord.load(lifted_record).file("lifted", lifted_record))
+    from neuspring.perception.results import LiftedTracks
+
+    lifted = LiftedTracks.load(before.file("lifted"))
     depths = {}
     for name, camera in capture.cameras.items():
         pixels, distance = camera.project(lifted.cloud.astype(float))
@@ -160,6 +120,9 @@ def _shots(
 
     `depths` are guesses for cameras without depth.
     """
+    from neuspring.splats.draw import view_of
+    from neuspring.splats.losses import HAND_MARGIN, REFERENCE_WIDTH, Shot
+
     shots = []
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
@@ -203,6 +166,8 @@ class _Surface:
     @property
     def has_prior(self) -> bool:
         """Whether there are points enough of a prior for splats to begin with."""
+        from neuspring.splats.train import NEAREST
+
         return len(self.prior) > NEAREST
 
     @property
@@ -215,6 +180,8 @@ class _Surface:
     @cached_property
     def _to_cloud(self) -> tuple[np.ndarray, np.ndarray]:
         """Distance, m, and index of the nearest seen point of each point of the prior [Q]."""
+        from scipy.spatial import cKDTree
+
         distance, nearest = cKDTree(self.cloud).query(self.prior)
         return distance, nearest
 
@@ -225,20 +192,20 @@ def _surface(
     settings: Config,
     seed: int,
     width: float,
-    lifted_record: Path | None,
-    observations_path: Path | None,
+    before: Before | None,
+    observations: Observations | None,
 ) -> _Surface:
     """From perception's record, or from masks and processed observations; `width`, m, is a pixel's at the object."""
-    if lifted_record is not None:
-        record = StageRecord.load(lifted_record)
-        lifted = LiftedTracks.load(record.file("lifted", lifted_record))
-        prior = ShapePrior.load(record.file("shape", lifted_record))
+    from neuspring.perception.lift import clean_masks, lifting_cameras
+    from neuspring.perception.results import LiftedTracks, ShapePrior
+
+    if before is not None:
+        lifted, prior = LiftedTracks.load(before.file("lifted")), ShapePrior.load(before.file("shape"))
         apart = max(settings.images.appearance.spacing, 1.0) * width
         return _Surface(lifted.cloud, lifted.cloud_colors, _surface_points(prior, apart, seed), NEAR_SEEN * width, True)
-    if observations_path is None:
+    if observations is None:
         raise InputError("--lifted, --observations", "one of the two is required", "neither")
-    observations = Observations.load(observations_path)
-    require_length(capture, observations.scenario.frame_count, observations_path)
+    require_length(capture, observations)
     chosen = settings.perception.lift
     _, cloud, colors = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
     if not len(cloud):
@@ -251,6 +218,8 @@ def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
     """Random points [Q, 3] on the prior's surface, one per square of side `apart`, m."""
     if not len(prior.faces):
         return np.zeros((0, 3))
+    import trimesh
+
     mesh = trimesh.Trimesh(prior.vertices, prior.faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, max(int(mesh.area / apart**2), 1), seed=seed)
     return np.asarray(points)
@@ -258,12 +227,18 @@ def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
 
 def _behind_hands(shot: Shot, drawn: np.ndarray) -> float:
     """Part of the splats' picture that hands cover."""
+    from neuspring.splats.draw import COVERED
+
     cover = drawn[..., 3] >= COVERED
     return float((cover & (shot.known.cpu().numpy() == 0)).sum() / max(cover.sum(), 1))
 
 
 def _quality(shot: Shot, drawn: np.ndarray) -> float:
     """PSNR of a training view, dB."""
+    import torch
+
+    from neuspring.scores.images import psnr
+
     splats = torch.tensor(drawn[..., :3].astype(np.float32) / 255) * shot.known.cpu()[..., None]
     return float(psnr(splats.permute(2, 0, 1), shot.color.cpu().permute(2, 0, 1)))
 

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
-from neuspring.data.sources import write_capture
-from neuspring.stages import options as shared
+from neuspring.data.sources import SOURCES, write_capture
+from neuspring.stages.stage import stage
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring capture`."""
-    shared.add_scenario(parser)
-    shared.add_settings(parser)
-    shared.add_output(parser, "capture.json to write")
-
-
-def command(a: Namespace) -> None:
-    """`neuspring capture`."""
-    settings = shared.read_settings(a.settings)
-    run(shared.read_row(a, settings), settings, a.output)
-
-
-def run(row: ScenarioRow, settings: Config, output: Path) -> None:
-    """Write the capture whose capture.json is `output`.
+@stage(
+    output="{scenario}/capture/capture.json",
+    reads=lambda settings, given: SOURCES[given["row"].source].reads,
+    code=lambda settings, given: (SOURCES[given["row"].source].importer,),
+    minutes=120,
+)
+def capture(row: ScenarioRow, settings: Config, output: Path) -> None:
+    """Synthetic scene or PhysTwin's raw layout -> capture folder, whose capture.json is `output`.
 
     The truth of a synthetic scene lies beside the folder and is never read by a method.
     """

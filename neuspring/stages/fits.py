@@ -7,22 +7,22 @@ would leave alone, and `fit` then continues from there: to its end, if nothing w
 from __future__ import annotations
 
 import json
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring import config
 from neuspring.config import Kind
-from neuspring.core.device import resolve_device
-from neuspring.core.errors import InputError
+from neuspring.core.artifacts import Observations
 from neuspring.core.records import Recorder, StageRecord
-from neuspring.physics.lanes import WIDTHS
 from neuspring.stages import fit as alone
-from neuspring.stages import options as shared
-from neuspring.twin.company import Seat, together
-from neuspring.twin.fit import FitResult, fit
+from neuspring.stages.search import launch_size
+from neuspring.stages.stage import Job, Written, json_value, read_settings, stage
+
+if TYPE_CHECKING:
+    from neuspring.twin.company import Seat
+    from neuspring.twin.fit import FitProblem, FitResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,97 +37,88 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Member:
+class FitJob:
     """A fit that is still to be done."""
 
     output: str
-    ready: alone.Prepared
+    problem: FitProblem
+    checkpoint: Path
+    key: str
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring fits`."""
-    shared.add_observations(parser)
-    about = (
-        'JSON list of rows: [{"kind": springs or field, "settings": as of `fit`, "fits": {fit.json: search.json, ...}}, ...];'
-        ' "oracle": true fits all frames'
-    )
-    parser.add_argument("--rows", required=True, help=about)
-    shared.add_device(parser)
-    shared.add_twins_per_launch(parser)
-    shared.add_output(parser)
+@stage(
+    output="{scenario}/fits.json",
+    reads=(),
+    gpu="always",
+    memory_mb=16000,
+    minutes=960,
+)
+def fits(
+    observations: Observations,
+    rows: Annotated[str, 'JSON list [{"kind": ..., "settings": as of `fit`, "oracle": ..., "fits": {fit.json: search.json}}, ...]'],
+    run: Recorder,
+    device: str = "auto",
+    twins_per_launch: int | Literal["auto"] = "auto",
+) -> Written:
+    """Coarse twins of a scenario -> checkpoints of their fits, several in one launch.
 
-
-def command(a: Namespace) -> None:
-    """`neuspring fits`."""
-    run(a.observations, read_rows(a.rows), a.device, a.output, shared.read_twins_per_launch(a))
-
-
-def read_rows(text: str) -> list[Row]:
-    """Raises InputError for anything but a list of rows."""
-    try:
-        values = json.loads(text)
-    except ValueError as error:
-        raise InputError("--rows", "must be JSON", str(error)) from error
-    if not isinstance(values, list):
-        raise InputError("--rows", "must be a list of rows", type(values).__name__)
-    return [config.parse(Row, value, f"--rows, entry {place}") for place, value in enumerate(values)]
-
-
-def run(observations_path: Path, rows: list[Row], device: str, output: Path, most: int = 0) -> None:
-    """Write a checkpoint beside the record of each fit, and the record `output`.
-
-    At most `most` fits share launches (0: as many as pay). Fits whose record is there already, from the same inputs and settings,
-    are left alone, and so are those whose search failed. An error in one fit holds nobody up: it is named here, and its own `fit`
-    meets it again.
+    At most `twins_per_launch` fits share launches (auto: as many as pay). Fits whose record is there already, from the same inputs
+    and settings, are left alone, and so are those whose search failed. An error in one fit holds nobody up: it is named here, and
+    its own `fit` meets it again.
     """
-    device = resolve_device(device)
-    record = Recorder("fits", output, inputs={"observations": observations_path}, device=device)
-    members = [member for row in rows for member in _members(observations_path, row, device)]
-    facts: dict[str, Any] = {"fits": sum(len(row.fits) for row in rows), "errors": {}, "spring_updates": 0}
-    groups = companies(members, most or (WIDTHS[-1] if device == "cpu" else len(members)))
-    facts["companies"] = [[member.output for member in group] for group in groups]
-    for group in groups:
-        results = together([member.ready.problem.twin for member in group], device, [_work(member.ready) for member in group])
-        for member, result in zip(group, results, strict=True):
+    from neuspring.physics.lanes import WIDTHS
+    from neuspring.twin.company import together
+    from neuspring.twin.fit import FitResult
+
+    asked = [config.parse(Row, row, f"--rows, entry {place}") for place, row in enumerate(json_value("--rows", rows, list))]
+    jobs = [job for row in asked for job in _jobs(run.input_paths["observations"], row, device)]
+    facts: dict[str, Any] = {"fits": sum(len(row.fits) for row in asked), "errors": {}, "spring_updates": 0}
+    batches = batched(jobs, launch_size(twins_per_launch) or (WIDTHS[-1] if device == "cpu" else len(jobs)))
+    facts["batches"] = [[job.output for job in batch] for batch in batches]
+    for batch in batches:
+        results = together([job.problem.twin for job in batch], device, [_work(job) for job in batch])
+        for job, result in zip(batch, results, strict=True):
             if isinstance(result, FitResult):
-                counts, frames = result.twin.counts, member.ready.problem.frame_end - 1
+                counts, frames = result.twin.counts, job.problem.frame_end - 1
                 facts["spring_updates"] += result.epochs_together * frames * counts["springs"] * counts["substeps"]
             else:
-                facts["errors"][member.output] = f"{type(result).__name__}: {result}"
-                print(f"{member.output}: {facts['errors'][member.output]}; its own job goes on from its last checkpoint")
-    record.save(facts=facts)
+                facts["errors"][job.output] = f"{type(result).__name__}: {result}"
+                print(f"{job.output}: {facts['errors'][job.output]}; its own job goes on from its last checkpoint")
+    return Written(facts=facts)
 
 
-def _members(observations_path: Path, row: Row, device: str) -> Iterator[Member]:
-    settings = shared.read_settings(row.settings)
+def _jobs(observations: Path, row: Row, device: str) -> Iterator[FitJob]:
+    given = {"settings": read_settings(row.settings), "kind": row.kind, "oracle": row.oracle, "device": device}
     for output, search in row.fits.items():
-        own = alone.recorder(observations_path, Path(search), settings, row.kind, device, Path(output), oracle=row.oracle)
-        if StageRecord.load(Path(search)).status != "failed" and not _is_done(own):
-            yield Member(output, alone.prepared(own, observations_path, Path(search), settings))
+        job = alone.fit.job(output=Path(output), observations=observations, search=Path(search), **given)
+        if not (job.failed or _is_done(job)):
+            yield FitJob(output, *alone.prepared(**job.arguments))
 
 
-def companies(members: Sequence[Member], most: int) -> list[list[Member]]:
+def batched(jobs: Sequence[FitJob], most: int) -> list[list[FitJob]]:
     """Which fits share launches, at most so many: those of equal horizon and as many frames, which are in step. One alone
     shares with nobody."""
-    in_step: dict[tuple[int, int], list[Member]] = {}
-    for member in members:
-        problem = member.ready.problem
-        in_step.setdefault((problem.fit.horizon, problem.frame_end), []).append(member)
-    groups = [alike[first : first + most] for alike in in_step.values() for first in range(0, len(alike), most)]
-    return [group for group in groups if len(group) > 1]
+    in_step: dict[tuple[int, int], list[FitJob]] = {}
+    for job in jobs:
+        in_step.setdefault((job.problem.fit.horizon, job.problem.frame_end), []).append(job)
+    batches = [alike[first : first + most] for alike in in_step.values() for first in range(0, len(alike), most)]
+    return [batch for batch in batches if len(batch) > 1]
 
 
-def _work(ready: alone.Prepared) -> Callable[[Seat], FitResult]:
+def _work(job: FitJob) -> Callable[[Seat], FitResult]:
+    from neuspring.twin.fit import fit
+
     def work(seat: Seat) -> FitResult:
-        ready.partial.parent.mkdir(parents=True, exist_ok=True)
-        return fit(ready.problem, partial=ready.partial, key=ready.key, seat=seat)
+        job.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        return fit(job.problem, partial=job.checkpoint, key=job.key, seat=seat)
 
     return work
 
 
-def _is_done(own: Recorder) -> bool:
+def _is_done(job: Job) -> bool:
     """Whether the fit's record is there, made of the same inputs and settings."""
-    if not own.output.is_file():
+    own = job.record
+    if own is None or not own.output.is_file():
         return False
     record = StageRecord.load(own.output)
     return (record.inputs, record.settings) == (own.inputs, json.loads(json.dumps(own.settings)))

@@ -2,60 +2,48 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.core.findings import refuse_errors, told
-from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.records import Before, Recorder
+from neuspring.data.capture import Capture
 from neuspring.data.sources import SOURCES, read_observations
-from neuspring.stages import options as shared
+from neuspring.stages.stage import stage
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring observe`."""
-    shared.add_scenario(parser)
-    shared.add_capture(parser, required=False, help="capture.json of raw video")
-    shared.add_record(parser, "lifted", "lifted.json of raw video", required=False)
-    shared.add_settings(parser)
-    shared.add_output(parser)
+@stage(
+    output="{scenario}/observations.npz",
+    reads=lambda settings, given: (
+        ("perception.sample", "perception.seed") if SOURCES[given["row"].source].films else SOURCES[given["row"].source].reads
+    ),
+    code=lambda settings, given: () if SOURCES[given["row"].source].films else (SOURCES[given["row"].source].module,),
+)
+def observe(row: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None) -> None:
+    """Capture, or processed data -> observations.npz; of a toy scene also truth.npz beside it, which no method reads.
 
-
-def command(a: Namespace) -> None:
-    """`neuspring observe`."""
-    settings = shared.read_settings(a.settings)
-    run(shared.read_row(a, settings), settings, a.output, a.capture and a.capture.parent, a.lifted)
-
-
-def run(row: ScenarioRow, settings: Config, output: Path, capture: Path | None = None, lifted_record: Path | None = None) -> None:
-    """Write observations.npz; of a toy scene also truth.npz beside it, which no method reads.
-
-    Raw video has been perceived before: `capture` is its folder, `lifted_record` its lifted.json. Then a record with what was
-    noticed lies beside the observations. Raises InputError for observations that no method can work with.
+    Raw video has been perceived before: `capture` and `lifted` are what came of it. Then a record with what was noticed lies beside
+    the observations. Raises InputError for observations that no method can work with.
     """
     if not SOURCES[row.source].films:
         read_observations(row, settings, output).save(output)
         return
-    if capture is None or lifted_record is None:
+    if capture is None or lifted is None:
         rule = f"scenarios of source {row.source} need --capture and --lifted"
         raise InputError(f"scenario {row.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
-    # Imported here: processed data need nothing of perception, whose code must not start their jobs again.
     from neuspring.core.artifacts import ImageObservations
-    from neuspring.data.capture import Capture
+    from neuspring.core.findings import refuse_errors, told
+    from neuspring.perception.sample import assemble
     from neuspring.perception.findings import look_at_observations
     from neuspring.perception.results import LiftedTracks, ShapePrior
-    from neuspring.perception.sample import assemble
 
-    record = StageRecord.load(lifted_record)
-    lifted = LiftedTracks.load(record.file("lifted", lifted_record))
-    prior = ShapePrior.load(record.file("shape", lifted_record))
-    recorder = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted_record})
-    image = ImageObservations.load(record.file("image", lifted_record)) if "image" in record.files else None
-    observations = assemble(row, Capture.load(capture), lifted, prior, settings.perception, image)
+    record = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted.path})
+    points, prior = LiftedTracks.load(lifted.file("lifted")), ShapePrior.load(lifted.file("shape"))
+    image = ImageObservations.load(lifted.file("image")) if lifted.has("image") else None
+    observations = assemble(row, capture, points, prior, settings.perception, image)
     findings = look_at_observations(observations)
     facts = told(findings)
     # Before the observations are there: what no method can work with starts no search.
     refuse_errors(findings)
     observations.save(output)
-    recorder.save({"observations": output}, {"nodes": len(observations.nodes), **facts})
+    record.save({"observations": output}, {"nodes": len(observations.nodes), **facts})

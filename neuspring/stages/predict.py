@@ -2,73 +2,59 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from neuspring.baselines import BASELINES
 from neuspring.core.artifacts import Observations, SplatCenters
-from neuspring.core.device import resolve_device
-from neuspring.core.errors import InputError
-from neuspring.core.records import Recorder, StageRecord
-from neuspring.scores import metrics
-from neuspring.splats.model import Splats
-from neuspring.stages import options as shared
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.records import Before, Recorder
+from neuspring.stages.stage import MayFail, Written, stage
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring predict`."""
-    shared.add_observations(parser)
-    parser.add_argument("--model", required=True, choices=tuple(BASELINES))
-    shared.add_record(parser, "train", "train.json, of models that are trained", required=False)
-    shared.add_record(parser, "appearance", "appearance.json of the splats that the model moves", required=False)
-    shared.add_device(parser)
-    shared.add_output(parser)
+@stage(
+    output="{scenario}/{method}/{seed}/rollout.json",
+    code=lambda settings, given: BASELINES[given["model"]].modules,
+    gpu="always",
+    minutes=60,
+)
+def predict(
+    observations: Observations,
+    model: str,
+    run: Recorder,
+    train: MayFail | None = None,
+    appearance: Before | None = None,
+    device: str = "auto",
+) -> Written:
+    """Model of a baseline -> trajectory over all frames: trajectory.npz, and centers.npz of models with splats of their own.
 
-
-def command(a: Namespace) -> None:
-    """`neuspring predict`."""
-    run(a.observations, a.model, a.train, a.appearance, a.device, a.output)
-
-
-def run(
-    observations_path: Path, model: str, train_record: Path | None, appearance_record: Path | None, device: str, output: Path
-) -> None:
-    """Write trajectory.npz, centers.npz (of models with splats of their own) and the record `output`.
-
-    A model whose training failed is rolled out too, and the run remains a failure. Raises InputError if the record of a training
-    is missing.
+    A model whose training failed is rolled out too, and the run remains a failure. Raises InputError if the record of a training is
+    missing.
     """
-    device = resolve_device(device)
-    records = {"train": train_record, "appearance": appearance_record}
-    paths = {name: path for name, path in records.items() if path}
-    before = {name: StageRecord.load(path) for name, path in paths.items()}
-    record = Recorder(
-        "rollout", output, inputs={"observations": observations_path} | paths, settings={"model": model}, device=device
-    )
-    for name, stage in before.items():
-        # A failed training may have left its last usable model.
-        if stage.status == "failed" and "model" not in stage.files:
-            record.save(failure=f"{name}: {stage.reason}")
-            return
-    if BASELINES[model].trained and train_record is None:
+    from neuspring.splats.model import Splats
+
+    if model not in BASELINES:
+        raise InputError("--model", f"must be one of {', '.join(BASELINES)}", model)
+    if BASELINES[model].trained and train is None:
         raise InputError("--train", f"model {model} is trained first", None, "Name its train.json.")
-    observations = Observations.load(observations_path)
-    learned = before["train"].file("model", train_record) if train_record else None
-    splats = Splats.load(before["appearance"].file("splats", appearance_record)).means if appearance_record else None
-    prediction = BASELINES[model].predict(observations, learned, splats, device)
+    if train and train.record.status == "failed" and not train.has("model"):
+        # A failed training may have left its last usable model.
+        raise NumericalFailure(f"train: {train.record.reason}")
+    splats = Splats.load(appearance.file("splats")).means if appearance else None
+    prediction = BASELINES[model].predict(observations, train.file("model") if train else None, splats, device)
     trajectory = prediction.trajectory
-    files = record.beside(trajectory="trajectory.npz")
+    files = run.beside(trajectory="trajectory.npz")
     trajectory.save(files["trajectory"])
     facts = {"frames": len(trajectory.positions), **prediction.facts}
     if prediction.centers is not None:
-        files |= record.beside(centers="centers.npz")
+        files |= run.beside(centers="centers.npz")
         SplatCenters(positions=prediction.centers).save(files["centers"])
         facts |= _scores_of_centers(prediction.centers, observations)
-    reasons = [f"train: {before['train'].reason}"] if "train" in before and before["train"].reason else []
+    reasons = [f"train: {train.record.reason}"] if train and train.record.reason else []
     reasons += [f"rollout: {trajectory.reason}"] if trajectory.reason else []
-    record.save(files, facts, failure="; ".join(reasons))
+    return Written(files=files, facts=facts, failure="; ".join(reasons))
 
 
 def _scores_of_centers(centers: np.ndarray, observations: Observations) -> dict[str, float]:
@@ -76,6 +62,10 @@ def _scores_of_centers(centers: np.ndarray, observations: Observations) -> dict[
 
     The released evaluation takes the first of them in storage order, which is an arbitrary part.
     """
+    import numpy as np
+
+    from neuspring.scores import metrics
+
     scores = {}
     points, visible = observations.object_points, observations.object_visibility
     for task in metrics.TASKS:

@@ -4,104 +4,82 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import pandas as pd
+from typing import TYPE_CHECKING, Any, Literal
 
 from neuspring import config
 from neuspring.config import Config
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
-from neuspring.core.device import resolve_device
-from neuspring.core.errors import NumericalFailure
-from neuspring.core.files import write_table
-from neuspring.core.records import Recorder, StageRecord
-from neuspring.core.text import Progress
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.perception.results import masks_of_cameras
-from neuspring.report.figures import images as figures
-from neuspring.report.video import Video
-from neuspring.scores.lpips import Lpips
-from neuspring.scores.lpips_weights import configured
-from neuspring.scores.pictures import Scored, picture_scores
-from neuspring.splats.draw import frames_from_centers, orbit_view, prune_by_opacity, skinned_frames
-from neuspring.splats.model import Gaussians, Splats
-from neuspring.stages import options as shared
-from neuspring.stages.lengths import require_length
+from neuspring.stages.stage import MayFail, Written, paths, require_length, stage
+
+if TYPE_CHECKING:
+    from neuspring.config.images import Images
+    from neuspring.splats.model import Gaussians, Splats
 
 VIDEOS = ("video", "turntable")
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring render`."""
-    shared.add_capture(parser)
-    shared.add_masks(parser)
-    shared.add_observations(parser)
-    shared.add_record(parser, "appearance", "appearance.json")
-    shared.add_record(parser, "rollout", "rollout.json")
-    shared.add_settings(parser)
-    shared.add_device(parser)
-    shared.add_output(parser)
-
-
-def command(a: Namespace) -> None:
-    """`neuspring render`."""
-    settings = shared.read_settings(a.settings)
-    run(a.capture.parent, a.masks, a.observations, a.appearance, a.rollout, settings, a.device, a.output)
-
-
-def run(
-    folder: Path,
-    masks_records: Sequence[Path],
-    observations_path: Path,
-    appearance_record: Path,
-    rollout_record: Path,
+@stage(
+    output="{scenario}/{method}/{seed}/render.json",
+    reads=(
+        "images.backend",
+        "images.views",
+        "images.opacity",
+        "images.frozen_skinning",
+        "images.video",
+        "images.lpips",
+        "images.released_quirks",
+    ),
+    gpu="always",
+    memory_mb=8000,
+    minutes=120,
+)
+def render(
+    capture: Capture,
+    masks: Sequence[Before],
+    observations: Observations,
+    appearance: Before,
+    rollout: MayFail,
     settings: Config,
-    device: str,
-    output: Path,
-) -> None:
-    """Write frames.parquet (metrics per frame and camera), images.png, videos, and the record `output`.
+    run: Recorder,
+    device: str = "auto",
+) -> Written:
+    """Splats and trajectory -> pictures, scored and filmed: frames.parquet (metrics per frame and camera), images.png, videos.
 
-    A failure of an earlier stage is passed on. A trajectory that diverged is shown as far as it goes; its last frame is frozen and
-    scored on, for averages over all runs.
+    A trajectory that diverged is shown as far as it goes; its last frame is frozen and scored on, for averages over all runs.
     """
-    device, images = resolve_device(device), settings.images
-    inputs = {"appearance": appearance_record, "rollout": rollout_record}
-    record = Recorder(
-        "render",
-        output,
-        inputs=inputs | {"capture": folder / CAPTURE},
-        settings={name: value for name, value in config.plain(images).items() if name != "appearance"},
-        device=device,
-    )
-    appearance, rollout = StageRecord.load(appearance_record), StageRecord.load(rollout_record)
-    capture, scenario = Capture.load(folder), Observations.load(observations_path).scenario
-    require_length(capture, scenario.frame_count, observations_path)
-    scored = Scored.of(capture, masks_of_cameras(capture, masks_records), images, device)
+    import numpy as np
+    import pandas as pd
+
+    from neuspring.core.files import write_table
+    from neuspring.core.text import Progress
+    from neuspring.perception.results import masks_of_cameras
+    from neuspring.report.figures import images as figures
+    from neuspring.report.video import Video
+    from neuspring.scores.lpips import Lpips
+    from neuspring.scores.lpips_weights import configured
+    from neuspring.scores.pictures import Scored, picture_scores
+    from neuspring.splats.draw import orbit_view
+
+    images, scenario = settings.images, observations.scenario
+    require_length(capture, observations)
+    scored = Scored.of(capture, masks_of_cameras(capture, paths(masks)), images, device)
     weights = configured(images.lpips)
     # Their checksums have just been taken.
     lpips = weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
-    if appearance.status == "failed":
-        record.save(failure=appearance.reason)
-        return
-    trajectory = Trajectory.load(rollout.file("trajectory", rollout_record)) if "trajectory" in rollout.files else None
+    trajectory = Trajectory.load(rollout.file("trajectory")) if rollout.has("trajectory") else None
     if trajectory is None or not len(trajectory.positions):
-        record.save(failure=rollout.reason)
-        return
-    try:
-        splats, frames = posed(appearance_record, rollout_record, trajectory, images, device)
-    except NumericalFailure as failure:
-        record.save(failure=str(failure))
-        return
+        raise NumericalFailure(rollout.record.reason)
+    splats, frames = posed(appearance, rollout, trajectory, images, device)
     predicted = len(trajectory.positions)
     rows: list[dict[str, Any]] = []
     strip, film = figures.Strip(scenario, predicted), figures.Film(scenario)
     first = next(iter(scored.views))
-    files = record.beside(**{role: f"{role}.mp4" for role in (VIDEOS if images.video else ())})
+    files = run.beside(**{role: f"{role}.mp4" for role in (VIDEOS if images.video else ())})
     progress = Progress("render", scenario.frame_count)
     with contextlib.ExitStack() as stack:
         videos = {role: stack.enter_context(Video(path, scenario.frame_rate)) for role, path in files.items()}
@@ -121,7 +99,7 @@ def run(
                 videos["turntable"].add(film.turned(frame, orbit_view(gaussians, scored.views[first], scored.backend, angle)))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
-    files |= record.beside(frames="frames.parquet", strip="images.png")
+    files |= run.beside(frames="frames.parquet", strip="images.png")
     strip.save(files["strip"])
     write_table(table, files["frames"])
     facts = {
@@ -131,26 +109,28 @@ def run(
         "splats": len(splats.means),
         "lpips": lpips if isinstance(lpips, str) else "computed",
         "quirks": sorted(name for name, on in config.plain(images.released_quirks).items() if on),
-        "unseen_surface": appearance.facts["unseen_surface"],
+        "unseen_surface": appearance.record.facts["unseen_surface"],
         # Nothing but black on both sides: such frames have no finite PSNR.
         "empty_frames": int(np.isinf(table.loc[table["frame"] < predicted, "value"]).sum()),
     }
-    record.save(files, facts, failure=rollout.reason)
+    return Written(files=files, facts=facts, failure=rollout.record.reason)
 
 
 def posed(
-    appearance_record: Path, rollout_record: Path, trajectory: Trajectory, images: Images, device: str
+    appearance: Before, rollout: Before, trajectory: Trajectory, images: Images, device: str
 ) -> tuple[Splats, Iterator[Gaussians]]:
     """Splats of frame 0, and in every frame: where the method's own model puts them, else skinned to the trajectory.
 
     Raises NumericalFailure where no splat is opaque enough to be moved.
     """
-    splats = Splats.load(StageRecord.load(appearance_record).file("splats", appearance_record))
-    rollout = StageRecord.load(rollout_record)
-    if "centers" not in rollout.files:
+    from neuspring.splats.draw import frames_from_centers, prune_by_opacity, skinned_frames
+    from neuspring.splats.model import Splats
+
+    splats = Splats.load(appearance.file("splats"))
+    if not rollout.has("centers"):
         splats = prune_by_opacity(splats, images.opacity)
         return splats, skinned_frames(splats, trajectory.positions, images, device)
-    return splats, frames_from_centers(splats, SplatCenters.load(rollout.file("centers", rollout_record)).positions, device)
+    return splats, frames_from_centers(splats, SplatCenters.load(rollout.file("centers")).positions, device)
 
 
 def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:
@@ -161,3 +141,41 @@ def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussian
         yield last
     if last is not None:
         yield from itertools.repeat(last, count)
+
+
+def draw_frames(
+    folder: Path,
+    appearance: Before,
+    rollout: Before,
+    camera: str,
+    frames: Sequence[int] | None,
+    background: Literal["black", "white"],
+    settings: Config,
+    device: str,
+    output: Path,
+) -> list[Path]:
+    """RGBA pictures <frame>.png (five digits) of a prediction, seen by one camera, in the folder `output`; all frames by default.
+
+    Raises InputError for a camera or frame that is not there, and where there is nothing to draw.
+    """
+    from neuspring.core.device import resolve_device
+    from neuspring.splats.draw import BLACK, WHITE, picture, save_picture, view_of
+    from neuspring.splats.rasterize import choose_backend
+
+    device, images, capture = resolve_device(device), settings.images, Capture.load(folder)
+    if camera not in capture.cameras:
+        raise InputError("--camera", f"must be a camera of {folder / CAPTURE}: {', '.join(capture.cameras)}", camera)
+    trajectory = Trajectory.load(rollout.file("trajectory"))
+    count = len(trajectory.positions)
+    wanted = range(count) if frames is None else frames
+    beyond = [frame for frame in wanted if not 0 <= frame < count]
+    if beyond or not count:
+        raise InputError("--frames", f"the trajectory has the frames 0 to {count - 1}", beyond)
+    _, frames_of_splats = posed(appearance, rollout, trajectory, images, device)
+    view, backend = view_of(capture.cameras[camera], images, device), choose_backend(images.backend, device)
+    made = []
+    for frame, gaussians in enumerate(frames_of_splats):
+        if frame in wanted:
+            made.append(output / f"{frame:05d}.png")
+            save_picture(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
+    return made

@@ -4,28 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from neuspring.core import provenance
 from neuspring.core.artifacts import Observations, Trajectory, Twin
-from neuspring.core.files import write_table
 from neuspring.core.records import StageRecord, digest_file, now
-from neuspring.core.run_record import RESULT_ROLES, RunRecord, flat, key_of
-from neuspring.report.figures import run as figures
-from neuspring.scores import metrics
-from neuspring.stages import LEARNING
-from neuspring.stages import options as shared
-from neuspring.twin.hand_paths import with_hands
+from neuspring.core.run_folder import LEARNING, RunFolder
+from neuspring.core.run_record import RunRecord, flat, key_of
+from neuspring.stages.stage import MayFail, stage
 
-STAGES_BEFORE = ("search", "fit", "train", "rollout", "appearance", "render")
+if TYPE_CHECKING:
+    import pandas as pd
+
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
@@ -35,80 +27,40 @@ HELD = 0.05
 """A share of springs at their bound above this, or of texels that moved below it, says that the settings were in training's way."""
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring score`."""
-    shared.add_observations(parser)
-    for stage in STAGES_BEFORE:
-        where = "the scenario has images" if stage in ("appearance", "render") else "the method has that stage"
-        required = stage == "rollout"
-        shared.add_record(parser, stage, f"{stage}.json" + ("" if required else f", if {where}"), required=required)
-    parser.add_argument("--method", required=True)
-    parser.add_argument("--variant", default="{}", help="JSON: the method's switches")
-    shared.add_seed(parser)
-    shared.add_output(parser)
-
-
-def command(a: Namespace) -> None:
-    """`neuspring score`."""
-    records = {name: path for name in STAGES_BEFORE if (path := getattr(a, name))}
-    run(a.observations, records, a.method, shared.json_mapping("--variant", a.variant), a.seed, a.output)
-
-
-@dataclass(frozen=True)
-class Stages:
-    """The stages of a run: name -> path of its record."""
-
-    paths: Mapping[str, Path]
-
-    @cached_property
-    def records(self) -> dict[str, StageRecord]:
-        """Name -> record."""
-        return {name: StageRecord.load(path) for name, path in self.paths.items()}
-
-    def file(self, stage: str, role: str) -> Path | None:
-        """The file that a stage names; None if the run has no such stage or the stage no such file."""
-        record = self.records.get(stage)
-        return record.file(role, self.paths[stage]) if record and role in record.files else None
-
-    @property
-    def twin_file(self) -> Path | None:
-        """The run's twin; None if it has none."""
-        return self.file("fit" if "fit" in self.paths else "search", "twin")
-
-    @property
-    def learning(self) -> list[str]:
-        """The stages that learned the run's model, in order."""
-        return [name for name in LEARNING if name in self.paths]
-
-    @property
-    def maker(self) -> StageRecord:
-        """The stage that made the run's model; of what learns nothing, the rollout."""
-        return self.records[self.learning[-1] if self.learning else "rollout"]
-
-    @property
-    def results(self) -> dict[str, str]:
-        """Stage -> digest of its result."""
-        return {
-            name: record.files[role][1] for name, record in self.records.items() for role in RESULT_ROLES if role in record.files
-        }
-
-
-def run(
-    observations_path: Path, records: Mapping[str, Path], method: str, variant: Mapping[str, Any], seed: int, output: Path
+@stage(output="{scenario}/{method}/{seed}/run.json")
+def score(
+    observations: Observations,
+    rollout: MayFail,
+    method: str,
+    output: Path,
+    search: MayFail | None = None,
+    fit: MayFail | None = None,
+    train: MayFail | None = None,
+    appearance: MayFail | None = None,
+    render: MayFail | None = None,
+    variant: dict[str, Any] | None = None,
+    seed: int = 0,
 ) -> None:
-    """Write scores.parquet, plots, and `output`, the record of the whole run, which MLflow indexes.
+    """Trajectory -> scores, plots and run.json, the record of the whole run, which MLflow indexes.
 
-    `records` maps the method's stages to their records: search and fit, or train, if any; rollout; of scenarios with images,
-    appearance and render. A run that failed also gets held.parquet: its scores with the last frame frozen that it reached.
+    The records are those of the method's stages: search and fit, or train, if any; rollout; of scenarios with images, appearance
+    and render. `variant` are the method's switches. A run that failed also gets held.parquet: its scores with the last frame frozen
+    that it reached.
     """
+    import pandas as pd
+
+    from neuspring.core.files import write_table
+    from neuspring.scores import metrics
+    from neuspring.twin.hand_paths import with_hands
+
     began, folder = time.perf_counter(), output.parent
-    stages = Stages(records)
-    rollout = stages.records["rollout"]
-    observations = Observations.load(observations_path)
-    if stages.twin_file:
-        observations = with_hands(observations, Twin.load(stages.twin_file))
-    trajectory_file, frames_file = stages.file("rollout", "trajectory"), stages.file("render", "frames")
-    trajectory = Trajectory.load(trajectory_file) if trajectory_file else None
+    given = {"search": search, "fit": fit, "train": train, "rollout": rollout, "appearance": appearance, "render": render}
+    stages = RunFolder(folder, {name: before for name, before in given.items() if before})
+    paths = {name: before.path for name, before in stages.stages.items()}
+    if stages.twin:
+        observations = with_hands(observations, stages.twin)
+    frames_file = stages.file("render", "frames")
+    trajectory = stages.trajectory
     pictures = pd.read_parquet(frames_file) if frames_file else None
     scores = pd.DataFrame(columns=list(metrics.COLUMNS))
     if trajectory is not None:
@@ -116,21 +68,23 @@ def run(
         if pictures is not None:
             scores = _with_pictures(scores, pictures, len(trajectory.positions), observations, method, seed)
     write_table(scores, folder / "scores.parquet")
-    frozen_file = _write_frozen(trajectory, pictures, observations, method, seed, folder) if rollout.status == "failed" else None
-    histories = {name: path.parent / "history.parquet" for name, path in records.items() if _learned_steps(stages, name)}
-    artifacts = {"records": list(records.values())} | _artifacts(
+    frozen_file = (
+        _write_frozen(trajectory, pictures, observations, method, seed, folder) if rollout.record.status == "failed" else None
+    )
+    histories = {name: path.parent / "history.parquet" for name, path in paths.items() if _learned_steps(stages, name)}
+    artifacts = {"records": list(paths.values())} | _artifacts(
         stages, observations, trajectory, pictures, histories, method, folder
     )
     content: dict[str, Any] = {
         "scenario": observations.scenario.name,
         "method": method,
-        "variant": flat(variant),
+        "variant": flat(variant or {}),
         "seed": seed,
-        "status": rollout.status,
-        "reason": rollout.reason,
+        "status": rollout.record.status,
+        "reason": rollout.record.reason,
         "notes": _notes(stages.records),
         "settings": {name: record.settings for name, record in stages.records.items()},
-        "data_digest": digest_file(observations_path),
+        "data_digest": rollout.record.inputs["observations"],
     }
     seconds = {name: record.seconds for name, record in stages.records.items()} | {"score": round(time.perf_counter() - began, 3)}
     RunRecord(
@@ -146,24 +100,24 @@ def run(
         device=stages.maker.device,
         started=min(record.started for record in stages.records.values()),
         ended=now(),
-        params=_parameters(stages.records, variant),
+        params=_parameters(stages.records, variant or {}),
         timings=seconds,
         peak_memory_mb={name: record.peak_memory_mb for name, record in stages.records.items()},
-        machine=rollout.machine,
+        machine=rollout.record.machine,
         versions=stages.maker.versions,
         scores_file="scores.parquet",
         held_file=frozen_file,
         histories={name: _relative(path, folder) for name, path in histories.items()},
-        artifacts={name: [_relative(path, folder) for path in paths] for name, paths in artifacts.items()},
+        artifacts={name: [_relative(path, folder) for path in files] for name, files in artifacts.items()},
     ).save(output)
 
 
-def _learned_steps(stages: Stages, name: str) -> bool:
+def _learned_steps(stages: RunFolder, name: str) -> bool:
     return name in LEARNING and "history" in stages.records[name].files
 
 
 def _artifacts(
-    stages: Stages,
+    stages: RunFolder,
     observations: Observations,
     trajectory: Trajectory | None,
     pictures: pd.DataFrame | None,
@@ -172,18 +126,23 @@ def _artifacts(
     folder: Path,
 ) -> dict[str, list[Path]]:
     """Kind -> files to look at or to load: the twin, plots that are drawn now, pictures of earlier stages."""
+    import numpy as np
+    import pandas as pd
+
+    from neuspring.report.figures import run
+
     artifacts: dict[str, list[Path]] = {}
     twin_file = stages.twin_file
     searched_file = stages.file("search", "twin")
     if twin_file:
         artifacts["twin"] = [twin_file]
-    artifacts["plots"] = figures.run_figures(
+    artifacts["plots"] = run.run_figures(
         observations,
         trajectory,
         {name: pd.read_parquet(path) for name, path in histories.items()},
         method,
         folder / "plots",
-        twin=Twin.load(twin_file) if twin_file else None,
+        twin=stages.twin,
         # The search gives every spring the same stiffness.
         searched=float(np.median(Twin.load(searched_file).material.stiffness)) if searched_file else None,
     )
@@ -191,7 +150,7 @@ def _artifacts(
         named = [stages.file("appearance", "picture"), *(stages.file("render", role) for role in PICTURE_ROLES)]
         artifacts["images"] = [path for path in named if path]
         shown = pictures[pictures["frame"] < len(trajectory.positions)] if trajectory is not None else pictures
-        artifacts["plots"].append(figures.image_scores_figure(shown, observations.scenario, method, folder / "plots"))
+        artifacts["plots"].append(run.image_scores_figure(shown, observations.scenario, method, folder / "plots"))
     return artifacts
 
 
@@ -199,6 +158,10 @@ def _with_pictures(
     scores: pd.DataFrame, pictures: pd.DataFrame, frames: int, observations: Observations, method: str, seed: int
 ) -> pd.DataFrame:
     """Scores, and those of the first `frames` pictures."""
+    import pandas as pd
+
+    from neuspring.scores import metrics
+
     pictured = metrics.score_images(pictures, observations.scenario, frames, method, seed)
     return pd.concat([part for part in (scores, pictured) if len(part)] or [scores], ignore_index=True)
 
@@ -212,6 +175,9 @@ def _write_frozen(
     folder: Path,
 ) -> str:
     """Write held.parquet: scores with the last finite frame repeated, or frame 0 where there is none. Returns the file's name."""
+    from neuspring.core.files import write_table
+    from neuspring.scores import metrics
+
     frozen = metrics.last_frame_frozen(trajectory, observations)
     scores = metrics.score(frozen, observations, method, seed)
     if pictures is not None:

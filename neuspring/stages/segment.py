@@ -2,46 +2,30 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from pathlib import Path
-
-from neuspring import config
 from neuspring.config import Config
 from neuspring.core.errors import InputError
-from neuspring.core.findings import told
 from neuspring.core.records import Recorder
-from neuspring.data.capture import CAPTURE, Capture
-from neuspring.perception import figures
-from neuspring.perception.backends import BACKENDS
-from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
-from neuspring.perception.results import Masks
-from neuspring.stages import options as shared
+from neuspring.data.capture import Capture
+from neuspring.perception.backends import BACKENDS, backend_keys
+from neuspring.stages.stage import Written, stage
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring segment`."""
-    shared.add_capture(parser)
-    parser.add_argument("--camera", required=True)
-    shared.add_settings(parser)
-    shared.add_device(parser)
-    shared.add_output(parser)
+@stage(
+    output="{scenario}/perception/{camera}/masks.json",
+    reads=lambda settings, given: (*backend_keys("segment", settings.perception.segment.backend), "perception.segment.verdict"),
+    code=lambda settings, given: (BACKENDS["segment"][settings.perception.segment.backend].module,),
+    gpu="backend",
+    memory_mb=8000,
+    minutes=120,
+)
+def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
+    """One camera of a capture -> masks: masks.npz and masks.png."""
+    from neuspring.core.findings import told
+    from neuspring.perception import figures
+    from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
+    from neuspring.perception.results import Masks
 
-
-def command(a: Namespace) -> None:
-    """`neuspring segment`."""
-    run(a.capture.parent, a.camera, shared.read_settings(a.settings), a.device, a.output)
-
-
-def run(folder: Path, camera: str, settings: Config, device: str, output: Path) -> None:
-    """Write masks.npz, masks.png and the record `output`."""
     section = settings.perception.segment
-    record = Recorder(
-        "segment",
-        output,
-        inputs={"capture": folder / CAPTURE},
-        settings={type(section).__name__: config.plain(section)},
-    )
-    capture = Capture.load(folder)
     capture.require_camera(camera)
     labels = BACKENDS["segment"][section.backend].segment(capture, camera, settings.perception, device)
     facts = mask_facts(capture, camera, labels)
@@ -51,7 +35,7 @@ def run(folder: Path, camera: str, settings: Config, device: str, output: Path) 
         rule = "perception.segment.verdict: error asks for masks that can be right"
         raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(one.text for one in wrong))
     masks = Masks(labels=labels, backend=section.backend, facts=facts)
-    files = record.beside(masks="masks.npz", picture="masks.png")
+    files = run.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])
-    record.save(files, masks.facts | told(findings))
+    return Written(files=files, facts=masks.facts | told(findings))

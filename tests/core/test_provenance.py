@@ -5,11 +5,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from neuspring.experiments.inputs import Inputs
 
 from neuspring import config
 from neuspring.core import provenance
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.inputs import Inputs
 
 PACKAGE = Path(provenance.__file__).parents[1]
 ROOT = PACKAGE.parent
@@ -70,7 +70,7 @@ def test_the_code_of_a_stage_itself_counts(copy):
         ("splats/draw.py", "COVERED = 128", "COVERED = 200"),
         ("scores/lpips.py", "SHIFT = (-0.030", "SHIFT = (-0.031"),
         ("report/video.py", "quality: int = 20", "quality: int = 21"),
-        ("splats/train.py", "> opacity", ">= opacity"),
+        ("splats/train.py", "PRUNE_SIZE * extent", "PRUNE_SIZE * 2 * extent"),
         ("stages/render.py", 'VIDEOS = ("video", "turntable")', 'VIDEOS = ("turntable", "video")'),
         ("data/capture.py", "[..., ::-1]", "[..., ::1]"),
     ],

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from neuspring.experiments.inputs import Inputs
 
 from neuspring import config
 from neuspring.config import Config, Method, SearchRow, parse
@@ -20,7 +21,6 @@ from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.inputs import Inputs
 from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies

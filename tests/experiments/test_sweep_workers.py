@@ -7,8 +7,7 @@ import pytest
 
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
-from neuspring.experiments.tuning import worker
-from neuspring.stages import search as search_stage
+from neuspring.experiments.tuning import trial, worker
 from neuspring.twin.fit import TwinFit
 from tests.support import stores
 from tests.support.sweeps import furnish, report, results_of, slots, sweep, work
@@ -65,14 +64,14 @@ def test_a_kill_between_asking_for_a_trial_and_taking_it_costs_nothing(folder, m
 
 def counting(calls: Path) -> None:
     """Note every search in a file, in this process."""
-    searched = search_stage.run
+    searched = trial.search_stage
 
     def noted(*args, **kwargs):
         with calls.open("a") as stream:
             stream.write("search\n")
         searched(*args, **kwargs)
 
-    search_stage.run = noted
+    trial.search_stage = noted
 
 
 def other_worker(folder: Path, tune: Tune, start, hangs, calls: Path) -> None:
@@ -121,14 +120,14 @@ def two_workers(folder: Path, tune: Tune) -> None:
 
 def test_two_workers_and_a_kill_make_exactly_the_trials_asked_for(folder, monkeypatch):
     # Restored after the test.
-    monkeypatch.setattr(search_stage, "run", search_stage.run)
+    monkeypatch.setattr(trial, "search_stage", trial.search_stage)
     two_workers(folder, sweep(trials=6, workers=2, pruner="none"))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(stores.without_postgres()), reason=stores.without_postgres())
 def test_postgresql_holds_a_sweep(folder, monkeypatch):
-    monkeypatch.setattr(search_stage, "run", search_stage.run)
+    monkeypatch.setattr(trial, "search_stage", trial.search_stage)
     with stores.postgres() as cluster:
         tune = sweep(trials=6, workers=2, pruner="none", storage=cluster.database("study"))
         two_workers(folder, tune)

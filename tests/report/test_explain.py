@@ -19,7 +19,7 @@ from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.report.tables import study as tables_paper
 from neuspring.scores import paper
 from neuspring.scores.studies import read_studies
-from neuspring.stages import score
+from neuspring.stages.score import score
 from tests.support import small
 from tests.support.runs import STARTED, run_record
 from tests.support.study_runs import all_scores, write_benchmark, write_run
@@ -247,7 +247,7 @@ def test_the_key_is_that_of_a_real_run(tmp_path):
     records = {"search": folder / "search.json", "rollout": folder / "rollout.json"}
     StageRecord(stage="search", status="ok", settings={"seed": 0}, started=STARTED).save(records["search"])
     StageRecord(stage="rollout", status="ok", files=named, started=STARTED).save(records["rollout"])
-    score.run(seen, records, "search_only", {"fit": "none"}, 0, folder / "run.json")
+    score(observations=seen, **records, method="search_only", variant={"fit": "none"}, seed=0, output=folder / "run.json")
     record = RunRecord.load(folder / "run.json")
     assert check_files(folder / "run.json", record, seen) == (3, [])
     _, problems = check_files(folder / "run.json", replace(record, seed=1), seen)

@@ -14,14 +14,15 @@ import torch
 from neuspring.config.images import ImageQuirks, LpipsWeights
 from neuspring.core.artifacts import SplatCenters
 from neuspring.core.errors import InputError
-from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.records import Before, Recorder, StageRecord
 from neuspring.data.capture import HANDS, Capture
 from neuspring.perception.results import Masks
 from neuspring.scores import metrics
 from neuspring.splats.draw import orbit_view
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
-from neuspring.stages import appearance, draw, render
+from neuspring.stages.appearance import appearance
+from neuspring.stages.render import draw_frames, render
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
 from tests.support.pictured import IMAGES, Scene
 from tests.support.pictured import pictured as settings
@@ -46,7 +47,7 @@ def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
     assert all(record.facts[f"psnr_{name}"] > 28 for name in scene.capture.cameras)
     # Below, no camera looks.
     assert 0.05 < record.facts["unseen_surface"] < 0.6
-    assert record.inputs.keys() == {"capture", "masks0", "masks1", "masks2", "lift"}
+    assert record.inputs.keys() == {"capture", "masks0", "masks1", "masks2", "lifted"}
     assert record.facts["backend"] == "warp"
     assert {"splats", "history", "picture"} == set(record.files)
 
@@ -144,8 +145,15 @@ def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_p
     for kind in ("color", "depth", "tracks.json", "capture.json"):
         (tmp_path / kind).symlink_to(scene.capture.folder / kind)
     rollout = scene.roll(STEP, "covered")
-    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
-    render.run(tmp_path, *paths, settings(video=False), "cpu", rollout.with_name("render.json"))
+    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
+    render(
+        capture=tmp_path / "capture.json",
+        observations=scene.folder / "observations.npz",
+        settings=settings(video=False),
+        device="cpu",
+        output=rollout.with_name("render.json"),
+        **before,
+    )
     record = StageRecord.load(rollout.with_name("render.json"))
     assert record.facts["empty_frames"] == 1
     table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
@@ -176,19 +184,19 @@ def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
 
 def test_pictures_of_any_camera_and_frame(scene, tmp_path):
     rollout = scene.roll(STEP, "drawn")
-    common = (scene.capture.folder, scene.appearance, rollout)
-    made = draw.run(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
+    common = (scene.capture.folder, Before.load(scene.appearance), Before.load(rollout))
+    made = draw_frames(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
     assert [path.name for path in made] == ["00001.png", "00004.png"]
     white = cv2.imread(str(made[0]), cv2.IMREAD_UNCHANGED)
-    black = cv2.imread(str(draw.run(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
+    black = cv2.imread(str(draw_frames(*common, "2", [1], "black", settings(), "cpu", tmp_path)[0]), cv2.IMREAD_UNCHANGED)
     assert white.shape == (SIZE[1], SIZE[0], 4)
     assert np.array_equal(white[..., 3], black[..., 3])
     # Over a background c the color is color over black + (1 - coverage) c.
     assert np.abs(white[..., :3].astype(int) - black[..., :3] - (255 - black[..., 3:].astype(int))).max() <= 2
     with pytest.raises(InputError, match="must be a camera of"):
-        draw.run(*common, "7", None, "black", settings(), "cpu", tmp_path)
+        draw_frames(*common, "7", None, "black", settings(), "cpu", tmp_path)
     with pytest.raises(InputError, match=r"frames 0 to 5; received \[9\]"):
-        draw.run(*common, "0", [9], "black", settings(), "cpu", tmp_path)
+        draw_frames(*common, "0", [9], "black", settings(), "cpu", tmp_path)
 
 
 def test_training_follows_its_seed_and_repeats(scene, tmp_path):
@@ -230,7 +238,15 @@ def spoiled(scene: Scene, folder, **changes: object) -> Capture:
 
 def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
     lifted = scene.folder / "lifted.json"
-    appearance.run(capture.folder, masks or scene.masks, settings(), 0, "cpu", tmp_path / "appearance.json", lifted_record=lifted)
+    appearance(
+        capture=capture.folder / "capture.json",
+        masks=masks or scene.masks,
+        settings=settings(),
+        seed=0,
+        device="cpu",
+        output=tmp_path / "appearance.json",
+        lifted=lifted,
+    )
 
 
 def test_a_camera_inside_the_object_is_named(scene, tmp_path):
@@ -270,9 +286,16 @@ def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
     values = json.loads((shorter.folder / "capture.json").read_text())
     (shorter.folder / "capture.json").write_text(json.dumps(values | {"frame_count": 5}))
     rollout = scene.roll(STEP, "length")
-    paths = (scene.masks, scene.folder / "observations.npz", scene.appearance, rollout)
-    with pytest.raises(InputError, match=r"capture\.json: must have as many frames as .*observations\.npz: 6.*received 5.*enabled"):
-        render.run(shorter.folder, *paths, settings(), "cpu", rollout.with_name("render.json"))
+    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
+    with pytest.raises(InputError, match=r"capture\.json: must have as many frames as the observations: 6.*received 5.*enabled"):
+        render(
+            capture=shorter.folder / "capture.json",
+            observations=scene.folder / "observations.npz",
+            settings=settings(),
+            device="cpu",
+            output=rollout.with_name("render.json"),
+            **before,
+        )
 
 
 def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
@@ -284,7 +307,15 @@ def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene,
 def test_processed_data_need_no_lifted_points(scene, tmp_path):
     """As of PhysTwin's released cases: masks are lifted, surface points of the observations stand for the shape prior."""
     output, seen = tmp_path / "appearance.json", scene.folder / "observations.npz"
-    appearance.run(scene.capture.folder, scene.masks, settings(), 0, "cpu", output, observations_path=seen)
+    appearance(
+        capture=scene.capture.folder / "capture.json",
+        masks=scene.masks,
+        settings=settings(),
+        seed=0,
+        device="cpu",
+        output=output,
+        observations=seen,
+    )
     facts = StageRecord.load(output).facts
     assert facts["unseen_surface"] is None
     assert all(facts[f"psnr_{name}"] > 25 for name in scene.capture.cameras)

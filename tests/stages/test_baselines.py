@@ -21,7 +21,10 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
-from neuspring.stages import predict, score, train, transfer
+from neuspring.stages.predict import predict
+from neuspring.stages.score import score
+from neuspring.stages.train import train
+from neuspring.stages.transfer import transfer
 from tests.support import small
 from tests.support.filmed import FRAMES, film
 from tests.support.pictured import Scene, pictured
@@ -48,10 +51,10 @@ def run_all(seen, model: str, chosen: config.Config):
     trained = None
     if BASELINES[model].trained:
         trained = folder / "train.json"
-        train.run(seen, model, chosen, 0, "cpu", trained)
-    predict.run(seen, model, trained, None, "cpu", folder / "rollout.json")
+        train(observations=seen, model=model, settings=chosen, seed=0, device="cpu", output=trained)
+    predict(observations=seen, model=model, train=trained, appearance=None, device="cpu", output=folder / "rollout.json")
     records = ({"train": trained} if trained else {}) | {"rollout": folder / "rollout.json"}
-    score.run(seen, records, model, {"model": model}, 0, folder / "run.json")
+    score(observations=seen, **records, method=model, variant={"model": model}, seed=0, output=folder / "run.json")
     return folder / "run.json"
 
 
@@ -78,7 +81,7 @@ def test_training_reads_no_frame_of_the_future(seen, tmp_path, model):
     small.spoiled_future().save(other)
     found = []
     for path in (seen, other):
-        train.run(path, model, settings(), 0, "cpu", path.with_name("train.json"))
+        train(observations=path, model=model, settings=settings(), seed=0, device="cpu", output=path.with_name("train.json"))
         found.append(StageRecord.load(path.with_name("train.json")).files["model"][1])
     assert found[0] == found[1]
 
@@ -87,8 +90,16 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
     out, target = seen.parent / "gs_dynamics" / "0", tmp_path / "other" / "observations.npz"
     other = small.scene("rope/shake/smooth").observations
     other.save(target)
-    train.run(seen, "gs_dynamics", settings(), 0, "cpu", out / "train.json")
-    transfer.run([target], out / "train.json", "gs_dynamics", 0, settings(), "cpu", out / "transfer.json")
+    train(observations=seen, model="gs_dynamics", settings=settings(), seed=0, device="cpu", output=out / "train.json")
+    transfer(
+        targets=[target],
+        learned=out / "train.json",
+        method="gs_dynamics",
+        seed=0,
+        settings=settings(),
+        device="cpu",
+        output=out / "transfer.json",
+    )
     scores = pd.read_parquet(out / "transfer.parquet")
     model = GsDynamicsModel.load(out / "model.npz")
     frames = {"transfer": range(1, other.scenario.frame_count)}
@@ -117,9 +128,17 @@ def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen)
 def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path):
     learned = tmp_path / "appearance.json"
     Recorder("appearance", learned).save(failure="appearance: step 3 removed the last splat")
-    pictures = train.PictureRecords(tmp_path, [], learned)
+    pictures = {"appearance": learned}
     out = seen.with_name("train.json")
-    train.run(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", out, pictures)
+    train(
+        observations=seen,
+        model="spring_gaus",
+        settings=settings(spring_gaus=MASKS),
+        seed=0,
+        device="cpu",
+        output=out,
+        **pictures,
+    )
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
     lonely = settings(spring_gaus=replace(POINTS, neighbors=500))
@@ -131,18 +150,28 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
 
 def test_all_that_training_reads_is_in_its_record(seen):
     out = seen.with_name("train.json")
-    train.run(seen, "spring_gaus", settings(), 0, "cpu", out)
+    train(observations=seen, model="spring_gaus", settings=settings(), seed=0, device="cpu", output=out)
     found = StageRecord.load(out).settings
-    assert found["gravity"] == 9.8 and found["losses"]["track"] == 1.0 and found["anchors"] == 60
+    assert found["simulation"]["gravity"] == 9.8 and found["losses"]["track"] == 1.0
+    assert found["baselines"]["spring_gaus"]["anchors"] == 60
 
 
 def test_what_is_missing_is_named(seen):
     with pytest.raises(InputError, match="only spring_gaus, gs_dynamics are trained"):
-        train.run(seen, "static", settings(), 0, "cpu", seen.with_name("train.json"))
+        train(observations=seen, model="static", settings=settings(), seed=0, device="cpu", output=seen.with_name("train.json"))
     with pytest.raises(InputError, match="supervision: masks needs --capture"):
-        train.run(seen, "spring_gaus", settings(spring_gaus=MASKS), 0, "cpu", seen.with_name("train.json"))
+        train(
+            observations=seen,
+            model="spring_gaus",
+            settings=settings(spring_gaus=MASKS),
+            seed=0,
+            device="cpu",
+            output=seen.with_name("train.json"),
+        )
     with pytest.raises(InputError, match="model gs_dynamics is trained first"):
-        predict.run(seen, "gs_dynamics", None, None, "cpu", seen.with_name("rollout.json"))
+        predict(
+            observations=seen, model="gs_dynamics", train=None, appearance=None, device="cpu", output=seen.with_name("rollout.json")
+        )
 
 
 @pytest.fixture(scope="module")
@@ -156,13 +185,20 @@ def filmed(tmp_path_factory):
 
 def test_silhouettes_train_and_both_outputs_are_written(filmed):
     chosen = replace(settings(spring_gaus=MASKS), images=Images())
-    pictures = train.PictureRecords(filmed.capture.folder, filmed.masks, filmed.appearance)
+    pictures = {"capture": filmed.capture.folder / "capture.json", "masks": filmed.masks, "appearance": filmed.appearance}
     seen, out = filmed.folder / "observations.npz", filmed.folder / "spring_gaus"
-    train.run(seen, "spring_gaus", chosen, 0, "cpu", out / "train.json", pictures)
+    train(observations=seen, model="spring_gaus", settings=chosen, seed=0, device="cpu", output=out / "train.json", **pictures)
     trained = StageRecord.load(out / "train.json")
     assert trained.status == "ok" and trained.facts["vgg16"].startswith("no VGG16 weights")
     assert {"masks0", "appearance", "observations"} <= set(trained.inputs)
-    predict.run(seen, "spring_gaus", out / "train.json", filmed.appearance, "cpu", out / "rollout.json")
+    predict(
+        observations=seen,
+        model="spring_gaus",
+        train=out / "train.json",
+        appearance=filmed.appearance,
+        device="cpu",
+        output=out / "rollout.json",
+    )
     record = StageRecord.load(out / "rollout.json")
     centers = SplatCenters.load(record.file("centers", out / "rollout.json")).positions
     trajectory = Trajectory.load(record.file("trajectory", out / "rollout.json"))
@@ -175,5 +211,5 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     assert drawn.status == "ok" and drawn.facts["splats"] == centers.shape[1]
     run = out / "run.json"
     records = {"train": out / "train.json", "rollout": out / "rollout.json", "render": out / "render.json"}
-    score.run(seen, records | {"appearance": filmed.appearance}, "spring_gaus", {}, 0, run)
+    score(observations=seen, **(records | {"appearance": filmed.appearance}), method="spring_gaus", variant={}, seed=0, output=run)
     assert "without the loss of VGG16's features" in " ".join(json.loads(run.read_text())["notes"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,12 @@ from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
-from neuspring.stages import fit, fits, observe, options, search
+from neuspring.stages.fit import fit
+from neuspring.stages.fits import Row, fits
+from neuspring.stages.observe import observe
+from neuspring.stages.search import search
+from neuspring.stages.stage import read_settings
+from neuspring.twin import fit as twin_fit
 from tests.support import small
 
 SETTINGS = config.Config(
@@ -30,9 +35,16 @@ ROWS = {"springs": SETTINGS.fit, "field": SETTINGS.fit, "ten": replace(SETTINGS.
 def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations, and the searches of two seeds."""
     folder = tmp_path_factory.mktemp("started")
-    observe.run(small.row(), SETTINGS, folder / "observations.npz")
+    observe(row=small.row(), settings=SETTINGS, output=folder / "observations.npz")
     for seed in (0, 1):
-        search.run(folder / "observations.npz", SETTINGS, 1, seed, "cpu", folder / f"search-{seed}" / "search.json")
+        search(
+            observations=folder / "observations.npz",
+            settings=SETTINGS,
+            clusters=1,
+            seed=seed,
+            device="cpu",
+            output=folder / f"search-{seed}" / "search.json",
+        )
     return folder
 
 
@@ -40,10 +52,10 @@ def text(name: str) -> str:
     return json.dumps({"fit": config.plain(ROWS[name])})
 
 
-def rows_of(started: Path, folder: Path) -> list[fits.Row]:
+def rows_of(started: Path, folder: Path) -> list[Row]:
     """Three rows of the method table, two seeds each; the last has another horizon."""
     return [
-        fits.Row(
+        Row(
             kind="field" if name == "field" else "springs",
             settings=text(name),
             fits={str(folder / name / str(k) / "fit.json"): str(started / f"search-{k}" / "search.json") for k in (0, 1)},
@@ -52,12 +64,16 @@ def rows_of(started: Path, folder: Path) -> list[fits.Row]:
     ]
 
 
-def finish(started: Path, rows: list[fits.Row]) -> None:
+def as_json(rows: list[Row]) -> str:
+    return json.dumps([asdict(row) for row in rows])
+
+
+def finish(started: Path, rows: list[Row]) -> None:
     """The jobs of the fits themselves."""
     for row in rows:
         for output, found in row.fits.items():
-            seen, settings = started / "observations.npz", options.read_settings(row.settings)
-            fit.run(seen, Path(found), settings, row.kind, "cpu", Path(output))
+            seen, settings = started / "observations.npz", read_settings(row.settings)
+            fit(observations=seen, search=Path(found), settings=settings, kind=row.kind, device="cpu", output=Path(output))
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +103,21 @@ def assert_same(got: Path, wanted: Path) -> None:
 @pytest.mark.parametrize("most", [0, 3])
 def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Path, tmp_path: Path, most: int) -> None:
     rows = rows_of(started, tmp_path)
-    fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json", most)
+    fits(
+        observations=started / "observations.npz",
+        rows=as_json(rows),
+        device="cpu",
+        output=tmp_path / "fits.json",
+        twins_per_launch=most or "auto",
+    )
     record = StageRecord.load(tmp_path / "fits.json")
-    sizes = [len(company) for company in record.facts["companies"]]
+    sizes = [len(batch) for batch in record.facts["batches"]]
     # Four of one horizon and two of another; of three at most, one would be alone, and is left to itself.
     assert sizes == ([4, 2] if most == 0 else [3, 2])
     assert record.facts["errors"] == {}
     finish(started, rows)
     assert_same(tmp_path, alone)
-    together = {path for company in record.facts["companies"] for path in company}
+    together = {path for batch in record.facts["batches"] for path in batch}
     for row in rows:
         for output in row.fits:
             facts, attempts = StageRecord.load(Path(output)).facts, StageRecord.load(Path(output)).attempts
@@ -108,10 +130,10 @@ def test_finished_fits_and_failed_searches_are_left_alone(started: Path, alone: 
     rows = rows_of(started, alone)
     broken = tmp_path / "failed.json"
     replace(StageRecord.load(started / "search-0" / "search.json"), status="failed", reason="x").save(broken)
-    rows.append(fits.Row(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
+    rows.append(Row(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
     before = {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()}
-    fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json")
-    assert StageRecord.load(tmp_path / "fits.json").facts["companies"] == []
+    fits(observations=started / "observations.npz", rows=as_json(rows), device="cpu", output=tmp_path / "fits.json")
+    assert StageRecord.load(tmp_path / "fits.json").facts["batches"] == []
     assert {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()} == before
 
 
@@ -119,14 +141,14 @@ def test_a_fit_with_other_settings_is_made_again(started: Path, alone: Path, tmp
     rows = rows_of(started, tmp_path)
     finish(started, rows)
     longer = [replace(row, settings=json.dumps({"fit": {"epochs": 4}})) for row in rows[:1]]
-    fits.run(started / "observations.npz", longer, "cpu", tmp_path / "fits.json")
-    assert len(StageRecord.load(tmp_path / "fits.json").facts["companies"][0]) == 2
+    fits(observations=started / "observations.npz", rows=as_json(longer), device="cpu", output=tmp_path / "fits.json")
+    assert len(StageRecord.load(tmp_path / "fits.json").facts["batches"][0]) == 2
 
 
 def test_an_error_of_one_is_named_and_holds_nobody_up(
     started: Path, alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows, original = rows_of(started, tmp_path), fits.fit
+    rows, original = rows_of(started, tmp_path), twin_fit.fit
 
     def failing(problem: object, *, partial: Path, **more: object) -> object:
         if partial.parent == tmp_path / "field" / "1":
@@ -134,15 +156,18 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
         return original(problem, partial=partial, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fits, "fit", failing)
-        fits.run(started / "observations.npz", rows, "cpu", tmp_path / "fits.json")
+        patch.setattr(twin_fit, "fit", failing)
+        fits(observations=started / "observations.npz", rows=as_json(rows), device="cpu", output=tmp_path / "fits.json")
     errors = StageRecord.load(tmp_path / "fits.json").facts["errors"]
     assert errors == {str(tmp_path / "field" / "1" / "fit.json"): "MemoryError: too large"}
     finish(started, rows)
     assert_same(tmp_path, alone)
 
 
-@pytest.mark.parametrize(("given", "message"), [("{", "must be JSON"), ("{}", "a list of rows"), ('[{"kind": "x"}]', "entry 0")])
-def test_bad_rows(given: str, message: str) -> None:
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("{", "must be JSON"), ("{}", "must be a JSON list"), ('[{"kind": "x"}]', "entry 0")],
+)
+def test_bad_rows(started: Path, tmp_path: Path, given: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        fits.read_rows(given)
+        fits(observations=started / "observations.npz", rows=given, device="cpu", output=tmp_path / "fits.json")

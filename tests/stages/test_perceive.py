@@ -14,7 +14,10 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data import phystwin
 from neuspring.data.capture import Capture
-from neuspring.stages import capture, lift, observe, segment
+from neuspring.stages.capture import capture
+from neuspring.stages.lift import lift
+from neuspring.stages.observe import observe
+from neuspring.stages.segment import segment
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
 from tests.support.perceived import ROW, SETTINGS, final_data, perceived
 from tests.support.phystwin_case import dump, write_json
@@ -50,9 +53,9 @@ def test_points_and_controllers_move_as_filmed(whole):
 def test_each_step_names_its_backend_and_draws_a_picture(whole):
     _, observations, folder = whole
     masks = StageRecord.load(folder / "0" / "masks.json")
-    assert masks.settings["Segmentation"]["backend"] == "given"
+    assert masks.settings["perception"]["segment"]["backend"] == "given"
     tracks = StageRecord.load(folder / "0" / "tracks.json")
-    assert tracks.settings["PointTracking"]["backend"] == "opencv"
+    assert tracks.settings["perception"]["track"]["backend"] == "opencv"
     assert 0 < tracks.facts["visible_share"] <= 1
     lifted = StageRecord.load(folder / "lifted.json")
     assert lifted.facts["controllers"] == 10
@@ -80,7 +83,7 @@ def test_opencv_finds_what_the_given_masks_show(tmp_path, whole):
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, segment=Segmentation(backend="opencv")))
     observations = perceived(whole[0], tmp_path, settings=settings)
     assert np.median(motion_error(observations)) < 0.003
-    assert StageRecord.load(tmp_path / "0" / "masks.json").settings["Segmentation"]["backend"] == "opencv"
+    assert StageRecord.load(tmp_path / "0" / "masks.json").settings["perception"]["segment"]["backend"] == "opencv"
 
 
 def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
@@ -88,7 +91,7 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
     own = film(tmp_path / "own", cameras=2, up="-z", train_end=4)
     case = write_raw(own, tmp_path / "data" / "thing")
     row = ScenarioRow(scenario="film", source="phystwin_raw", category="toy", path="thing", self_collision=False, ground=True)
-    capture.run(row, replace(SETTINGS, data_root=str(case.parent)), tmp_path / "imported" / "capture.json")
+    capture(row=row, settings=replace(SETTINGS, data_root=str(case.parent)), output=tmp_path / "imported" / "capture.json")
     imported = Capture.load(tmp_path / "imported")
     assert imported.train_end == 4
     expected, found = perceived(own, tmp_path / "a"), perceived(imported, tmp_path / "b", row)
@@ -111,7 +114,9 @@ def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp
 def test_given_masks_must_be_there(tmp_path):
     capture = film(tmp_path / "capture", cameras=1, masks=False)
     with pytest.raises(InputError, match=r"backend: given needs masks.*neuspring annotate .*: marks, opencv"):
-        segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+        segment(
+            capture=capture.folder / "capture.json", camera="0", settings=SETTINGS, device="cpu", output=tmp_path / "masks.json"
+        )
 
 
 def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
@@ -121,7 +126,7 @@ def test_two_objects_and_an_object_that_leaves_are_said(tmp_path, capsys):
         labels[2:22, 2:22] = 1
         labels = np.where((labels == 1) & (frame > 3), 0, labels).astype(np.uint8)
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
-    segment.run(capture.folder, "0", SETTINGS, "cpu", tmp_path / "masks.json")
+    segment(capture=capture.folder / "capture.json", camera="0", settings=SETTINGS, device="cpu", output=tmp_path / "masks.json")
     said = capsys.readouterr().out
     assert "the object's mask of frame 0 has 2 pieces far apart; one object is expected, whose pieces lie together" in said
     assert "almost nothing of the object in 2 frames, first in frame 4" in said
@@ -139,26 +144,34 @@ def test_a_camera_without_object_and_hand_in_frame_0_is_not_used(tmp_path, capsy
 
 def test_an_unknown_camera_is_named(tmp_path, whole):
     with pytest.raises(InputError, match=r"must have a camera left; received \['0', '1', '2'\]"):
-        segment.run(whole[0].folder, "left", SETTINGS, "cpu", tmp_path / "masks.json")
+        segment(
+            capture=whole[0].folder / "capture.json", camera="left", settings=SETTINGS, device="cpu", output=tmp_path / "masks.json"
+        )
 
 
 def test_every_camera_s_records_are_required(tmp_path, whole):
     _, _, folder = whole
     with pytest.raises(InputError, match="one record per camera is required"):
-        lift.run(whole[0].folder, [folder / "0" / "masks.json"], [folder / "0" / "tracks.json"], SETTINGS, tmp_path / "l.json")
+        lift(
+            capture=whole[0].folder / "capture.json",
+            masks=[folder / "0" / "masks.json"],
+            tracks=[folder / "0" / "tracks.json"],
+            settings=SETTINGS,
+            output=tmp_path / "l.json",
+        )
 
 
 def test_too_few_controllers_say_what_to_change(tmp_path, whole):
     _, _, folder = whole
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighborhood=0.02, least_controllers=3000)))
-    records = [[folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")]
+    records = {name: [folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")}
     with pytest.raises(InputError, match=r"at least 3000 points of the hands.*perception\.lift has controller_gaps"):
-        lift.run(whole[0].folder, *records, settings, tmp_path / "lifted.json")
+        lift(capture=whole[0].folder / "capture.json", settings=settings, output=tmp_path / "lifted.json", **records)
 
 
 def test_raw_video_must_be_perceived_first(tmp_path):
     with pytest.raises(InputError, match="need --capture and --lifted"):
-        observe.run(ROW, SETTINGS, tmp_path / "observations.npz")
+        observe(row=ROW, settings=SETTINGS, output=tmp_path / "observations.npz")
 
 
 def test_records_are_plain_json(whole):

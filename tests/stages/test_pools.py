@@ -9,7 +9,8 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.stages import fit, search
+from neuspring.stages.fit import fit
+from neuspring.stages.search import search
 from tests.support import small
 
 SETTINGS = config.Config(
@@ -31,8 +32,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def run(seen: dict[str, Path], folder: Path, **pool) -> tuple[StageRecord, StageRecord]:
     """Search and fit of the lifted rope."""
     found, fitted = folder / "search.json", folder / "fit" / "fit.json"
-    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", found, **pool)
-    fit.run(seen["lift"], found, SETTINGS, "springs", "cpu", fitted, **pool)
+    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=found, **pool)
+    fit(observations=seen["lift"], search=found, settings=SETTINGS, kind="springs", device="cpu", output=fitted, **pool)
     return StageRecord.load(found), StageRecord.load(fitted)
 
 
@@ -43,7 +44,7 @@ def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
     for one, both, other in zip(alone, pooled, left_out, strict=True):
         assert "pool0" not in one.inputs
         assert both.inputs["pool0"] == other.inputs["pool0"] == digest_file(seen["shake"])
-        assert [record.settings.get("leave_out") for record in (one, both, other)] == [None, None, True]
+        assert [record.settings["leave_out"] for record in (one, both, other)] == [False, False, True]
         assert one.status == both.status == other.status == "ok"
     ratio = [both.facts["spring_updates"] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
     assert ratio[1] == 2 * ratio[0]
@@ -57,10 +58,10 @@ def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
 
 def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):
     record = tmp_path / "search.json"
-    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record)
-    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record, pool=[seen["shake"]])
+    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record)
+    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
     assert "made with other inputs or settings" in capsys.readouterr().out
     first = pd.read_parquet(tmp_path / "trace.parquet")
-    search.run(seen["lift"], SETTINGS, 1, 0, "cpu", record, pool=[seen["shake"]])
+    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
     assert "continuing the search after 6 rollouts" in capsys.readouterr().out
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), first)

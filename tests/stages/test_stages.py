@@ -15,7 +15,12 @@ from neuspring.experiments.tracking import log as tracking
 from neuspring.report.tables import summary as tables
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
-from neuspring.stages import fit, observe, rollout, score, search, transfer
+from neuspring.stages.fit import fit
+from neuspring.stages.observe import observe
+from neuspring.stages.rollout import rollout
+from neuspring.stages.score import _notes, score
+from neuspring.stages.search import search
+from neuspring.stages.transfer import transfer
 from neuspring.twin.spacing import node_spacing
 from tests.support import small
 
@@ -38,15 +43,22 @@ def run_all(folder, name="small", *, method="phystwin", settings=SETTINGS):
     seen, found = folder / name / "observations.npz", folder / name / searched / "0" / "search.json"
     out = folder / name / method / "0"
     if not seen.exists():
-        observe.run(small.row(name=name), settings, seen)
+        observe(row=small.row(name=name), settings=settings, output=seen)
     if not found.exists():
-        search.run(seen, settings, clusters, 0, "cpu", found)
+        search(observations=seen, settings=settings, clusters=clusters, seed=0, device="cpu", output=found)
     records = {"search": found}
     if kind:
-        fit.run(seen, found, settings, kind, "cpu", out / "fit.json")
+        fit(observations=seen, search=found, settings=settings, kind=kind, device="cpu", output=out / "fit.json")
         records["fit"] = out / "fit.json"
-    rollout.run(seen, list(records.values())[-1], "cpu", out / "rollout.json")
-    score.run(seen, records | {"rollout": out / "rollout.json"}, out.parent.name, {"search": "uniform"}, 0, out / "run.json")
+    rollout(observations=seen, learned=list(records.values())[-1], device="cpu", output=out / "rollout.json")
+    score(
+        observations=seen,
+        **(records | {"rollout": out / "rollout.json"}),
+        method=out.parent.name,
+        variant={"search": "uniform"},
+        seed=0,
+        output=out / "run.json",
+    )
     return out / "run.json"
 
 
@@ -108,7 +120,15 @@ def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     frames = seen.scenario.frame_count - 1
     assert StageRecord.load(run.with_name("rollout.json")).facts["spring_updates"] == frames * per_frame
     observations = folder / "small" / "observations.npz"
-    transfer.run([observations, observations], fitted, "phystwin", 0, SETTINGS, "cpu", tmp_path / "transfer.json")
+    transfer(
+        targets=[observations, observations],
+        learned=fitted,
+        method="phystwin",
+        seed=0,
+        settings=SETTINGS,
+        device="cpu",
+        output=tmp_path / "transfer.json",
+    )
     moved = StageRecord.load(tmp_path / "transfer.json").facts["spring_updates"]
     # Substeps are added where the other recording's distances need more.
     assert moved >= 2 * frames * per_frame and moved % (2 * frames * facts["fit"]["springs"]) == 0
@@ -144,21 +164,21 @@ def test_a_fit_that_its_settings_held_says_so_in_the_notes():
     facts = {"at_bound": 0.25, "texels_moved": 0.0125}
     settings = {"fit": {"epochs": 2}}
     held = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
-    notes = score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
+    notes = _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
     assert notes == [
         "fit: 25% of the springs lie at the bound of their stiffness (fit.output_bound)",
         "fit: only 1.2% of the texels moved by a tenth of their first scale",
     ]
     free = StageRecord(stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05}, settings=settings)
-    assert score._notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
+    assert _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 
 def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     seen = finished[0] / "small" / "observations.npz"
     larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
-    search.run(seen, SETTINGS, 1, 0, "cpu", tmp_path / "search.json")
+    search(observations=seen, settings=SETTINGS, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
     before = pd.read_parquet(tmp_path / "trace.parquet")
-    search.run(seen, larger, 1, 0, "cpu", tmp_path / "search.json")
+    search(observations=seen, settings=larger, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
     record, after = StageRecord.load(tmp_path / "search.json"), pd.read_parquet(tmp_path / "trace.parquet")
     assert (record.attempts, record.facts["rollouts"], len(after)) == (2, 14, 14)
     # Candidates that were there are not evaluated again: not even their times change.
@@ -166,7 +186,7 @@ def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
     assert record.file("trace", tmp_path / "search.json").exists()
     # Everything else does start a search afresh.
     other = replace(larger, losses=config.Losses(track=2.0))
-    search.run(seen, other, 1, 0, "cpu", tmp_path / "search.json")
+    search(observations=seen, settings=other, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
     assert StageRecord.load(tmp_path / "search.json").attempts == 1
 
 
@@ -174,8 +194,10 @@ def test_how_candidates_are_simulated_is_no_setting(finished, tmp_path):
     """Neither the record nor the key of what is continued knows it."""
     seen = finished[0] / "small" / "observations.npz"
     records, traces = [], []
-    for name, how in (("one", {"together": 1}), ("many", {"together": 0, "threads": 2})):
-        search.run(seen, SETTINGS, 1, 0, "cpu", tmp_path / name / "search.json", **how)
+    for name, how in (("one", {"twins_per_launch": 1}), ("many", {"twins_per_launch": "auto", "threads": 2})):
+        search(
+            observations=seen, settings=SETTINGS, clusters=1, seed=0, device="cpu", output=tmp_path / name / "search.json", **how
+        )
         records.append(StageRecord.load(tmp_path / name / "search.json"))
         traces.append(pd.read_parquet(tmp_path / name / "trace.parquet"))
     assert records[0].settings == records[1].settings
@@ -183,7 +205,15 @@ def test_how_candidates_are_simulated_is_no_setting(finished, tmp_path):
     assert records[0].files["twin"] == records[1].files["twin"]
     assert traces[0].attrs["key"] == traces[1].attrs["key"]
     larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
-    search.run(seen, larger, 1, 0, "cpu", tmp_path / "one" / "search.json", together=5)
+    search(
+        observations=seen,
+        settings=larger,
+        clusters=1,
+        seed=0,
+        device="cpu",
+        output=tmp_path / "one" / "search.json",
+        twins_per_launch=5,
+    )
     assert StageRecord.load(tmp_path / "one" / "search.json").attempts == 2
 
 
@@ -210,7 +240,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     def fails(*_arguments, **_options):
         raise NumericalFailure("every candidate diverged")
 
-    monkeypatch.setattr("neuspring.stages.search.search", fails)
+    monkeypatch.setattr("neuspring.twin.search.search", fails)
     run_all(tmp_path, "bad")
     monkeypatch.undo()
     run_all(tmp_path, "good")
@@ -229,11 +259,18 @@ def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
     folder, _, _ = finished
     monkeypatch.setattr("neuspring.twin.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
     found = folder / "small" / "search-uniform" / "0" / "search.json"
-    rollout.run(folder / "small" / "observations.npz", found, "cpu", tmp_path / "rollout.json")
+    rollout(observations=folder / "small" / "observations.npz", learned=found, device="cpu", output=tmp_path / "rollout.json")
     record = StageRecord.load(tmp_path / "rollout.json")
     assert record.status == "failed"
     assert "left the scene in frame" in record.reason
     records = {"search": found, "rollout": tmp_path / "rollout.json"}
-    score.run(folder / "small" / "observations.npz", records, "search_only", {}, 0, tmp_path / "run.json")
+    score(
+        observations=folder / "small" / "observations.npz",
+        **records,
+        method="search_only",
+        variant={},
+        seed=0,
+        output=tmp_path / "run.json",
+    )
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
     assert len(pd.read_parquet(tmp_path / "scores.parquet")) < 4

@@ -11,7 +11,7 @@ import numpy as np
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Twin
 from neuspring.core.records import Recorder
 from neuspring.splats.model import Splats
-from neuspring.stages import rollout
+from neuspring.stages.rollout import rollout
 from tests.support import scenarios
 
 NODES, FRAMES = 6, 7
@@ -94,7 +94,7 @@ def run_folder(
     files = record.beside(twin="twin.npz")
     twin.save(files["twin"])
     record.save(files)
-    rollout.run(observations, folder / "fit.json", "cpu", folder / "rollout.json")
+    rollout(observations=observations, learned=folder / "fit.json", device="cpu", output=folder / "rollout.json")
     if with_splats:
         trained = Recorder("appearance", scenario / "appearance" / "0" / "appearance.json")
         files = trained.beside(splats="splats.ply")

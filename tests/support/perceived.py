@@ -8,7 +8,10 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, OpenCvTracking, Perception, PointTracking, Sampling
 from neuspring.core.artifacts import Observations
 from neuspring.data.capture import Capture
-from neuspring.stages import lift, observe, segment, track
+from neuspring.stages.lift import lift
+from neuspring.stages.observe import observe
+from neuspring.stages.segment import segment
+from neuspring.stages.track import track
 
 ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film", self_collision=False, ground=True)
 SETTINGS = Config(
@@ -28,10 +31,23 @@ def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: 
         masks.append(folder / camera / "masks.json")
         tracks.append(folder / camera / "tracks.json")
         masks[-1].parent.mkdir(parents=True)
-        segment.run(capture.folder, camera, settings, "cpu", masks[-1])
-        track.run(capture.folder, camera, masks[-1], settings, "cpu", tracks[-1])
-    lift.run(capture.folder, masks, tracks, settings, folder / "lifted.json")
-    observe.run(row, settings, folder / "observations.npz", capture.folder, folder / "lifted.json")
+        segment(capture=capture.folder / "capture.json", camera=camera, settings=settings, device="cpu", output=masks[-1])
+        track(
+            capture=capture.folder / "capture.json",
+            camera=camera,
+            masks=masks[-1],
+            settings=settings,
+            device="cpu",
+            output=tracks[-1],
+        )
+    lift(capture=capture.folder / "capture.json", masks=masks, tracks=tracks, settings=settings, output=folder / "lifted.json")
+    observe(
+        row=row,
+        settings=settings,
+        output=folder / "observations.npz",
+        capture=capture.folder / "capture.json",
+        lifted=folder / "lifted.json",
+    )
     return Observations.load(folder / "observations.npz")
 
 

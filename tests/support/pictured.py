@@ -10,7 +10,8 @@ from neuspring.config.images import Appearance, Images
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import Capture
-from neuspring.stages import appearance, render
+from neuspring.stages.appearance import appearance
+from neuspring.stages.render import render
 from tests.support.filmed import FRAMES
 from tests.support.perceived import SETTINGS, perceived
 
@@ -33,7 +34,15 @@ class Scene:
     def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
         self.appearance.parent.mkdir(exist_ok=True)
         lifted = self.folder / "lifted.json"
-        appearance.run(self.capture.folder, self.masks, chosen, seed, "cpu", self.appearance, lifted_record=lifted)
+        appearance(
+            capture=self.capture.folder / "capture.json",
+            masks=self.masks,
+            settings=chosen,
+            seed=seed,
+            device="cpu",
+            output=self.appearance,
+            lifted=lifted,
+        )
         return StageRecord.load(self.appearance)
 
     def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
@@ -50,7 +59,14 @@ class Scene:
 
     def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
         output = rollout.with_name("render.json")
-        paths = (self.masks, self.folder / "observations.npz", self.appearance, rollout)
-        render.run(self.capture.folder, *paths, chosen, "cpu", output)
+        before = {"masks": self.masks, "appearance": self.appearance, "rollout": rollout}
+        render(
+            capture=self.capture.folder / "capture.json",
+            observations=self.folder / "observations.npz",
+            settings=chosen,
+            device="cpu",
+            output=output,
+            **before,
+        )
         record = StageRecord.load(output)
         return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None

@@ -1,7 +1,7 @@
 """The oracle reads the future and says so; what is no oracle reads none of it, bit for bit."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,11 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.physics.parameters import twin_tensors
-from neuspring.stages import fit as fit_stage
-from neuspring.stages import fits, rollout
-from neuspring.stages import search as search_stage
+from neuspring.stages.fit import fit as fit_stage
+from neuspring.stages.fit import prepared
+from neuspring.stages.fits import Row, fits
+from neuspring.stages.rollout import rollout
+from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import roll_out
@@ -97,7 +99,9 @@ def test_settings_cannot_make_an_oracle():
 def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("oracle")
     small.observations().save(folder / "observations.npz")
-    search_stage.run(folder / "observations.npz", SETTINGS, 1, 0, "cpu", folder / "search.json")
+    search_stage(
+        observations=folder / "observations.npz", settings=SETTINGS, clusters=1, seed=0, device="cpu", output=folder / "search.json"
+    )
     return folder
 
 
@@ -105,14 +109,28 @@ def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_p
     seen, found = started / "observations.npz", started / "search.json"
     keys = {}
     for oracle in (False, True):
-        recorder = fit_stage.recorder(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
-        keys[oracle] = fit_stage.prepared(recorder, seen, found, SETTINGS).key
-        fit_stage.run(seen, found, SETTINGS, "springs", "cpu", tmp_path / f"{oracle}" / "fit.json", oracle=oracle)
-        rollout.run(seen, tmp_path / f"{oracle}" / "fit.json", "cpu", tmp_path / f"{oracle}" / "rollout.json")
+        output = tmp_path / f"{oracle}" / "fit.json"
+        job = fit_stage.job(observations=seen, search=found, settings=SETTINGS, device="cpu", output=output, oracle=oracle)
+        keys[oracle] = prepared(**job.arguments)[2]
+        fit_stage(
+            observations=seen,
+            search=found,
+            settings=SETTINGS,
+            kind="springs",
+            device="cpu",
+            output=tmp_path / f"{oracle}" / "fit.json",
+            oracle=oracle,
+        )
+        rollout(
+            observations=seen,
+            learned=tmp_path / f"{oracle}" / "fit.json",
+            device="cpu",
+            output=tmp_path / f"{oracle}" / "rollout.json",
+        )
     assert keys[False] != keys[True]
     for name in ("fit", "rollout"):
         normal, seeing = (StageRecord.load(tmp_path / f"{oracle}" / f"{name}.json") for oracle in (False, True))
-        assert "oracle" not in normal.settings
+        assert not normal.settings.get("oracle")
         assert seeing.settings["oracle"] is True
     frames = [StageRecord.load(tmp_path / f"{oracle}" / "fit.json").facts["spring_updates"] for oracle in (False, True)]
     scenario = small.observations().scenario
@@ -123,15 +141,21 @@ def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
     seen, found = started / "observations.npz", started / "search.json"
     settings = json.dumps({"fit": config.plain(SETTINGS.fit)})
     names = ["normal", "oracle", "oracle_again"]
-    rows = [
-        fits.Row(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names
-    ]
-    fits.run(seen, rows, "cpu", tmp_path / "fits.json")
-    companies = StageRecord.load(tmp_path / "fits.json").facts["companies"]
-    assert companies == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
+    rows = [Row(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names]
+    fits(observations=seen, rows=json.dumps([asdict(row) for row in rows]), device="cpu", output=tmp_path / "fits.json")
+    batches = StageRecord.load(tmp_path / "fits.json").facts["batches"]
+    assert batches == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
     twins = []
     for folder in (tmp_path / "oracle", tmp_path / "alone"):
-        fit_stage.run(seen, found, SETTINGS, "springs", "cpu", folder / "fit.json", oracle=True)
+        fit_stage(
+            observations=seen,
+            search=found,
+            settings=SETTINGS,
+            kind="springs",
+            device="cpu",
+            output=folder / "fit.json",
+            oracle=True,
+        )
         twins.append(Twin.load(folder / "twin.npz"))
         history = pd.read_parquet(folder / "history.parquet")
         assert len(history)

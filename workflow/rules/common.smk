@@ -17,7 +17,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.provenance import code_digest
 from neuspring.experiments import needs
 from neuspring.experiments.arguments import Arguments
-from neuspring.experiments.inputs import Inputs, one_of, options
+from neuspring.experiments.graph import Graph, one_of
 from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
 
@@ -59,7 +59,7 @@ GPU = int(
     CONFIG.device == "cuda" or (CONFIG.device == "auto" and (CLUSTER or bool(POOL)))
 )
 BENCHMARK = dataclasses.replace(BENCHMARK, on_gpu=bool(GPU))
-INPUTS = Inputs(BENCHMARK)
+GRAPH = Graph(BENCHMARK)
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
 GPU_FIRST = 10 * GPU
@@ -113,32 +113,6 @@ def log_of(stage, name):
     return f"{RESULTS}/logs/{stage}/{name}.log"
 
 
-def gpu(stage):
-    """1 for jobs that take a GPU where there is one."""
-    return lambda wildcards: int(GPU and INPUTS.gpu(stage, wildcards))
-
-
-def settings_of(stage):
-    return lambda wildcards: INPUTS.settings(stage, wildcards)
-
-
-def code_of(stage):
-    return lambda wildcards: INPUTS.code(stage, wildcards)
-
-
-def masks_of(wildcards):
-    return INPUTS.of_cameras(wildcards, "masks.json")
-
-
-def tracks_of(wildcards):
-    return INPUTS.of_cameras(wildcards, "tracks.json")
-
-
-def files_if(applies, ask):
-    """Files of a job, where a condition holds for it; none otherwise."""
-    return lambda wildcards: ask(wildcards) if applies(wildcards) else []
-
-
 def section(name):
     """A section of the configuration, as the JSON text that a command takes."""
     return json.dumps({name: settings.plain(CONFIG)[name]}, sort_keys=True)
@@ -155,13 +129,16 @@ def common_job(command, gpus=False):
     return wrapped("--gpus {resources.gpu}" if gpus else "--quiet", command)
 
 
-def scenario_job(command):
-    return wrapped("--scenario {wildcards.scenario}", command)
-
-
-def gpu_job(command):
-    """A job of a scenario that may take a GPU."""
+def stage_job(stage):
+    """A job of a stage: its command, and where it runs, which changes no result and so runs nothing again."""
+    places = {
+        "device": CONFIG.device,
+        "threads": "{threads}",
+        "twins_per_launch": CONFIG.twins_per_launch,
+    }
+    where = [f"--{name.replace('_', '-')} {places[name]}" for name in stage.places]
+    gpus = "--gpus {resources.gpu}" if stage.gpu != "never" else ""
     return wrapped(
-        "--scenario {wildcards.scenario} --gpus {resources.gpu}",
-        f"{command} --threads {{threads}} --device {CONFIG.device}",
+        f"--scenario {{wildcards.scenario}} {gpus}",
+        " ".join(["{params.command}", *where, "--output {output:q}"]),
     )

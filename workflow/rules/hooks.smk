@@ -41,7 +41,9 @@ def begin():
             for job in workflow.dag.needrun_jobs(exclude_finished=False)
             if len(job.log)
         ]
-        RUN.overview = messages.Overview(Path(RESULTS), [Path(job.log[0]) for job in jobs])
+        RUN.overview = messages.Overview(
+            Path(RESULTS), [Path(job.log[0]) for job in jobs]
+        )
         RUN.overview.start()
     if not CLUSTER:
         WARM.parent.mkdir(mode=0o700)
@@ -69,7 +71,7 @@ if workflow.is_main_process:
 def finish():
     end()
     messages.finished(
-        BENCHMARK, ARGUMENTS, INPUTS.logged_runs(), time.monotonic() - RUN.begun
+        BENCHMARK, ARGUMENTS, GRAPH.logged_runs(), time.monotonic() - RUN.begun
     )
 
 

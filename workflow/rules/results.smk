@@ -1,39 +1,30 @@
-# Scores, tables, report, and MLflow, which is an index of the records: its rules never fail a run, and no number depends on them.
-rule score:
+# Tables, report, and MLflow, which is an index of the records: its rules never fail a run, and no number depends on them.
+rule perception_table:
     input:
-        observations=rules.observe.output,
-        search=INPUTS.search,
-        fit=INPUTS.fit,
-        train=INPUTS.train,
-        rollout=rules.rollout.output,
-        appearance=INPUTS.appearance,
-        render=INPUTS.render,
+        [
+            f"{RESULTS}/{name}/perception/judged.json"
+            for name in GRAPH.judged(CONFIG.scenarios)
+        ],
     output:
-        f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/run.json",
+        PERCEPTION_TABLE,
     log:
-        log_of("score", "{scenario}/{method}/{seed}"),
+        log_of("perception_table", CONFIG.tables),
     conda:
         ENVIRONMENT
     resources:
-        mem_mb=NEEDS.memory("score"),
-        runtime=NEEDS.minutes("score"),
+        mem_mb=NEEDS.memory("perception_table"),
+        runtime=NEEDS.minutes("perception_table"),
     params:
-        stages=lambda wildcards, input: options(
-            input, **{name: f"--{name}" for name in STAGES if name != "observe"}
-        ),
-        variant=INPUTS.variant,
-        code=code_of("score"),
+        arguments=ARGUMENTS.perception(GRAPH.judged(BENCHMARK.whole.scenarios)),
+        code=code_digest("neuspring.report.tables.perception"),
     shell:
-        scenario_job(
-            "score --observations {input.observations:q} {params.stages:q} --method {wildcards.method}"
-            " --variant {params.variant:q} --seed {wildcards.seed} --output {output:q}"
-        )
+        common_job("perception-table {params.arguments:q} --output {output:q}")
 
 
 rule tables:
     input:
-        runs=INPUTS.runs(),
-        transfers=INPUTS.transfers(),
+        runs=GRAPH.runs(),
+        transfers=GRAPH.transfers(),
     output:
         TABLES,
     log:
@@ -52,7 +43,7 @@ rule tables:
 
 rule study:
     input:
-        lambda wildcards: INPUTS.runs(BENCHMARK.methods_of(wildcards.study)),
+        lambda wildcards: GRAPH.runs(BENCHMARK.methods_of(wildcards.study)),
     output:
         f"{TABLE_FOLDER}/studies/{{study}}.md",
     log:
@@ -76,7 +67,7 @@ rule report:
     input:
         tables=TABLES,
         studies=expand(rules.study.output, study=CONFIG.studies),
-        perception=[PERCEPTION_TABLE] if INPUTS.judged(CONFIG.scenarios) else [],
+        perception=[PERCEPTION_TABLE] if GRAPH.judged(CONFIG.scenarios) else [],
     output:
         REPORT,
     log:
@@ -117,7 +108,7 @@ rule track_init:
 rule log_run:
     input:
         store=rules.track_init.output,
-        record=rules.score.output,
+        record=f"{RESULTS}/{STAGES['score'].output}",
     output:
         f"{RESULTS}/{{scenario}}/{{method}}/{{seed}}/mlflow.txt",
     log:
@@ -131,8 +122,9 @@ rule log_run:
         settings=section("tracking"),
         results=lambda wildcards, input: str(Path(input.store[0]).parent),
     shell:
-        scenario_job(
-            "log --record {input.record:q} --results {params.results:q} --settings {params.settings:q} --output {output:q}"
+        wrapped(
+            "--scenario {wildcards.scenario}",
+            "log --record {input.record:q} --results {params.results:q} --settings {params.settings:q} --output {output:q}",
         )
 
 
@@ -148,4 +140,4 @@ for study_name in BENCHMARK.studies:
             study_name
         input:
             f"{TABLE_FOLDER}/studies/{study_name}.md",
-            INPUTS.logged_runs(BENCHMARK.methods_of(study_name)),
+            GRAPH.logged_runs(BENCHMARK.methods_of(study_name)),

@@ -29,7 +29,7 @@ from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.experiments.tuning.space import Plan
-from neuspring.stages import search as search_stage
+from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
 
 Report = Callable[[int, float, str], None]
@@ -164,7 +164,7 @@ def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: s
             write_text(
                 place / "settings.json", json.dumps({"scenario": scene.name, "clusters": clusters, **values}, indent=1) + "\n"
             )
-            search_stage.run(scene.head, settings, clusters, seed, device, record)
+            search_stage(observations=scene.head, settings=settings, clusters=clusters, seed=seed, device=device, output=record)
     return record
 
 

@@ -10,7 +10,9 @@ from neuspring.data.capture import HANDS, OBJECT
 from neuspring.perception.color import FirstFrame, lift_color, silhouettes
 from neuspring.perception.color_hands import along_arms, follow_hands, grips
 from neuspring.perception.results import PixelTracks
-from neuspring.stages import lift, segment, track
+from neuspring.stages.lift import lift
+from neuspring.stages.segment import segment
+from neuspring.stages.track import track
 from tests.support.colored import paint
 
 SIZE = 240
@@ -157,9 +159,22 @@ def test_nothing_of_the_object_is_read_in_future_frames(tmp_path):
     for name, spoiled in (("plain", False), ("spoiled", True)):
         capture = paint(tmp_path / name, spoiled=spoiled)
         out = tmp_path / f"{name}_out"
-        segment.run(capture.folder, "0", Config(), "cpu", out / "masks.json")
-        track.run(capture.folder, "0", out / "masks.json", Config(), "cpu", out / "tracks.json")
-        lift.run(capture.folder, [out / "masks.json"], [out / "tracks.json"], Config(), out / "lifted.json")
+        segment(capture=capture.folder / "capture.json", camera="0", settings=Config(), device="cpu", output=out / "masks.json")
+        track(
+            capture=capture.folder / "capture.json",
+            camera="0",
+            masks=out / "masks.json",
+            settings=Config(),
+            device="cpu",
+            output=out / "tracks.json",
+        )
+        lift(
+            capture=capture.folder / "capture.json",
+            masks=[out / "masks.json"],
+            tracks=[out / "tracks.json"],
+            settings=Config(),
+            output=out / "lifted.json",
+        )
         made.append({file: np.load(out / file) for file in ("image.npz", "lifted.npz")})
     for file, arrays in made[0].items():
         for name in arrays.files:

@@ -1,0 +1,394 @@
+"""The jobs of a benchmark: for a stage and the wildcards of a job its inputs, options, settings and code.
+
+A stage's signature says what it reads; here stands where that lies in the results folder, and what the rows of a configuration give
+it. The workflow's one rule per stage asks `inputs`, `command` and `stamp`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from neuspring.baselines import BASELINES
+from neuspring.config import Config, Search, SpringField, plain
+from neuspring.config.images import Appearance
+from neuspring.core.errors import InputError
+from neuspring.core.provenance import code_digest
+from neuspring.data.sources import SOURCES
+from neuspring.experiments import benchmark as benchmarks
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.perception.backends import BACKENDS
+from neuspring.scores.lpips_weights import configured
+from neuspring.stages import STAGES
+from neuspring.stages.stage import Stage
+
+SPLATS = "appearance"
+"""Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
+REGIONS_ONLY = ("tied_rollouts", "freed_sigma")
+"""Settings of the search that concern nothing where there is one region."""
+Files = str | list[str]
+
+
+def one_of(names: Sequence[str]) -> str:
+    """A pattern of exactly these names; of none, one that matches nothing."""
+    return "|".join(map(re.escape, names)) or "(?!)"
+
+
+class Graph:
+    """Answers for the jobs of one benchmark."""
+
+    def __init__(self, benchmark: Benchmark) -> None:
+        self.benchmark, self.config = benchmark, benchmark.config
+        self.results = benchmark.config.results
+        self._texts: dict[tuple[str, str, str], str] = {}
+
+    # --- which jobs there are
+
+    def constraints(self, stage: Stage) -> dict[str, str]:
+        """Patterns of a stage's wildcards, where they are narrower than those of all rules."""
+        rows = self.benchmark.methods.items()
+        sources = {name: self.benchmark.source(name) for name in self.benchmark.scenarios}
+        trained = {name for name, baseline in BASELINES.items() if baseline.trained}
+        return {
+            "capture": {"scenario": one_of([name for name, source in sources.items() if source.write_capture])},
+            "judge": {"scenario": one_of([name for name, source in sources.items() if source.has_truth])},
+            "rollout": {"method": one_of([name for name, row in rows if row.search])},
+            "predict": {"method": one_of([name for name, row in rows if row.model])},
+            "train": {"method": one_of([name for name, row in rows if row.model in trained])},
+            "appearance": {"looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in self.benchmark.splats)])},
+        }.get(stage.name, {})
+
+    def judged(self, names: Sequence[str]) -> dict[str, str]:
+        """Scenarios whose truth is known, and their categories."""
+        rows = self.benchmark.whole_scenarios
+        return {name: rows[name].category for name in names if SOURCES[rows[name].source].has_truth}
+
+    def runs(self, methods: Sequence[str] | None = None) -> list[str]:
+        """The records of all runs, or of those of some methods."""
+        return [
+            self._output("score", scenario=scenario, method=method, seed=seed)
+            for scenario in self.config.scenarios
+            for method in (self.config.methods if methods is None else methods)
+            if self.benchmark.applies(method, scenario)
+            for seed in self.config.seeds
+        ]
+
+    def logged_runs(self, methods: Sequence[str] | None = None) -> list[str]:
+        """Files that say that a run is in MLflow; none where tracking is off."""
+        return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
+
+    def transfers(self) -> list[str]:
+        """Records of transfers: per source, method and seed. Oracles concern their own recording alone, and are not transferred."""
+        methods = [
+            name
+            for name, method in self.benchmark.methods.items()
+            if (method.search or (method.model and BASELINES[method.model].transfers)) and not method.oracle
+        ]
+        return [
+            self._output("transfer", scenario=scenario, method=method, seed=seed)
+            for scenario in self.benchmark.transfers
+            for method in methods
+            if self.benchmark.applies(method, scenario)
+            for seed in self.config.seeds
+        ]
+
+    # --- what a job reads
+
+    def inputs(self, stage: Stage) -> Callable[..., dict[str, Any]]:
+        """Wildcards of a job -> its input files by parameter; `also`: files that it depends on beside them."""
+
+        def found(wildcards: Any) -> dict[str, Any]:
+            files = {name: self._find(stage, name, wildcards) for name in stage.inputs}
+            return {name: paths for name, paths in (files | {"also": self._also(stage, wildcards)}).items() if paths}
+
+        return found
+
+    def _find(self, stage: Stage, name: str, job: Any) -> Files:
+        """The files of a parameter; none where a job goes without."""
+        source = self.benchmark.source(job.scenario)
+        pictured = stage.name not in ("train", "predict") or self.pictured(job)
+        match name:
+            case "capture":
+                wanted = pictured and (source.films or stage.name != "observe")
+                return f"{self.benchmark.capture_folder(job.scenario)}/capture.json" if wanted else []
+            case "masks" | "tracks":
+                if not pictured:
+                    return []
+                maker = next(other for other in STAGES.values() if other.product == name)
+                cameras = self._cameras(job.scenario) if stage.inputs[name].many else [job.camera]
+                return [self._output(maker.name, scenario=job.scenario, camera=camera) for camera in cameras]
+            case "lifted":
+                return self._output("lift", scenario=job.scenario) if source.films else []
+            case "observations":
+                # Perception's record says more than the observations where splats begin.
+                return [] if stage.name == "appearance" and source.films else self._observations(job.scenario)
+            case "pool":
+                others = self.benchmark.pools[job.scenario] if self.benchmark.pool_kind(job) else ()
+                return [self._observations(other) for other in others]
+            case "targets":
+                return [self._observations(target) for target in self.benchmark.transfers[job.scenario]]
+            case "search":
+                method = (self.benchmark.methods | self.benchmark.fits)[job.method]
+                return [] if method.model else self._search(job)
+            case "fit":
+                owner = self.benchmark.fit_of_method.get(job.method)
+                return self._output("fit", scenario=job.scenario, method=owner, seed=job.seed) if owner else []
+            case "train":
+                model = self.benchmark.methods[job.method].model
+                trained = bool(model and BASELINES[model].trained)
+                return self._output("train", scenario=job.scenario, method=job.method, seed=job.seed) if trained else []
+            case "learned":
+                return next(files for maker in ("train", "fit", "search") if (files := self._find(stage, maker, job)))
+            case "appearance":
+                if not (pictured and self.benchmark.has_images(job.scenario)):
+                    return []
+                owner = self.benchmark.splats_of_method.get(job.method)
+                looks = f"{SPLATS}-{owner}" if owner else SPLATS
+                return self._output("appearance", scenario=job.scenario, looks=looks, seed=job.seed)
+            case "render" if not self.benchmark.has_images(job.scenario):
+                return []
+        maker = next(other for other in STAGES.values() if other.product == name)
+        return self._output(maker.name, **{wildcard: getattr(job, wildcard) for wildcard in maker.wildcards})
+
+    def _also(self, stage: Stage, job: Any) -> list[str]:
+        """Files without which a job cannot run, or whose change makes it run again, and which its command does not name."""
+        source, folder = self.benchmark.source(job.scenario), self.benchmark.data_path(job.scenario)
+        match stage.name:
+            case "capture":
+                return [str(folder / name) for name in source.capture_files if folder and (folder / name).exists()]
+            case "observe" if folder and not source.films:
+                if folder.is_file():
+                    return [str(folder)]
+                return [str(folder / name) for name in source.files if (folder / name).exists()]
+            case "lift" if self.config.perception.shape.mesh:
+                return [str(self.config.perception.shape.mesh)]
+            case "fits":
+                return list(dict.fromkeys(self._search(member) for member in self._members(job.scenario)))
+        return []
+
+    def shared_launches(self, job: Any) -> list[str]:
+        """The record of the launches that a fit shared with others, if it is one of several."""
+        together = (job.method, int(job.seed)) in self.benchmark.fits_together(job.scenario)
+        return [self._output("fits", scenario=job.scenario)] if together else []
+
+    def _output(self, stage: str, **wildcards: Any) -> str:
+        return f"{self.results}/{STAGES[stage].output.format(**wildcards)}"
+
+    def _observations(self, scenario: str) -> str:
+        return self._output("observe", scenario=scenario)
+
+    def _search(self, job: Any) -> str:
+        method = (self.benchmark.methods | self.benchmark.fits)[job.method]
+        return self._output("search", scenario=job.scenario, search=method.searched, seed=job.seed)
+
+    def _cameras(self, scenario: str) -> tuple[str, ...]:
+        try:
+            return self.benchmark.cameras(scenario)
+        except InputError:
+            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
+            return ("0",)
+
+    def pictured(self, job: Any) -> bool:
+        """Whether the method is trained on pictures, and moves splats itself."""
+        return job.method in self.benchmark.pictured
+
+    def _members(self, scenario: str) -> list[Any]:
+        pairs = self.benchmark.fits_together(scenario)
+        return [SimpleNamespace(scenario=scenario, method=method, seed=seed) for method, seed in pairs]
+
+    # --- what a job is told
+
+    def command(self, stage: Stage) -> Callable[..., str]:
+        """Wildcards and inputs of a job -> its command line, without where it runs and where it writes."""
+
+        def line(wildcards: Any, input: Any) -> str:
+            files = {name: _paths(input.get(name), parameter.many) for name, parameter in stage.inputs.items()}
+            return shlex.join([stage.name, *stage.words(files | self.options(stage, wildcards)), *self._settings(stage, wildcards)])
+
+        return line
+
+    def _settings(self, stage: Stage, job: Any) -> list[str]:
+        text = self.settings(stage, job)
+        return [] if text == "{}" else ["--settings", text]
+
+    def options(self, stage: Stage, job: Any) -> dict[str, Any]:
+        """The options of a job's stage, by name."""
+        return {name: self._option(name, job) for name in stage.options}
+
+    def _option(self, name: str, job: Any) -> Any:
+        rows = self.benchmark
+        match name:
+            case "row":
+                return plain(rows.scenarios[job.scenario])
+            case "clusters":
+                return rows.searches[job.search].clusters
+            case "leave_out":
+                return rows.pool_kind(job) == "others"
+            case "kind":
+                return rows.fits[job.method].fit
+            case "oracle":
+                return rows.fits[job.method].oracle
+            case "model":
+                return rows.methods[job.method].model
+            case "variant":
+                return self.variant(job)
+            case "rows":
+                return self._rows_of_fits(job.scenario)
+        return getattr(job, name)
+
+    def _rows_of_fits(self, scenario: str) -> str:
+        """The fits of a scenario that share launches, by row of the method table, as JSON."""
+        rows: dict[str, dict[str, Any]] = {}
+        for member in self._members(scenario):
+            method = self.benchmark.fits[member.method]
+            row = {"kind": method.fit, "settings": self.settings(STAGES["fit"], member), "oracle": method.oracle, "fits": {}}
+            made = self._output("fit", scenario=scenario, method=member.method, seed=member.seed)
+            rows.setdefault(member.method, row)["fits"][made] = self._search(member)
+        return _json(list(rows.values()))
+
+    def variant(self, job: Any) -> dict[str, Any]:
+        """The switches of a method, for the record of its run."""
+        method = self.benchmark.methods[job.method]
+        settings = plain(method)["settings"]
+        if method.model:
+            return {"model": method.model, **settings}
+        row = self.benchmark.searches[method.searched]
+        switches: dict[str, Any] = {"search": method.search, "clusters": row.clusters, "fit": method.fit or "none"}
+        switches |= {"pool": method.pool} if method.pool else {}
+        # Named only where it is one: runs of other rows are compared with it nowhere.
+        switches |= {"oracle": True} if method.oracle else {}
+        switches |= {"released_quirks": sorted(key for key, on in row.released_quirks.items() if on)} if row.released_quirks else {}
+        return switches | settings
+
+    def settings(self, stage: Stage, job: Any) -> str:
+        """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
+        own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage.name)
+        # Thousands of jobs share a few texts: those of one source and one row.
+        key = (stage.name, self.benchmark.scenarios[job.scenario].source, getattr(job, own) if own else "")
+        if key not in self._texts:
+            self._texts[key] = _json(stage.settings(self.config_of(stage, job), self._given(stage, job)))
+        return self._texts[key]
+
+    def _given(self, stage: Stage, job: Any) -> dict[str, Any]:
+        """What declarations of a stage ask for: its options, and which inputs there are."""
+        given = self.options(stage, job) if stage.name != "fits" else {}
+        if "row" in given:
+            given["row"] = self.benchmark.scenarios[job.scenario]
+        return given | {name: self._find(stage, name, job) for name in stage.inputs}
+
+    def config_of(self, stage: Stage, job: Any) -> Config:
+        """The configuration of a stage's job: with what the rows of its method and search lay on top.
+
+        What such a row does not read has its default, so that changing it does not run the job again.
+        """
+        config, rows = self.config, self.benchmark
+        if stage.name == "segment" and not rows.source(job.scenario).films:
+            # Processed data have masks; those are taken, whatever segments raw video.
+            given = dataclasses.replace(config.perception.segment, backend="given")
+            return dataclasses.replace(config, perception=dataclasses.replace(config.perception, segment=given))
+        if stage.name == "search":
+            row = rows.searches[job.search]
+            search = benchmarks.search_of(config, row, job.search)
+            if row.clusters == 1:
+                search = dataclasses.replace(search, **{name: getattr(Search(), name) for name in REGIONS_ONLY})
+            return dataclasses.replace(
+                config,
+                search=search,
+                released_quirks=benchmarks.quirks_of(config, row, job.search),
+                losses=benchmarks.losses_of(config, row, job.search),
+            )
+        if stage.name == "fit":
+            method = rows.fits[job.method]
+            fit, name = benchmarks.fit_of(config, method, job.method), method.searched
+            row = rows.searches[name]
+            return dataclasses.replace(
+                config,
+                fit=dataclasses.replace(fit, field=SpringField()) if method.fit == "springs" else fit,
+                released_quirks=benchmarks.quirks_of(config, row, name),
+                losses=benchmarks.losses_of(config, row, name),
+            )
+        if stage.name == "train":
+            method = rows.methods[job.method]
+            section = BASELINES[method.model or ""].section
+            own = benchmarks.section_of(config, method, job.method)
+            return dataclasses.replace(config, baselines=dataclasses.replace(config.baselines, **{section: own}))
+        if stage.name == "appearance":
+            images = dataclasses.replace(config.images, appearance=self.splat_settings(job.looks))
+            return dataclasses.replace(config, images=images)
+        return config
+
+    def splat_settings(self, folder: str) -> Appearance:
+        """How the splats of a folder are trained: those of all methods, or a method's own."""
+        name = folder.removeprefix(f"{SPLATS}-")
+        if name == SPLATS:
+            return self.config.images.appearance
+        return benchmarks.appearance_of(self.config, self.benchmark.splats[name], name)
+
+    # --- what makes a job run again beside its command
+
+    def stamp(self, stage: Stage) -> Callable[..., str]:
+        """Wildcards of a job -> a digest of its code, of images that the user may change, and of optional weights."""
+
+        def digest(wildcards: Any) -> str:
+            config = self.config_of(stage, wildcards)
+            modules = stage.code(config, self._given(stage, wildcards))
+            parts = [code_digest(f"neuspring.stages.{stage.name}", *modules)]
+            if "capture" in stage.inputs or stage.name == "capture":
+                parts.append(self._image_stamps(wildcards.scenario))
+            if stage.name == "render":
+                parts.append("absent" if isinstance(configured(self.config.images.lpips), str) else "found")
+            if stage.name == "train" and self.pictured(wildcards):
+                method = self.benchmark.methods[wildcards.method]
+                section = benchmarks.section_of(self.config, method, wildcards.method)
+                parts.append(BASELINES[method.model or ""].features(section))
+            return " ".join(parts)
+
+        return digest
+
+    def _image_stamps(self, scenario: str) -> str:
+        folder, source = self.benchmark.data_path(scenario), self.benchmark.source(scenario)
+        return _stamps(folder) if folder and (source.films or source.capture_files) else ""
+
+    def gpu(self, stage: Stage) -> Callable[..., int]:
+        """Wildcards of a job -> 1 where it takes a GPU if there is one."""
+
+        def taken(wildcards: Any) -> int:
+            if stage.gpu == "backend":
+                backend = getattr(self.config_of(stage, wildcards).perception, stage.name).backend
+                return int(self.benchmark.on_gpu and BACKENDS[stage.name][backend].gpu)
+            return int(self.benchmark.on_gpu and stage.gpu == "always")
+
+        return taken
+
+
+def _paths(files: Any, many: bool) -> Any:
+    if files is None:
+        return None
+    paths = [files] if isinstance(files, str) else [str(path) for path in files]
+    return paths if many else paths[0]
+
+
+@functools.cache
+def _stamps(folder: Path) -> str:
+    """A digest of names, sizes and times of the images that the user may change, so that changed ones are read again."""
+    digest = hashlib.sha256()
+    kinds = [folder / kind for kind in ("color", "depth", "mask")]
+    # Marks are segmented from as images are.
+    marks = [path for path in [folder / "marks.json"] if path.exists()]
+    for path in sorted([*marks, *(path for kind in kinds for path in kind.rglob("*"))]):
+        # A link without target must not end the planning either: whoever reads it says so.
+        facts = path.stat() if path.exists() else path.lstat()
+        digest.update(f"{path} {facts.st_size} {facts.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _json(values: Any) -> str:
+    return json.dumps(values, sort_keys=True)

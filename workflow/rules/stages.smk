@@ -1,0 +1,37 @@
+# One rule per stage. What a job reads stands in the signature of its function, neuspring/stages/<rule>.py; where that lies, what its
+# options are and what makes it run again: neuspring/experiments/graph.py.
+for STAGE in STAGES.values():
+
+    rule:
+        name:
+            STAGE.name
+        input:
+            unpack(GRAPH.inputs(STAGE)),
+            **(
+                {
+                    # Their checkpoints, from which a fit goes on, are those that it would have left alone.
+                    "shared": lambda wildcards: [
+                        ancient(path) for path in GRAPH.shared_launches(wildcards)
+                    ]
+                }
+                if STAGE.name == "fit"
+                else {}
+            ),
+        output:
+            f"{RESULTS}/{STAGE.output}",
+        log:
+            log_of(STAGE.name, "/".join(f"{{{name}}}" for name in STAGE.wildcards)),
+        wildcard_constraints:
+            **GRAPH.constraints(STAGE),
+        priority: GPU_FIRST if STAGE.gpu != "never" else 0
+        conda:
+            ENVIRONMENT
+        resources:
+            **({"gpu": GRAPH.gpu(STAGE)} if STAGE.gpu != "never" else {}),
+            mem_mb=NEEDS.memory(STAGE.name),
+            runtime=NEEDS.minutes(STAGE.name),
+        params:
+            command=GRAPH.command(STAGE),
+            stamp=GRAPH.stamp(STAGE),
+        shell:
+            stage_job(STAGE)
