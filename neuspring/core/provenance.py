@@ -17,7 +17,9 @@ from pathlib import Path
 
 PACKAGE = "neuspring"
 ROOT = Path(__file__).parents[1]
-NOT_NUMERICS = tuple(f"{PACKAGE}.{name}" for name in ("config", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage"))
+NOT_NUMERICS = tuple(
+    f"{PACKAGE}.{name}" for name in ("config", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
+)
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
 
 

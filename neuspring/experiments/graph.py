@@ -280,6 +280,8 @@ class Graph:
     def _given(self, stage: Stage, job: Any) -> dict[str, Any]:
         """What declarations of a stage ask for: its options, and which inputs there are."""
         given = self.options(stage, job) if stage.name != "fits" else {}
+        method = self.benchmark.methods.get(getattr(job, "method", ""))
+        given |= {"model": method.model} if method else {}
         if "row" in given:
             given["row"] = self.benchmark.scenarios[job.scenario]
         return given | {name: self._find(stage, name, job) for name in stage.inputs}

@@ -19,7 +19,7 @@ shapes fit (empty where the nodes are the same)."""
 @stage(
     output="{scenario}/{method}/{seed}/transfer.json",
     reads=("simulation",),
-    code=lambda settings, given: (BASELINES[given["model"]].module,) if given.get("model") else (),
+    code=lambda settings, given: BASELINES[given["model"]].modules if given.get("model") else (),
     gpu="always",
     minutes=60,
 )

@@ -5,11 +5,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from neuspring.experiments.inputs import Inputs
 
 from neuspring import config
 from neuspring.core import provenance
 from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.graph import Graph
+from neuspring.stages import STAGES
 
 PACKAGE = Path(provenance.__file__).parents[1]
 ROOT = PACKAGE.parent
@@ -85,12 +86,12 @@ def test_modules_that_are_imported_by_name_count(copy):
     """Backends, readers and baselines: the registries name them, and the workflow adds them to the stage that uses them."""
     values = config.read_yaml(ROOT / "config" / "config.yaml")
     config.merge(values, config.read_yaml(ROOT / "config" / "data" / "demo.yaml"))
-    inputs = Inputs(Benchmark.of(values, ROOT))
-    job = SimpleNamespace(scenario=inputs.config.scenarios[0], camera="0", method=inputs.config.methods[0], seed=0)
+    graph = Graph(Benchmark.of(values, ROOT))
+    job = SimpleNamespace(scenario=graph.config.scenarios[0], camera="0", method=graph.config.methods[0], seed=0)
 
     def now(stage: str) -> str:
         clear()
-        return inputs.code(stage, job)
+        return graph.stamp(STAGES[stage])(job)
 
     before = {stage: now(stage) for stage in ("segment", "track", "lift")}
     edit(copy / "perception" / "segment_opencv.py", "import cv2", "import cv2\n\nADDED = 1")

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import yaml
-from neuspring.experiments.inputs import Inputs
 
 from neuspring import config
 from neuspring.config import Config, Method, SearchRow, parse
@@ -21,9 +20,11 @@ from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.graph import Graph
 from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.studies import read_studies
+from neuspring.stages import STAGES
 from tests.support.captures import describe
 from tests.support.colored import paint
 from tests.support.project import config_with
@@ -366,24 +367,26 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
     assert list(made.searches) == ["uniform", "uniform-all", "uniform-others"]
     assert made.fit_of_method == {"full": "full", "one": "one", "two": "two"}
-    inputs = Inputs(made)
+    graph = Graph(made)
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
-    assert [inputs.search_of_fit(job) for job in jobs.values()] == [
+    found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
+    assert [files["search"] for files in found] == [
         f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-others")
     ]
     others = ["results/b/observations.npz", "results/c/observations.npz"]
-    assert [inputs.pool(job) for job in jobs.values()] == [[], others, others]
-    words = [inputs.pool_options(SimpleNamespace(scenario="a", search=name)) for name in made.searches]
-    assert words == ["", f"--pool {' '.join(others)}", f"--pool {' '.join(others)} --leave-out"]
-    assert [inputs.pool_options(job) for job in jobs.values()] == words
-    assert [json.loads(inputs.variant(job)).get("pool") for job in jobs.values()] == [None, "all", "others"]
-    assert json.loads(inputs.variant(jobs["one"]))["clusters"] == 1
+    assert [files.get("pool", []) for files in found] == [[], others, others]
+    searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
+    assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others, others]
+    assert [graph.options(STAGES["search"], job)["leave_out"] for job in searches] == [False, False, True]
+    assert [graph.options(STAGES["fit"], job)["leave_out"] for job in jobs.values()] == [False, False, True]
+    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "others"]
+    assert graph.variant(jobs["one"])["clusters"] == 1
 
 
 def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) -> None:
     made = pooled(tmp_path, scenarios=["a", "cloth"])
     assert made.whole_left_out == {"one": ("cloth",), "two": ("cloth",)}
-    assert [path for path in Inputs(made).runs() if "cloth" in path] == ["results/cloth/full/0/run.json"]
+    assert [path for path in Graph(made).runs() if "cloth" in path] == ["results/cloth/full/0/run.json"]
     assert made.applies("one", "a")
 
 
@@ -394,13 +397,13 @@ def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path
     made = pooled(tmp_path, method_table="more.yaml", methods=["one", "oracle"])
     assert list(made.searches) == ["uniform-all"], "no search alone is needed"
     assert made.fit_of_method == {"one": "one", "oracle": "oracle"}
-    inputs = Inputs(made)
+    graph = Graph(made)
     jobs = [SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods]
-    assert [(json.loads(inputs.variant(job)).get("oracle"), json.loads(inputs.variant(job))["pool"]) for job in jobs] == [
+    assert [(graph.variant(job).get("oracle"), graph.variant(job)["pool"]) for job in jobs] == [
         (None, "all"),
         (True, "all"),
     ]
-    assert "released_quirks" in json.loads(inputs.settings("fit", jobs[1]))
+    assert "released_quirks" in json.loads(graph.settings(STAGES["fit"], jobs[1]))
 
 
 def test_fits_on_a_pool_share_no_launches(tmp_path: Path) -> None:
@@ -581,10 +584,10 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
 
 def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
     values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "released_search", "phystwin_released"], "seeds": [0]}
-    inputs = Inputs(Benchmark.of(values, ROOT))
+    graph = Graph(Benchmark.of(values, ROOT))
 
     def settings(stage: str, **job: str) -> dict[str, Any]:
-        found = json.loads(inputs.settings(stage, SimpleNamespace(scenario="toy_rope_lift_smooth", seed="0", **job)))
+        found = json.loads(graph.settings(STAGES[stage], SimpleNamespace(scenario="toy_rope_lift_smooth", seed="0", **job)))
         parse(Config, found, "what the command reads")
         return found
 
@@ -594,9 +597,9 @@ def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
     assert not any(settings("search", search="released_uniform")["released_quirks"].values())
     fitted = settings("fit", method="phystwin_released")["fit"]
     assert (fitted["horizon"], fitted["learning_rate"]) == (1, 1e-3)
-    variant = json.loads(inputs.variant(SimpleNamespace(method="phystwin_released")))
+    variant = graph.variant(SimpleNamespace(method="phystwin_released"))
     assert variant["released_quirks"] == sorted(config.plain(config.ReleasedQuirks()))
-    assert "released_quirks" not in json.loads(inputs.variant(SimpleNamespace(method="baseline")))
+    assert "released_quirks" not in graph.variant(SimpleNamespace(method="baseline"))
 
 
 def test_the_released_rows_have_the_released_search() -> None:

@@ -13,8 +13,9 @@ from neuspring import config
 from neuspring.config import Method, parse
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.inputs import Inputs
+from neuspring.experiments.graph import Graph
 from neuspring.experiments.tuning.space import Plan
+from neuspring.stages import STAGES
 
 ROOT = Path(__file__).parents[2]
 NAMES = ["baseline", "neuspring", "oracle_neuspring"]
@@ -31,8 +32,8 @@ def job(name: str) -> SimpleNamespace:
 
 
 def test_records_name_oracles_and_leave_other_rows_as_they_were():
-    inputs = Inputs(benchmark())
-    variants = {name: json.loads(inputs.variant(job(name))) for name in NAMES}
+    graph = Graph(benchmark())
+    variants = {name: graph.variant(job(name)) for name in NAMES}
     assert {name for name, variant in variants.items() if "oracle" in variant} == {"oracle_neuspring"}
     assert variants["oracle_neuspring"]["oracle"] is True
     assert variants["baseline"] == {
@@ -46,16 +47,16 @@ def test_records_name_oracles_and_leave_other_rows_as_they_were():
 def test_an_oracles_fit_is_its_own_though_its_settings_are_those_of_another():
     made = benchmark(seeds=[0, 1, 2])
     assert made.fit_of_method["oracle_neuspring"] == "oracle_neuspring"
-    inputs = Inputs(made)
-    assert inputs.settings("fit", job("oracle_neuspring")) == inputs.settings("fit", job("neuspring"))
-    assert inputs.search(job("oracle_neuspring")) == inputs.search(job("neuspring"))
-    together = json.loads(inputs.rows_of_fits(SimpleNamespace(scenario=SCENES[0])))
+    graph = Graph(made)
+    assert graph.settings(STAGES["fit"], job("oracle_neuspring")) == graph.settings(STAGES["fit"], job("neuspring"))
+    assert graph.inputs(STAGES["fit"])(job("oracle_neuspring")) == graph.inputs(STAGES["fit"])(job("neuspring"))
+    together = json.loads(graph.options(STAGES["fits"], SimpleNamespace(scenario=SCENES[0]))["rows"])
     assert [bool(row.get("oracle")) for row in together] == [False, False, True]
 
 
 def test_oracles_are_not_transferred():
     made = benchmark(transfers={SCENES[0]: [SCENES[1]]})
-    assert {path.split("/")[-3] for path in Inputs(made).transfers()} == {"baseline", "neuspring"}
+    assert {path.split("/")[-3] for path in Graph(made).transfers()} == {"baseline", "neuspring"}
 
 
 def test_no_sweep_chooses_by_an_oracle():
