@@ -226,7 +226,7 @@ class Graph:
     def _option(self, name: str, job: Any) -> Any:
         rows = self.benchmark
         match name:
-            case "row":
+            case "scenario":
                 return plain(rows.scenarios[job.scenario])
             case "clusters":
                 return rows.searches[job.search].clusters
@@ -282,8 +282,8 @@ class Graph:
         given = self.options(stage, job) if stage.name != "fits" else {}
         method = self.benchmark.methods.get(getattr(job, "method", ""))
         given |= {"model": method.model} if method else {}
-        if "row" in given:
-            given["row"] = self.benchmark.scenarios[job.scenario]
+        if "scenario" in given:
+            given["scenario"] = self.benchmark.scenarios[job.scenario]
         return given | {name: self._find(stage, name, job) for name in stage.inputs}
 
     def config_of(self, stage: Stage, job: Any) -> Config:

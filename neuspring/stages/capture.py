@@ -11,13 +11,13 @@ from neuspring.stages.stage import stage
 
 @stage(
     output="{scenario}/capture/capture.json",
-    reads=lambda settings, given: SOURCES[given["row"].source].reads,
-    code=lambda settings, given: (SOURCES[given["row"].source].importer,),
+    reads=lambda settings, given: SOURCES[given["scenario"].source].reads,
+    code=lambda settings, given: (SOURCES[given["scenario"].source].importer,),
     minutes=120,
 )
-def capture(row: ScenarioRow, settings: Config, output: Path) -> None:
+def capture(scenario: ScenarioRow, settings: Config, output: Path) -> None:
     """Synthetic scene or PhysTwin's raw layout -> capture folder, whose capture.json is `output`.
 
     The truth of a synthetic scene lies beside the folder and is never read by a method.
     """
-    write_capture(row, settings, output.parent)
+    write_capture(scenario, settings, output.parent)

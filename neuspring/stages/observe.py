@@ -15,22 +15,22 @@ from neuspring.stages.stage import stage
 @stage(
     output="{scenario}/observations.npz",
     reads=lambda settings, given: (
-        ("perception.sample", "perception.seed") if SOURCES[given["row"].source].films else SOURCES[given["row"].source].reads
+        ("perception.sample", "perception.seed") if SOURCES[given["scenario"].source].films else SOURCES[given["scenario"].source].reads
     ),
-    code=lambda settings, given: () if SOURCES[given["row"].source].films else (SOURCES[given["row"].source].module,),
+    code=lambda settings, given: () if SOURCES[given["scenario"].source].films else (SOURCES[given["scenario"].source].module,),
 )
-def observe(row: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None) -> None:
+def observe(scenario: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None) -> None:
     """Capture, or processed data -> observations.npz; of a toy scene also truth.npz beside it, which no method reads.
 
     Raw video has been perceived before: `capture` and `lifted` are what came of it. Then a record with what was noticed lies beside
     the observations. Raises InputError for observations that no method can work with.
     """
-    if not SOURCES[row.source].films:
-        read_observations(row, settings, output).save(output)
+    if not SOURCES[scenario.source].films:
+        read_observations(scenario, settings, output).save(output)
         return
     if capture is None or lifted is None:
-        rule = f"scenarios of source {row.source} need --capture and --lifted"
-        raise InputError(f"scenario {row.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
+        rule = f"scenarios of source {scenario.source} need --capture and --lifted"
+        raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     from neuspring.core.artifacts import ImageObservations
     from neuspring.core.findings import refuse_errors, told
     from neuspring.perception.sample import assemble
@@ -40,7 +40,7 @@ def observe(row: ScenarioRow, settings: Config, output: Path, capture: Capture |
     record = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted.path})
     points, prior = LiftedTracks.load(lifted.file("lifted")), ShapePrior.load(lifted.file("shape"))
     image = ImageObservations.load(lifted.file("image")) if lifted.has("image") else None
-    observations = assemble(row, capture, points, prior, settings.perception, image)
+    observations = assemble(scenario, capture, points, prior, settings.perception, image)
     findings = look_at_observations(observations)
     facts = told(findings)
     # Before the observations are there: what no method can work with starts no search.

@@ -386,10 +386,10 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
     from neuspring.data.sources import read_scenarios
 
     if text.lstrip().startswith("{"):
-        return config.parse(ScenarioRow, json_value("--row", text), "--row")
+        return config.parse(ScenarioRow, json_value("--scenario", text), "--scenario")
     rows = read_scenarios(Path(settings.scenario_table))
     if text not in rows:
-        raise InputError("--row", f"must be a row of {settings.scenario_table}, or JSON", text)
+        raise InputError("--scenario", f"must be a row of {settings.scenario_table}, or JSON", text)
     return rows[text]
 
 

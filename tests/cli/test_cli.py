@@ -35,7 +35,7 @@ def observed(folder):
     row = {"scenario": "tiny", "source": "toy", "category": "rope", "path": "rope/lift/smooth"}
     row |= {"self_collision": False, "ground": True}
     path = folder / "observations.npz"
-    assert main(["observe", "--row", json.dumps(row), "--settings", json.dumps(TINY), "--output", str(path)]) == 0
+    assert main(["observe", "--scenario", json.dumps(row), "--settings", json.dumps(TINY), "--output", str(path)]) == 0
     return path
 
 
@@ -64,6 +64,7 @@ def test_a_number_of_regions_that_cannot_be_is_bad_input(clusters, tmp_path, cap
     [
         ["fit", "--kind", "network", "--observations", "x.npz", "--search", "x.json", "--output", "y.json"],
         ["search", "--clusters", "two", "--observations", "x.npz", "--output", "y.json"],
+        ["search", "--twins-per-launch", "many", "--observations", "x.npz", "--output", "y.json"],
     ],
 )
 def test_words_that_are_no_option_end_with_status_2(arguments, capsys):
@@ -77,9 +78,8 @@ def test_words_that_are_no_option_end_with_status_2(arguments, capsys):
     ("arguments", "message"),
     [
         (["observe", "--scenario", "nothing", "--output", "x.npz"], "--scenario: must be a row of config/scenarios.tsv"),
-        (["observe", "--row", "{", "--output", "x.npz"], "--row: must be JSON"),
-        (["observe", "--row", "[]", "--output", "x.npz"], "--row: must be a JSON object; received list"),
-        (["observe", "--row", "{}", "--output", "x.npz"], "scenario: required, but missing"),
+        (["observe", "--scenario", "{", "--output", "x.npz"], "--scenario: must be JSON"),
+        (["observe", "--scenario", "{}", "--output", "x.npz"], "scenario: required, but missing"),
         (["observe", "--scenario", "x", "--settings", '{"toy": {"framez": 3}}', "--output", "x.npz"], "toy.framez: unknown key"),
         (["observe", "--scenario", "x", "--settings", "no.yaml", "--output", "x.npz"], "no.yaml: this file must be readable"),
         (["search", "--observations", "no.npz", "--output", "x.json"], "no.npz: this file must be readable; received No such file"),
@@ -125,21 +125,23 @@ def test_a_search_knows_how_many_candidates_and_threads_it_may_take(tmp_path, mo
         asked.append((problem.together, problem.threads))
         raise NumericalFailure("stopped")
 
-    monkeypatch.setattr("neuspring.stages.search.search", stop)
+    monkeypatch.setattr("neuspring.twin.search.search", stop)
     arguments = ["--observations", str(observed(tmp_path)), "--device", "cpu", "--output", str(tmp_path / "search.json")]
     assert main(["search", *arguments, *options]) == 0
     assert asked == [(together, threads)]
 
 
-@pytest.mark.parametrize("word", ["0", "-1", "many", "1.5", "", "1e3", "Auto"])
-def test_a_number_of_twins_per_launch_that_cannot_be_is_bad_input(word, tmp_path, capsys):
-    assert main(["search", "--observations", "x.npz", f"--twins-per-launch={word}", "--output", str(tmp_path / "y.json")]) == 2
-    assert f"--twins-per-launch: must be auto or an integer of at least 1; received {word!r}" in capsys.readouterr().err
-
-
-def test_a_search_without_threads_is_bad_input(tmp_path, capsys):
-    assert main(["search", "--observations", "x.npz", "--threads", "0", "--output", str(tmp_path / "y.json")]) == 2
-    assert "--threads: must be at least 1; received 0" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--twins-per-launch", "0"], "--twins-per-launch: must be auto or an integer of at least 1; received 0"),
+        (["--threads", "0"], "--threads: must be at least 1; received 0"),
+    ],
+)
+def test_a_search_without_threads_or_twins_is_bad_input(words, message, tmp_path, capsys):
+    arguments = ["search", "--observations", str(observed(tmp_path)), *words, "--device", "cpu", "--output", str(tmp_path / "y.json")]
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_libraries_take_the_threads_that_a_command_does_not_take_itself():

@@ -35,7 +35,7 @@ ROWS = {"springs": SETTINGS.fit, "field": SETTINGS.fit, "ten": replace(SETTINGS.
 def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations, and the searches of two seeds."""
     folder = tmp_path_factory.mktemp("started")
-    observe(row=small.row(), settings=SETTINGS, output=folder / "observations.npz")
+    observe(scenario=small.row(), settings=SETTINGS, output=folder / "observations.npz")
     for seed in (0, 1):
         search(
             observations=folder / "observations.npz",

@@ -91,7 +91,7 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
     own = film(tmp_path / "own", cameras=2, up="-z", train_end=4)
     case = write_raw(own, tmp_path / "data" / "thing")
     row = ScenarioRow(scenario="film", source="phystwin_raw", category="toy", path="thing", self_collision=False, ground=True)
-    capture(row=row, settings=replace(SETTINGS, data_root=str(case.parent)), output=tmp_path / "imported" / "capture.json")
+    capture(scenario=row, settings=replace(SETTINGS, data_root=str(case.parent)), output=tmp_path / "imported" / "capture.json")
     imported = Capture.load(tmp_path / "imported")
     assert imported.train_end == 4
     expected, found = perceived(own, tmp_path / "a"), perceived(imported, tmp_path / "b", row)
@@ -171,7 +171,7 @@ def test_too_few_controllers_say_what_to_change(tmp_path, whole):
 
 def test_raw_video_must_be_perceived_first(tmp_path):
     with pytest.raises(InputError, match="need --capture and --lifted"):
-        observe(row=ROW, settings=SETTINGS, output=tmp_path / "observations.npz")
+        observe(scenario=ROW, settings=SETTINGS, output=tmp_path / "observations.npz")
 
 
 def test_records_are_plain_json(whole):

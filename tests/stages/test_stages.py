@@ -43,7 +43,7 @@ def run_all(folder, name="small", *, method="phystwin", settings=SETTINGS):
     seen, found = folder / name / "observations.npz", folder / name / searched / "0" / "search.json"
     out = folder / name / method / "0"
     if not seen.exists():
-        observe(row=small.row(name=name), settings=settings, output=seen)
+        observe(scenario=small.row(name=name), settings=settings, output=seen)
     if not found.exists():
         search(observations=seen, settings=settings, clusters=clusters, seed=0, device="cpu", output=found)
     records = {"search": found}

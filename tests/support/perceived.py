@@ -42,7 +42,7 @@ def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: 
         )
     lift(capture=capture.folder / "capture.json", masks=masks, tracks=tracks, settings=settings, output=folder / "lifted.json")
     observe(
-        row=row,
+        scenario=row,
         settings=settings,
         output=folder / "observations.npz",
         capture=capture.folder / "capture.json",
