@@ -24,8 +24,8 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
     from neuspring.core.findings import told
     from neuspring.perception import figures
     from neuspring.perception.color import from_color
-    from neuspring.perception.lift import lift as lift_points
     from neuspring.perception.findings import look_at_lifted
+    from neuspring.perception.lift import lift as lift_points
     from neuspring.perception.results import masks_of_cameras, tracks_of_cameras
     from neuspring.perception.shape import shape_prior
 

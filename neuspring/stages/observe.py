@@ -15,11 +15,15 @@ from neuspring.stages.stage import stage
 @stage(
     output="{scenario}/observations.npz",
     reads=lambda settings, given: (
-        ("perception.sample", "perception.seed") if SOURCES[given["scenario"].source].films else SOURCES[given["scenario"].source].reads
+        ("perception.sample", "perception.seed")
+        if SOURCES[given["scenario"].source].films
+        else SOURCES[given["scenario"].source].reads
     ),
     code=lambda settings, given: () if SOURCES[given["scenario"].source].films else (SOURCES[given["scenario"].source].module,),
 )
-def observe(scenario: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None) -> None:
+def observe(
+    scenario: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None
+) -> None:
     """Capture, or processed data -> observations.npz; of a toy scene also truth.npz beside it, which no method reads.
 
     Raw video has been perceived before: `capture` and `lifted` are what came of it. Then a record with what was noticed lies beside
@@ -33,9 +37,9 @@ def observe(scenario: ScenarioRow, settings: Config, output: Path, capture: Capt
         raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     from neuspring.core.artifacts import ImageObservations
     from neuspring.core.findings import refuse_errors, told
-    from neuspring.perception.sample import assemble
     from neuspring.perception.findings import look_at_observations
     from neuspring.perception.results import LiftedTracks, ShapePrior
+    from neuspring.perception.sample import assemble
 
     record = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted.path})
     points, prior = LiftedTracks.load(lifted.file("lifted")), ShapePrior.load(lifted.file("shape"))
