@@ -34,9 +34,8 @@ def play_options(parser: ArgumentParser) -> None:
 
 def play(a: Namespace) -> None:
     """`neuspring play`: serves until Ctrl-C."""
-    from neuspring.play.controls import load_controls
+    from neuspring.play.controls import load_controls, pulled_run
     from neuspring.play.results import find
-    from neuspring.play.scoring import pulled_run
 
     found = find(a.results)
     frames = found.observations.scenario.frame_count
@@ -55,15 +54,15 @@ def play(a: Namespace) -> None:
 
 def _evaluate(a: Namespace, found: Scene, own: Run, controls: Controls) -> None:
     """Print the comparison, write the video."""
-    from neuspring.play.film import write_film
-    from neuspring.play.scoring import comparison
+    from neuspring.play.controls import comparison
+    from neuspring.play.video import write_video
 
     if a.compare:
         for line in comparison(found, controls, own):
             print(line, flush=True)
     if a.video:
-        film = write_film(found, own, controls, a.video, a.camera)
-        print(f"Wrote {film.path}: {film.frames} frames, {film.kind}" + (f" ({film.reason})" if film.reason else ""))
+        video = write_video(found, own, controls, a.video, a.camera)
+        print(f"Wrote {video.path}: {video.frames} frames, {video.kind}" + (f" ({video.reason})" if video.reason else ""))
 
 
 def _serve(a: Namespace, found: Scene, own: Run | None, controls: Controls | None) -> None:

@@ -1,19 +1,22 @@
-"""The page beside the scene: time, runs, what is shown, the legend."""
+"""The page beside the scene: time, runs, what is shown, the legend, and a twin in your hands."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuspring.play.clock import SPEEDS
+from neuspring.core.errors import InputError
 from neuspring.play.colors import QUANTITIES
-from neuspring.play.panel import LivePanel
-from neuspring.play.player import MOST_SHOWN, Player
-from neuspring.play.results import Scene
+from neuspring.play.controls import Controls
+from neuspring.play.live import TOO_MUCH, Live
+from neuspring.play.player import MOST_SHOWN, SPEEDS, Player
+from neuspring.play.results import Run, Scene
+from neuspring.play.simulator import StartState, start_state
 
 if TYPE_CHECKING:
     import viser
@@ -30,6 +33,9 @@ PARTS = {
     "cameras": "Cameras",
     "images": "Camera images",
 }
+DRAG = "Start, then drag a node or a hand (red) with the left button. Drag beside them to turn the view."
+REPEAT = "Hands move as recorded, while you pull elsewhere. Switching begins again."
+FROM = "Begins in the state of the prediction in this frame"
 KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin."
 OPENING = math.radians(45)
 """Vertical angle of view."""
@@ -56,7 +62,7 @@ class Page:
         server.gui.main_panel.dock_right()
         self.player = Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
-        self._alive, self._before = False, self.player.look.quantity
+        self._alive, self._before = False, self.player.display.quantity
         self._look_at()
         server.gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
@@ -89,7 +95,7 @@ class Page:
 
     def _springs(self) -> None:
         gui = self.server.gui
-        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self.player.look.quantity)
+        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self.player.display.quantity)
         self.legend = gui.add_html("")
         self.quantity.on_update(lambda _: self._changed())
 
@@ -111,24 +117,24 @@ class Page:
         self.loop.on_update(lambda _: setattr(clock, "loop", bool(self.loop.value)))
 
     def _runs(self) -> None:
-        gui, look = self.server.gui, self.player.look
+        gui, display = self.server.gui, self.player.display
         self.boxes: dict[str, Any] = {}
         with gui.add_folder("Runs", expand_by_default=len(self.found.runs) <= 12):
             for run in self.found.runs:
-                self.boxes[run.name] = gui.add_checkbox(run.name, run.name in look.shown, hint="; ".join(run.notes) or None)
-            self.gap = gui.add_slider("Side by side", 0.0, 3.0, 0.1, look.gap, hint="0: all in one place")
+                self.boxes[run.name] = gui.add_checkbox(run.name, run.name in display.runs, hint="; ".join(run.notes) or None)
+            self.gap = gui.add_slider("Side by side", 0.0, 3.0, 0.1, display.gap, hint="0: all in one place")
             self.notes = gui.add_html("")
         for box in self.boxes.values():
             box.on_update(lambda _: self._changed())
         self.gap.on_update(lambda _: self._changed())
 
     def _shown(self) -> None:
-        gui, look = self.server.gui, self.player.look
+        gui, display = self.server.gui, self.player.display
         absent = self._absent()
         self.parts: dict[str, Any] = {}
         for name, title in PARTS.items():
             hint = absent.get(name)
-            self.parts[name] = gui.add_checkbox(title, getattr(look, name) and not hint, disabled=bool(hint), hint=hint)
+            self.parts[name] = gui.add_checkbox(title, getattr(display, name) and not hint, disabled=bool(hint), hint=hint)
         marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
         gui.add_html(f"<div style='{SMALL};margin-top:.6em'>{marks}</div>")
         for box in self.parts.values():
@@ -180,21 +186,21 @@ class Page:
 
     def _changed(self) -> None:
         """Take over what was switched."""
-        look = self.player.look
+        display = self.player.display
         with self.player.lock:
             for name, box in self.parts.items():
-                setattr(look, name, bool(box.value))
-            look.quantity = self.quantity.value
-            look.gap = float(self.gap.value)
-            look.shown = [name for name, box in self.boxes.items() if box.value]
+                setattr(display, name, bool(box.value))
+            display.quantity = self.quantity.value
+            display.gap = float(self.gap.value)
+            display.runs = [name for name, box in self.boxes.items() if box.value]
             self.player.apply()
             self.legend.content = self.player.legend()
-            notes = [f"{name}: {note}" for name, note in self.player.notes.items() if note and name in look.shown]
-            if len(look.shown) > MOST_SHOWN:
+            notes = [f"{name}: {note}" for name, note in self.player.notes.items() if note and name in display.runs]
+            if len(display.runs) > MOST_SHOWN:
                 notes.append(f"{MOST_SHOWN} runs are shown at once; take some away to see others")
             rows = "<br>".join(escape(note[:400]) for note in [*self.found.notes, *notes])
             self.notes.content = f"<div style='{SMALL}'>{rows}</div>"
-        self._tell_errors()
+        self._update_error_text()
 
     def _lived(self) -> None:
         """A live twin has begun or ended: it is shown by strain, unless something else was chosen."""
@@ -208,7 +214,7 @@ class Page:
                 self.quantity.value = self._before
         self._changed()
 
-    def _tell_errors(self) -> None:
+    def _update_error_text(self) -> None:
         found = self.player.errors()
         self.errors.content = f"<div style='{SMALL}'>track error in this frame: {escape(found)}</div>" if found else ""
 
@@ -229,6 +235,106 @@ class Page:
             if now - told > 0.25:
                 told = now
                 self.panel.refresh()
-                self._tell_errors()
+                self._update_error_text()
             if self.play.label != (wanted := "Pause" if playing else "Play"):
                 self.play.label = wanted
+
+
+class LivePanel:
+    """Starts and ends a live twin; `changed` is called when it has begun or ended."""
+
+    def __init__(self, server: viser.ViserServer, player: Player, save_to: Path, changed: Callable[[], None]) -> None:
+        self.live: Live | None = None
+        self._server, self._player, self._save_to, self._changed = server, player, save_to, changed
+        self._lock = threading.RLock()
+        names = [run.name for run in player.found.runs if run.twin_path is not None]
+        gui = server.gui
+        if not names:
+            gui.add_markdown("No run here has a twin, so there is nothing to pull.")
+            return
+        self.twin = gui.add_dropdown("Twin", tuple(names))
+        self.frame = gui.add_slider("From frame", 0, player.clock.count - 1, 1, 0, hint=FROM)
+        self.repeat = gui.add_checkbox("Hands repeat the recording", False, hint=REPEAT)
+        gui.add_html(f"<div style='{SMALL}'>{DRAG}</div>")
+        self.switch = gui.add_button("Start")
+        self.again = gui.add_button("Reset", disabled=True)
+        self.save = gui.add_button("Save recording", disabled=True, hint="What was done since the last reset")
+        self.most = gui.add_slider("Red above", 0.05, 2.0, 0.05, TOO_MUCH, hint="strain l / l0 − 1")
+        self.text = gui.add_html("")
+        self.switch.on_click(lambda _: self.stop() if self.live else self.start(self.twin.value))
+        self.again.on_click(lambda _: self._reset())
+        self.save.on_click(lambda _: self._save())
+        self.most.on_update(lambda _: self._limit())
+        for choice in (self.twin, self.frame, self.repeat):
+            choice.on_update(lambda _: self._chosen())
+        gui.add_command("Reset the live twin", hotkey="R").on_trigger(lambda _: self._reset())
+        server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
+
+    def start(self, name: str, played: Controls | None = None) -> None:
+        """Begin with a run's twin, or show what was recorded of it."""
+        with self._lock:
+            self.stop()
+            try:
+                run = self._player.run(name)
+                begin = StartState(played.start_frame, played.start) if played else self._start_state(run)
+                self._player.hide(True, float(self.most.value))
+                self.live = Live(self._server, self._player, run, begin, played)
+            except InputError as error:
+                self._player.hide(False)
+                self.text.content = f"<div style='margin:0 .8em'>{escape(str(error))}</div>"
+                return
+            self._limit()
+            self.switch.label, self.again.disabled, self.save.disabled = "Stop", False, played is not None
+
+    def stop(self) -> None:
+        """Back to the recording."""
+        with self._lock:
+            if self.live is not None:
+                self.live.close()
+                self.live = None
+                self._player.hide(False)
+                self.switch.label, self.again.disabled, self.save.disabled = "Start", True, True
+                self.text.content = ""
+                self._changed()
+
+    def refresh(self) -> None:
+        """Show the state; called a few times per second."""
+        if live := self.live:
+            self.text.content = live.status()
+
+    def _start_state(self, run: Run) -> StartState:
+        return start_state(run, self._player.found.observations, int(self.frame.value), bool(self.repeat.value))
+
+    def _reset(self) -> None:
+        if self.live is not None:
+            self.live.reset()
+
+    def _disconnected(self, client: int) -> None:
+        """A closed page lets go."""
+        if self.live is not None:
+            self.live.grab.release(client)
+
+    def _chosen(self) -> None:
+        """Another start is another live twin."""
+        with self._lock:
+            if self.live is not None and self.live.played is None:
+                self.start(self.twin.value)
+
+    def _limit(self) -> None:
+        if self.live:
+            self.live.most = self._player.limit = float(self.most.value)
+            self._changed()
+
+    def _save(self) -> None:
+        """Write what was recorded beside earlier recordings."""
+        live = self.live
+        if live is None:
+            return
+        try:
+            controls = live.recorded()
+            stem = f"controls_{controls.scenario}_{controls.method}_{controls.seed}"
+            path = next(p for i in range(10_000) if not (p := self._save_to / f"{stem}_{i}.npz").exists())
+            controls.save(path)
+            live.message = f"saved {len(controls.grabbed)} frames: {path}"
+        except (InputError, OSError, StopIteration) as error:
+            live.message = f"not saved: {error}"

@@ -1,27 +1,24 @@
-"""The recording in the scene: runs side by side, at a frame of the clock."""
+"""The recording in the scene: runs side by side, at a frame of a clock that runs, is scrubbed, and starts again at the end."""
 
 from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.play.body import Body
-from neuspring.play.clock import Clock
 from neuspring.play.colors import Scale, Springs, region_legend, scale_of, strain_scale
-from neuspring.play.dress import Dress
+from neuspring.play.layers import BodyLayer, Display, SplatLayer, Surroundings, TrackOverlay
 from neuspring.play.results import Run, Scene
-from neuspring.play.surroundings import Surroundings
-from neuspring.play.tracked import Tracked
 
 if TYPE_CHECKING:
     import viser
 
+SPEEDS = {"0.1 ×": 0.1, "0.25 ×": 0.25, "0.5 ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 ROOM = 1.1
 """The first view shows so much of what the runs fill."""
 SAMPLES = 12
@@ -31,22 +28,62 @@ MOST_SHOWN = 8
 
 
 @dataclass
-class Look:
-    """What is shown, and how."""
+class Clock:
+    """Time of a recording of `count` frames at `rate` frames/s, whose frames from `border` on are future frames."""
 
-    quantity: str = "stiffness"
-    nodes: bool = True
-    springs: bool = True
-    hands: bool = True
-    splats: bool = False
-    points: bool = True
-    tracks: bool = True
-    cameras: bool = True
-    images: bool = False
-    gap: float = 1.2
-    """Distance between runs, as a part of the scene's size; 0: all in one place."""
-    shown: list[str] = field(default_factory=list)
-    """Names of runs."""
+    count: int
+    rate: float
+    border: int
+    time: float = 0.0
+    """Frames since frame 0, with fractions."""
+    speed: float = 1.0
+    playing: bool = False
+    loop: bool = True
+
+    @property
+    def frame(self) -> int:
+        """The frame that is shown."""
+        return min(int(self.time), self.count - 1)
+
+    def advance(self, seconds: float) -> bool:
+        """Let time pass; returns whether the frame has changed."""
+        if not self.playing:
+            return False
+        before, self.time = self.frame, self.time + max(seconds, 0.0) * self.speed * self.rate
+        if self.time >= self.count:
+            self.time %= self.count
+            if not self.loop:
+                self.time, self.playing = float(self.count - 1), False
+        return self.frame != before
+
+    def show(self, frame: int) -> None:
+        """Go to a frame; outside ones are the first or the last."""
+        self.time = float(min(max(frame, 0), self.count - 1))
+
+    @property
+    def part(self) -> str:
+        """The part of the recording that the frame belongs to."""
+        return "training" if self.frame < self.border else "future"
+
+    def text(self) -> str:
+        """Frame, time and part in words."""
+        return f"{self.part} frame {self.frame} of {self.count - 1}, {self.frame / self.rate:.2f} s"
+
+    def bar(self) -> str:
+        """The timeline as HTML: training and future, the border between them, and where we are."""
+        border, here = (100 * value / max(self.count - 1, 1) for value in (self.border - 0.5, self.frame))
+        border = min(max(border, 0.0), 100.0)
+        colors = f"linear-gradient(to right, #9ecae1 {border:.2f}%, #fdae6b {border:.2f}%)"
+        mark = "position:absolute;top:-3px;bottom:-3px;width:{w}px;background:{c};left:calc({x:.2f}% - {h}px)"
+        color = "#2171b5" if self.part == "training" else "#d94801"
+        return (
+            "<div style='margin:.2em .8em .6em;font-size:.8em'>"
+            f"<div style='position:relative;height:12px;border-radius:2px;background:{colors}'>"
+            f"<div style='{mark.format(w=2, c='#333', x=border, h=1)}'></div>"
+            f"<div style='{mark.format(w=4, c=color, x=here, h=2)}'></div></div>"
+            f"<div style='margin-top:6px'><b style='color:{color}'>{self.text()}</b></div>"
+            f"<div>blue: training, frames 0 to {self.border - 1}; orange: future, predicted</div></div>"
+        )
 
 
 class Player:
@@ -56,11 +93,11 @@ class Player:
         scenario = found.observations.scenario
         self.found, self.lock = found, threading.RLock()
         self.clock = Clock(scenario.frame_count, scenario.frame_rate, scenario.train_end)
-        self.look = Look(shown=list(found.shown))
+        self.display = Display(runs=list(found.shown))
         self.scale: Scale | None = None
         self.notes: dict[str, str] = {}
         """Run -> why it is not shown, or what to know about it."""
-        self._scene, self._bodies, self._tracked = scene, dict[str, Body](), dict[str, Tracked]()
+        self._scene, self._bodies, self._overlays = scene, dict[str, BodyLayer](), dict[str, TrackOverlay]()
         self._hidden = False
         self.limit: float | None = None
         """Strain at the end of the colors of a live twin; None: the recording is shown."""
@@ -80,37 +117,36 @@ class Player:
         return next(run for run in self.found.runs if run.name == name)
 
     def apply(self) -> None:
-        """Make the scene agree with the look."""
+        """Make the scene agree with the display."""
         with self.lock:
-            wanted = self.look.shown[:MOST_SHOWN]
+            wanted = self.display.runs[:MOST_SHOWN]
             for name in [name for name in self._bodies if name not in wanted]:
                 self._bodies.pop(name).remove()
-                self._tracked.pop(name)
+                self._overlays.pop(name)
             for name in wanted:
                 if name not in self._bodies:
                     self._add(self.run(name))
-            look = self.look
+            display = self.display
             for index, name in enumerate(name for name in wanted if name in self._bodies):
                 body = self._bodies[name]
-                self.dress(body, self.run(name))
-                body.show(nodes=look.nodes, springs=look.springs, hands=look.hands, splats=look.splats)
-                self._tracked[name].show(look.tracks)
+                self.add_splats(body, self.run(name))
+                body.show(display)
+                self._overlays[name].show(display.tracks)
                 body.root.position, body.root.visible = self.offset(index), not self._hidden
             seen = not self._hidden
-            self.around.show(
-                points=look.points and seen, tracks=look.tracks and seen, cameras=look.cameras, images=look.images and seen
-            )
+            points, tracks, images = (wish and seen for wish in (display.points, display.tracks, display.images))
+            self.around.show(points=points, tracks=tracks, cameras=display.cameras, images=images)
             self.scale = self._scale()
             self.draw()
 
-    def dress(self, body: Body, run: Run) -> None:
-        """Put a run's splats on a body when they are first wanted; what it lacks is a note."""
-        if not self.look.splats or body.dress is not None or run.splats_path is None:
+    def add_splats(self, body: BodyLayer, run: Run) -> None:
+        """Give a body the run's splats when they are first wanted; what it lacks is a note."""
+        if not self.display.splats or body.splats is not None or run.splats_path is None:
             return
         try:
             if run.splats is not None and run.trajectory is not None:
                 nodes = run.trajectory.positions[0]
-                body.dress = Dress(self._scene, body.name, run.splats, nodes, run.centers)
+                body.splats = SplatLayer(self._scene, body.name, run.splats, nodes, run.centers)
         except (InputError, NumericalFailure) as error:
             self.notes[run.name] = "; ".join(filter(None, [self.notes.get(run.name, ""), f"no splats: {error}"]))
 
@@ -123,12 +159,12 @@ class Player:
 
     def offset(self, index: int) -> tuple[float, float, float]:
         """Where a run stands: beside the others along y, the first one where it was observed."""
-        return (0.0, index * self.look.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
+        return (0.0, index * self.display.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
 
     def view(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Up [3], the middle of the shown runs [3], m, and from where all are seen [3], m, with an angle of view, rad."""
         sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
-        last = np.array(self.offset(max(min(len(self.look.shown), MOST_SHOWN) - 1, 0)))
+        last = np.array(self.offset(max(min(len(self.display.runs), MOST_SHOWN) - 1, 0)))
         middle, reach = 0.5 * (self.low + self.high + last), self.size + float(np.linalg.norm(last))
         way = np.array([1.0, -0.35, 0.45 * sign])
         distance = ROOM * 0.5 * reach / math.tan(opening / 2)
@@ -141,16 +177,16 @@ class Player:
             hands = self.found.observations.controller_points[frame]
             for name, body in self._bodies.items():
                 nodes = self._positions(self.run(name), frame)
-                body.move(nodes, hands, self.look.quantity, self.scale)
-                self._tracked[name].move(nodes, frame)
-                if body.dress is not None:
-                    body.dress.move(nodes, frame)
+                body.move(nodes, hands, self.display.quantity, self.scale)
+                self._overlays[name].move(nodes, frame)
+                if body.splats is not None:
+                    body.splats.move(nodes, frame)
             self.around.move(frame)
 
     def legend(self) -> str:
         """The legend of the springs' colors as HTML."""
         twins = [body.twin for body in self._bodies.values() if body.twin]
-        if not twins or not self.look.springs:
+        if not twins or not self.display.springs:
             return ""
         if self.scale is None:
             return region_legend(twins[0])
@@ -161,7 +197,7 @@ class Player:
     def errors(self) -> str:
         """The track error of each shown run in the shown frame, mm, in words; empty without tracks."""
         with self.lock:
-            found = {name: one.error for name, one in self._tracked.items() if one.error is not None and not self._hidden}
+            found = {name: one.error for name, one in self._overlays.items() if one.error is not None and not self._hidden}
         return "; ".join(f"{name} {1e3 * error:.1f} mm" for name, error in found.items())
 
     def _add(self, run: Run) -> None:
@@ -176,8 +212,8 @@ class Player:
                 notes.append(f"left the scene in frame {run.trajectory.diverged_frame}; it stays where it was before")
             hands = self.found.observations.controller_points[0]
             nodes = run.trajectory.positions[0]
-            body = self._bodies[run.name] = Body(self._scene, run.name, twin, nodes, hands)
-            self._tracked[run.name] = Tracked(self._scene, run.name, self.found.observations.tracks, nodes, 1.2 * body.radius)
+            body = self._bodies[run.name] = BodyLayer(self._scene, run.name, twin, nodes, hands)
+            self._overlays[run.name] = TrackOverlay(self._scene, run.name, self.found.observations.tracks, nodes, 1.2 * body.radius)
         except InputError as error:
             notes.append(str(error))
         self.notes[run.name] = "; ".join(notes)
@@ -203,7 +239,7 @@ class Player:
         return np.asarray(run.trajectory.positions[min(frame, len(run.trajectory.positions) - 1)])
 
     def _scale(self) -> Scale | None:
-        if self.limit is not None and self.look.quantity == "strain":
+        if self.limit is not None and self.display.quantity == "strain":
             return strain_scale(self.limit)
         parts: list[Springs] = []
         strains = []
@@ -215,4 +251,4 @@ class Player:
             run, own = self.run(name), body.parts
             parts.append(own)
             strains.append(np.stack([own.strain(own.ends(self._positions(run, t), hands[t])) for t in frames]))
-        return scale_of(self.look.quantity, parts, strains)
+        return scale_of(self.display.quantity, parts, strains)

@@ -1,20 +1,25 @@
-"""What a results folder has to show: its scenario, its runs, and what is missing of each."""
+"""What a results folder has to show: its scenario, its runs, and what is missing of each.
+
+Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
+from neuspring.core.files import META, DamagedFile, read_head
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.play.guard import MOST_BYTES, inside, require_modest, require_small
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.model import Splats
 from neuspring.splats.of_run import APPEARANCE, RENDER, splats_file
@@ -25,6 +30,10 @@ FIRST = ("neuspring_plus", "neuspring", "baseline")
 """Methods that are shown first."""
 MOST_RUNS = 200
 """Runs that are looked at in a scenario's folder."""
+MOST_BYTES = 2 * 1024**3
+"""Largest file, unpacked, that is opened."""
+LARGEST_RECORD = 50_000_000
+"""Bytes of a JSON record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +59,10 @@ class Run:
     @cached_property
     def twin(self) -> Twin | None:
         """The twin, where the method has one. Raises InputError."""
-        return None if self.twin_path is None else load_twin(self.twin_path)
+        if self.twin_path is None:
+            return None
+        require_modest(self.twin_path)
+        return Twin.load(self.twin_path)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
@@ -94,13 +106,7 @@ class Scene:
     shown: tuple[str, ...]
     """Names of the runs to begin with."""
     capture: Capture | None = None
-    notes: tuple[str, ...] = field(default_factory=tuple)
-
-
-def load_twin(path: Path) -> Twin:
-    """A twin of modest size. Raises InputError."""
-    require_modest(path)
-    return Twin.load(path)
+    notes: tuple[str, ...] = ()
 
 
 def find(paths: Sequence[Path]) -> Scene:
@@ -124,7 +130,8 @@ def find(paths: Sequence[Path]) -> Scene:
     require_modest(folder / OBSERVATIONS)
     observations = Observations.load(folder / OBSERVATIONS)
     whole = len(named) < len(paths)
-    places = sorted(set(named) | set(_runs_below(folder) if whole else ()), key=_rank)
+    below = (place for place in folder.glob("*/*") if place.is_dir() and not place.is_symlink() and _is_run(place))
+    places = sorted({*named, *(below if whole else ())}, key=_rank)
     runs = tuple(_run(place, folder) for place in places[:MOST_RUNS])
     notes = [] if len(places) <= MOST_RUNS else [f"{len(places) - MOST_RUNS} runs are left out"]
     if not runs:
@@ -135,10 +142,6 @@ def find(paths: Sequence[Path]) -> Scene:
 
 def _is_run(path: Path) -> bool:
     return bool(SEED.fullmatch(path.name)) and any((path / name).is_file() for name in (RUN_RECORD, ROLLOUT))
-
-
-def _runs_below(folder: Path) -> list[Path]:
-    return [place for place in folder.glob("*/*") if place.is_dir() and not place.is_symlink() and _is_run(place)]
 
 
 def _rank(path: Path) -> tuple[int, str, int]:
@@ -223,3 +226,42 @@ def _capture(folder: Path, notes: list[str]) -> Capture | None:
 def _content(folder: Path) -> str:
     names = sorted(path.name for path in folder.iterdir())[:8]
     return ", ".join(names) or "an empty folder"
+
+
+def require_modest(path: Path, most: int = MOST_BYTES) -> None:
+    """Raise InputError for an `.npz` file whose arrays would not fit `most` bytes, or whose headers promise more than it holds."""
+    if not path.is_file():
+        raise InputError(path, "this file must exist", "no such file", "Run the step that makes it first.")
+    try:
+        shapes, _ = read_head(path)
+        with zipfile.ZipFile(path) as archive:
+            sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
+    except (DamagedFile, zipfile.BadZipFile, OSError) as error:
+        raise InputError(path, "this file must be readable", str(error), "Delete it and run its step again.") from error
+    if sum(sizes.values()) > most:
+        rule = f"at most {most / 1e9:.1f} GB are opened"
+        raise InputError(path, rule, f"{sum(sizes.values()) / 1e9:.1f} GB", "Show a smaller run.")
+    for name, shape in shapes.items():
+        if name != META and math.prod(shape) > sizes[name]:
+            rule = f"the header of {name} must agree with its content of {sizes[name]} bytes"
+            raise InputError(path, rule, f"shape {shape}", "Delete it and run its step again.")
+
+
+def require_small(path: Path, most: int = LARGEST_RECORD) -> None:
+    """Raise InputError for a file that is larger than any of its kind that we write."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
+    if size > most:
+        raise InputError(path, f"at most {most / 1e6:.0f} MB are opened", f"{size / 1e6:.0f} MB", "Run its step again.")
+
+
+def inside(folder: Path, path: Path) -> Path:
+    """The path, resolved. Raises InputError where it leads out of the folder."""
+    resolved = path.resolve()
+    if not resolved.is_relative_to(folder.resolve()):
+        raise InputError(
+            path, f"must lie inside {folder}", str(resolved), "A record of a results folder names files of its scenario."
+        )
+    return resolved

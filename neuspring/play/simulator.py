@@ -7,37 +7,99 @@ and c critical for the node's mass, bounded in the same way. The target is a con
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Artifact, Observations, Twin, array
+from neuspring.core.errors import InputError
 from neuspring.physics import stability
-from neuspring.physics.controllers import BEGINS
+from neuspring.physics.controllers import BEGINS, begins, waypoints
 from neuspring.physics.solver import FrameSolver, solver_for
+from neuspring.twin.hand_paths import with_hands
+from neuspring.twin.motion import initial_velocity
 from neuspring.twin.rollout import FAR, Diverged
+
+if TYPE_CHECKING:
+    from neuspring.play.results import Run
 
 REST = 1e-6
 """Rest length of the spring of a grab, m: the solver has none of length 0."""
 MARGIN = 0.9
 """Part of the stability bound that twin and grab may use together."""
+MOST_SOLVERS = 8
+"""Solvers of grabbed nodes that are kept."""
+HAND_GAP = 0.15
+"""Controllers nearer than this, m, directly or through others, are one hand."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start(Artifact):
+    """The state that a twin begins in. What is empty is as in its frame 0: there, at rest, and all hands hold."""
+
+    kind: ClassVar[str] = "start"
+    positions: np.ndarray = array("N,3", np.float32, "m", "nodes", omitted=True)
+    velocity: np.ndarray = array("N,3", np.float32, "m/s", "of the nodes", omitted=True)
+    hands: np.ndarray = array("C,3", np.float32, "m", "controllers", omitted=True)
+    holds: np.ndarray = array("C", np.float32, "1", "which hold; BEGINS where one takes hold in this moment", omitted=True)
+    grip_rows: np.ndarray = array("G,C,4", np.float32, "m, 1", "controllers when some took hold earlier", omitted=True)
+    grip_nodes: np.ndarray = array("G,N,3", np.float32, "m", "the nodes at these moments", omitted=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """The state that a twin begins in. What is None is as in its frame 0: there, at rest, and all hands hold."""
+class StartState:
+    """Where a live twin begins, and what recorded hands do from there: E frames, none where they stay."""
 
-    positions: np.ndarray | None = None
-    """[N, 3], m."""
-    velocity: np.ndarray | None = None
-    """[N, 3], m/s."""
-    hands: np.ndarray | None = None
-    """[C, 3], m."""
-    holds: np.ndarray | None = None
-    """Which hands hold [C], and 2 where one takes hold in this moment (physics/controllers.py)."""
-    grips: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-    """Of hands that took hold earlier: rows [C, 4] of their moments (physics/controllers.py), and the nodes [N, 3] then."""
+    frame: int = 0
+    """Of the recording."""
+    start: Start = field(default_factory=Start)
+    hands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
+    """[E, C, 3], m."""
+    holds: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
+    """[E, C]."""
+
+    def script(self, frame: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Hands [C, 3] and which hold [C] after `frame` frames more; they stay after their end. None without recorded hands."""
+        last = min(frame, len(self.hands) - 1)
+        return (self.hands[last], self.holds[last]) if len(self.hands) else (None, None)
+
+
+def start_state(run: Run, seen: Observations, frame: int, repeat: bool) -> StartState:
+    """The state of a run's prediction in a frame; with `repeat`, the hands go on as recorded.
+
+    Its velocity is half of what the nodes move from the frame before to the frame after, per frame; in frame 0 it is none, or with
+    `repeat` that of the rollout. Raises InputError for a frame that the prediction does not have.
+    """
+    twin = run.twin
+    if twin is None:
+        raise InputError(run.folder, "a run with a twin is required", "none", "Choose a method that makes a twin.")
+    seen = with_hands(seen, twin)
+    count, hands = len(twin.topology.controllers), seen.controller_points
+    if frame == 0 and not repeat:
+        return StartState()
+    if hands.shape[1] != count:
+        raise InputError(run.folder, f"its twin has {count} controllers, the observations must too", hands.shape[1])
+    holds = seen.controller_valid if seen.controller_valid.size else np.ones(hands.shape[:2], bool)
+    rest = slice(frame + 1, None) if repeat else slice(0, 0)
+    script = hands[rest], holds[rest]
+    if frame == 0:
+        velocity = initial_velocity(seen, twin.simulation.initial_velocity)
+        return StartState(0, Start(velocity=velocity, hands=hands[0], holds=holds[0].astype(np.float32)), *script)
+    x = None if run.trajectory is None else run.trajectory.positions
+    if x is None or x.shape[1:] != twin.topology.nodes.shape or not 0 <= frame < len(x):
+        known = 0 if x is None else len(x)
+        raise InputError(f"{run.name}, frame {frame}", f"its prediction has {known} frames", frame, "Begin at frame 0.")
+    before, after = max(frame - 1, 0), min(frame + 1, len(x) - 1)
+    velocity = (x[after].astype(float) - x[before]) / max((after - before) * twin.simulation.frame_time, 1e-9)
+    rows = waypoints(torch.tensor(hands[: frame + 1]), holds).numpy()
+    earlier = np.flatnonzero(begins(torch.tensor(rows[:frame])).any(dim=-1).numpy())
+    flags = rows[frame, :, 3] if rows.shape[2] == 4 else np.ones(count)
+    grips = {"grip_rows": rows[earlier], "grip_nodes": x[earlier]} if len(earlier) else {}
+    return StartState(frame, Start(positions=x[frame], velocity=velocity, hands=hands[frame], holds=flags, **grips), *script)
 
 
 class Simulator:
@@ -56,13 +118,12 @@ class Simulator:
         """Back to the start."""
         topology, start = self.twin.topology, self._start
         self.frame, self.grabbed = 0, -1
-        x = topology.nodes if start.positions is None else start.positions
-        v = np.zeros_like(x) if start.velocity is None else start.velocity
+        x = start.positions if start.positions.size else topology.nodes
+        v = start.velocity if start.velocity.size else np.zeros_like(x)
         self._x, self._v = (torch.tensor(np.asarray(values, np.float32), device=self._device) for values in (x, v))
-        self.hands = (topology.controllers if start.hands is None else start.hands).astype(np.float32)
-        count = len(topology.controllers)
-        self._holds = np.ones(count, np.float32) if start.holds is None else start.holds.astype(np.float32)
-        self._grips = [(np.asarray(row, np.float32), nodes) for row, nodes in start.grips]
+        self.hands = (start.hands if start.hands.size else topology.controllers).astype(np.float32)
+        self._holds = start.holds if start.holds.size else np.ones(len(topology.controllers), np.float32)
+        self._grips = list(zip(start.grip_rows, start.grip_nodes, strict=True))
         self.target = np.zeros(3, np.float32)
 
     @property
@@ -94,7 +155,11 @@ class Simulator:
             aim = np.asarray(target, np.float32)
             start = self.target if grabbed == self.grabbed else self.positions[grabbed]
             begin, end = (_with_row(rows, place) for rows, place in ((begin, start), (end, aim)))
-            solver = self._solver(grabbed)
+            if grabbed not in self._held:
+                if len(self._held) >= MOST_SOLVERS:
+                    self._held.pop(next(iter(self._held)))
+                self._held[grabbed] = solver_for(self._with_grab(grabbed), self._device, differentiable=False)
+            solver = self._held[grabbed]
         if begin.shape[1] == 4:
             # Each solver knows the grips of its own frames alone.
             rows = [_with_row(row, aim) if grabbed >= 0 else row for row, _ in grips]
@@ -121,15 +186,8 @@ class Simulator:
         k = min(wanted or room * mass / dt**2, room * mass / dt**2)
         return k, min(2 * np.sqrt(k * mass), room * mass / (2 * dt))
 
-    def _solver(self, node: int) -> FrameSolver:
-        """The twin with one controller and one spring more. The last ones are kept."""
-        if node not in self._held:
-            if len(self._held) >= 8:
-                self._held.pop(next(iter(self._held)))
-            self._held[node] = solver_for(self._with_grab(node), self._device, differentiable=False)
-        return self._held[node]
-
     def _with_grab(self, node: int) -> Twin:
+        """The twin with one controller and one spring more."""
         topology, material = self.twin.topology, self.twin.material
         k, c = self.grab_stiffness(node)
         own = len(topology.nodes) + len(topology.controllers)
@@ -152,9 +210,6 @@ def _with_row(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.append(place, np.ones(rows.shape[1] - 3))[None]]).astype(np.float32)
 
 
-def hands_of(controllers: np.ndarray, apart: float = 0.15) -> np.ndarray:
-    """The hand [C] of each controller [C, 3]: controllers nearer than `apart` m, directly or through others, move together."""
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial.distance import cdist
-
-    return np.asarray(connected_components(cdist(controllers, controllers) < apart)[1])
+def hands_of(controllers: np.ndarray) -> np.ndarray:
+    """The hand [C] of each controller [C, 3], m: those that move together."""
+    return np.asarray(connected_components(cdist(controllers, controllers) < HAND_GAP)[1])

@@ -23,14 +23,13 @@ import numpy as np
 
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.core.records import Recorder
-from neuspring.play.begin import Begin, Script
 from neuspring.play.controls import MOST_FRAMES
 from neuspring.play.live import Live
 from neuspring.play.page import Page
 from neuspring.play.player import Player
 from neuspring.play.results import find
 from neuspring.play.serve import address, start
-from neuspring.play.simulator import Simulator, Start
+from neuspring.play.simulator import Simulator, StartState
 from tests.benchmarks.memory import resident_mib
 from tests.benchmarks.scenes import box
 from tests.support import scenarios
@@ -169,7 +168,7 @@ def running(kind: type[Live], twin: Twin, folder: Path):
     server = start("127.0.0.1", 0)
     player = Player(server.scene, found)
     player.hide(True)
-    live = kind(server, player, found.runs[0], Begin(0, Start(), Script()))
+    live = kind(server, player, found.runs[0], StartState())
 
     def close() -> None:
         live.close()
@@ -198,12 +197,12 @@ def written(twin: Twin, folder: Path) -> Path:
 def pull(live: Live, seconds: float) -> None:
     """Move a grabbed node up and down for some seconds."""
     place = live.simulator.positions[0].copy()
-    live.hold.take(1, "node", 0, place)
+    live.grab.take(1, "node", 0, place)
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        live.hold.pull(1, place + np.array([0, 0, 0.01 * np.sin(6 * time.monotonic())]))
+        live.grab.pull(1, place + np.array([0, 0, 0.01 * np.sin(6 * time.monotonic())]))
         time.sleep(1 / MOVES)
-    live.hold.release(1)
+    live.grab.release(1)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
     """A twin that is pulled too far."""
-    page.panel.start(page.player.look.shown[0])
+    page.panel.start(page.player.display.runs[0])
     choose_tab(browser, "Live")
     one = page.panel.live
     assert one is not None

@@ -50,7 +50,7 @@ def opened(folder):
         server.stop()
 
 
-def test_switches_change_what_is_drawn_and_scrubbing_moves_it(tmp_path):
+def test_switches_change_what_is_drawn_scrubbing_moves_it_and_a_drag_pulls_a_live_twin(tmp_path):
     with opened(tmp_path) as (server, page, browser):
         body = page.player._bodies[RUN]
         before = body.nodes.batched_positions.copy()
@@ -70,21 +70,9 @@ def test_switches_change_what_is_drawn_and_scrubbing_moves_it(tmp_path):
             browser.run(switch(name))
             until(lambda part=part: not part.visible)
         assert seen(browser, server, tmp_path / "after.png", lambda count: count < 0.6 * drawn)
-
-
-def seen(browser, server, path, enough) -> int:
-    """How many pixels of the scene have a color, once they are so many."""
-    wide = next(iter(server.get_clients().values())).camera.image_width
-
-    def count() -> int:
-        found = int(colored(browser, path)[:, :wide].sum())
-        return found if enough(found) else 0
-
-    return until(count)
-
-
-def test_a_drag_pulls_the_twin_and_a_release_lets_it_swing(tmp_path):
-    with opened(tmp_path) as (server, page, browser):
+        for name in ("Nodes", "Springs"):
+            browser.run(switch(name))
+        until(lambda: body.nodes.visible and body.springs.visible)
         live, (x, y) = begun(server, page, browser, tmp_path)
         rest = live.simulator.positions.copy()
         with pull(browser, x, y, 0, -90):
@@ -99,10 +87,18 @@ def test_a_drag_pulls_the_twin_and_a_release_lets_it_swing(tmp_path):
         assert np.isfinite(live.simulator.positions).all() and not live.message
 
 
-@pytest.mark.parametrize(
-    "leave", [Browser.close, lambda browser: browser.call("Page.navigate", url="about:blank")], ids=["closed", "left"]
-)
-def test_one_of_two_browsers_holds_and_lets_go_when_it_leaves(tmp_path, leave):
+def seen(browser, server, path, enough) -> int:
+    """How many pixels of the scene have a color, once they are so many."""
+    wide = next(iter(server.get_clients().values())).camera.image_width
+
+    def count() -> int:
+        found = int(colored(browser, path)[:, :wide].sum())
+        return found if enough(found) else 0
+
+    return until(count)
+
+
+def test_one_of_two_browsers_holds_and_lets_go_when_it_is_closed_or_left(tmp_path):
     with opened(tmp_path) as (server, page, browser):
         live, (x, y) = begun(server, page, browser, tmp_path)
         (first,) = server.get_clients()
@@ -110,17 +106,18 @@ def test_one_of_two_browsers_holds_and_lets_go_when_it_leaves(tmp_path, leave):
             second.open(address(server), *SMALL)
             second.wait(text("training frame 0 of 7"), PATIENCE)
             until(lambda: len(server.get_clients()) == 2)
-            press(browser, x, y, 0, -60)
-            until(lambda: live.simulator.grabbed >= 0)
-            other = max(server.get_clients())
-            assert not live.hold.take(other, "node", 0, live.simulator.positions[0])
+            assert live.grab.take(max(server.get_clients()), "node", 0, live.simulator.positions[0])
+            assert not live.grab.take(first, "node", 1, live.simulator.positions[1])
             second.close()
             until(lambda: len(server.get_clients()) == 1)
-            assert live.hold.owner == first
-        leave(browser)
+            until(lambda: live.grab.owner is None)
+        press(browser, x, y, 0, -60)
+        until(lambda: live.simulator.grabbed >= 0)
+        assert live.grab.owner == first
+        browser.call("Page.navigate", url="about:blank")
         until(lambda: live.simulator.grabbed < 0)
         later(live, 3)
-        assert live.hold.owner is None and not live.message
+        assert live.grab.owner is None and not live.message
 
 
 def begun(server, page, browser, folder):

@@ -9,7 +9,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.play.controls import Controls, compare, digest_motion, load_controls, replay
-from neuspring.play.hold import FASTEST, Hold, nearest_to_ray
+from neuspring.play.live import FASTEST, Grab, nearest_to_ray
 from neuspring.play.simulator import Simulator
 from tests.support import small
 from tests.support.played import softer
@@ -87,12 +87,12 @@ def test_a_recording_names_no_path(twin):
         replace(controls, method="../../etc")
 
 
-def hold() -> Hold:
-    return Hold(5, np.zeros((3, 3), np.float32), np.array([0, 0, 1]))
+def grab() -> Grab:
+    return Grab(5, np.zeros((3, 3), np.float32), np.array([0, 0, 1]))
 
 
 def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
-    one = hold()
+    one = grab()
     assert one.take(1, "node", 2, (0, 0, 0))
     assert not one.take(2, "node", 3, (0, 0, 0))
     one.pull(2, (9, 9, 9))
@@ -104,7 +104,7 @@ def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
 
 
 def test_a_hand_moves_as_one_and_no_faster_than_allowed():
-    one = hold()
+    one = grab()
     one.take(1, "hand", 1, (0, 0, 0))
     one.pull(1, (1, 0, 0))
     hands, node, _ = one.next(0.1, np.zeros((3, 3), np.float32), np.zeros(3))
@@ -114,7 +114,7 @@ def test_a_hand_moves_as_one_and_no_faster_than_allowed():
 
 @pytest.mark.parametrize("place", [(np.nan, 0, 0), (1e9, 0, 0), (0, 0), "here", None])
 def test_places_that_are_none_are_ignored(place):
-    one = hold()
+    one = grab()
     assert not one.take(1, "node", 0, place)
     one.take(1, "node", 0, (0, 0, 0))
     one.pull(1, place)
@@ -123,7 +123,7 @@ def test_places_that_are_none_are_ignored(place):
 
 @pytest.mark.parametrize("index", [-1, 5, None, 1.5])
 def test_nodes_that_are_not_there_cannot_be_grabbed(index):
-    assert not hold().take(1, "node", index, (0, 0, 0))
+    assert not grab().take(1, "node", index, (0, 0, 0))
 
 
 def test_the_node_nearest_to_the_mouse_is_taken():

@@ -68,8 +68,8 @@ def test_a_stretch_above_the_limit_is_red_and_said(opened, tmp_path):
     live = page.panel.live
     assert "below 0.05" in live.status() or live.over
     place = live.simulator.positions[3]
-    live.hold.take(1, "node", 3, place)
-    live.hold.pull(1, place + np.array([0.2, 0, 0.2], np.float32))
+    live.grab.take(1, "node", 3, place)
+    live.grab.pull(1, place + np.array([0.2, 0, 0.2], np.float32))
     until(lambda: live.over > 0)
     assert "Over-stretched" in live.status() and "above 0.05" in live.status()
     assert (live.body.springs.colors[:, 0] == [255, 0, 0]).all(axis=1).any()
@@ -80,7 +80,7 @@ def test_hands_repeat_the_recording_from_a_frame_and_cannot_be_taken(opened, tmp
     page.panel.frame.value, page.panel.repeat.value = 2, True
     page.panel.start(RUN)
     live = page.panel.live
-    assert not live.hold.take(1, "hand", 0, (0, 0, 0))
+    assert not live.grab.take(1, "hand", 0, (0, 0, 0))
     until(lambda: live.simulator.frame >= 7)
     assert "the recorded hands have ended" in live.status()
     assert np.array_equal(live.simulator.hands, page.found.observations.controller_points[-1])
@@ -93,12 +93,12 @@ def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, tmp_path):
     page = opened(results(tmp_path))
     page.show(5)
     until(lambda: page.player.clock.frame == 5 and not page._moved)
-    until(lambda: page.player._tracked[RUN].error is not None)
+    until(lambda: page.player._overlays[RUN].error is not None)
     run, seen = page.player.run(RUN), page.found.observations
     expected = track_errors(run.trajectory.positions, seen.tracks)[5]
     with page.player.lock:
         page.player.draw()
-        assert page.player._tracked[RUN].error == pytest.approx(expected, rel=1e-5)
+        assert page.player._overlays[RUN].error == pytest.approx(expected, rel=1e-5)
     assert f"{RUN} {1e3 * expected:.1f} mm" in page.player.errors()
 
 
@@ -107,14 +107,14 @@ def test_splats_are_put_on_when_they_are_wanted(opened, tmp_path):
     dressed(folder)
     page = opened(folder)
     body = page.player._bodies[RUN]
-    assert body.dress is None
+    assert body.splats is None
     page.parts["splats"].value = True
     page._changed()
-    assert body.dress.shown
-    before = body.dress.handle.centers.copy()
+    assert body.splats.shown
+    before = body.splats.handle.centers.copy()
     page.player.clock.show(7)
     page.player.draw()
-    assert (body.dress.handle.centers != before).any()
+    assert (body.splats.handle.centers != before).any()
 
 
 def test_what_is_not_there_cannot_be_switched_on(opened, tmp_path):

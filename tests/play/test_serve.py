@@ -116,12 +116,12 @@ def test_a_saved_recording_is_compared_and_names_its_twin(page, capsys):
 
     page.panel.start("baseline/0")
     live = page.panel.live
-    live.hold.take(1, "node", 3, live.simulator.positions[3])
-    live.hold.pull(1, live.simulator.positions[3] + [0.1, 0, 0])
+    live.grab.take(1, "node", 3, live.simulator.positions[3])
+    live.grab.pull(1, live.simulator.positions[3] + [0.1, 0, 0])
     end = time.monotonic() + 60
     while live.simulator.frame < 6 and time.monotonic() < end:
         time.sleep(0.05)
-    live.hold.release(1)
+    live.grab.release(1)
     page.panel._save()
     page.panel.stop()
     saved = next((page.panel._save_to).glob("controls_small_baseline_0_0.npz"))

@@ -141,7 +141,7 @@ def write_parameters(case: Released, **changes: Any) -> None:
 def write_checkpoint(case: Released, nodes: np.ndarray, hands: np.ndarray, self_collision: bool) -> Twin:
     """best_199.pth, scalars beyond their clamps among it; the twin, whose scalars are clamped."""
     p = parameters()
-    sizes = [p[f"{who}_{what}"] for who in ("object", "controller") for what in ("radius", "max_neighbors")]
+    sizes = [p[f"{who}_{what}"] for who in ("object", "controller") for what in ("radius", "max_neighbours")]
     topology = uniform_topology(nodes, hands, *sizes)
     stiffness = np.random.default_rng(3).uniform(1e3, 5e3, len(topology.springs)).astype(np.float32)
     stiffness[0] = 1.2e5

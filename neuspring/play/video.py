@@ -33,7 +33,7 @@ SUBPIXEL = 4
 
 
 @dataclass(frozen=True)
-class Film:
+class WrittenVideo:
     """What was written."""
 
     path: Path
@@ -44,7 +44,7 @@ class Film:
     """Why it is shorter than the recording, or has no splats."""
 
 
-def write_film(found: Scene, run: Run, controls: Controls, path: Path, camera: str | None = None) -> Film:
+def write_video(found: Scene, run: Run, controls: Controls, path: Path, camera: str | None = None) -> WrittenVideo:
     """A video of the controls on a run's twin, from the view of the page or of a camera. Raises InputError."""
     assert run.twin is not None
     view = _camera(found, run.twin, camera)
@@ -55,18 +55,18 @@ def write_film(found: Scene, run: Run, controls: Controls, path: Path, camera: s
     except (InputError, NumericalFailure) as error:
         reason = f"no splats: {error}"
     x = motion.positions
-    drawn = _points(run.twin, x, controls, view) if splats is None else _splats(Gaussians.of(splats), run.twin, x, view)
+    start = controls.start.hands if controls.start.hands.size else run.twin.topology.controllers
+    hands = np.concatenate([start[None], controls.hands])
+    drawn = _points(run.twin, x, hands, view) if splats is None else _splats(Gaussians.of(splats), run.twin, x, view)
     parts = Springs.of(run.twin)
     rate = 1 / run.twin.simulation.frame_time
     with Video(path, rate) as video:
         for frame, image in enumerate(drawn):
-            hands = controls.start.hands if frame == 0 else controls.hands[frame - 1]
-            hands = run.twin.topology.controllers if hands is None else hands
-            strain = float(parts.strain(parts.ends(x[frame], hands)).max(initial=0.0))
-            _mark(image, view, controls, x[frame], hands, frame)
+            strain = float(parts.strain(parts.ends(x[frame], hands[frame])).max(initial=0.0))
+            _mark(image, view, controls, x[frame], hands[frame], frame)
             _caption(image, f"{run.name}  {frame / rate:.2f} s", strain)
             video.add(image)
-    return Film(path, len(x), "splats" if splats is not None else "nodes and springs", reason)
+    return WrittenVideo(path, len(x), "splats" if splats is not None else "nodes and springs", reason)
 
 
 def _camera(found: Scene, twin: Twin, name: str | None) -> Camera:
@@ -99,13 +99,12 @@ def _splats(start: Gaussians, twin: Twin, positions: np.ndarray, camera: Camera)
         yield np.ascontiguousarray(picture(moved, view, backend, WHITE)[..., :3])
 
 
-def _points(twin: Twin, positions: np.ndarray, controls: Controls, camera: Camera) -> Iterator[np.ndarray]:
+def _points(twin: Twin, positions: np.ndarray, hands: np.ndarray, camera: Camera) -> Iterator[np.ndarray]:
     """Pictures [H, W, 3] of springs, colored by strain, and nodes."""
     parts, scale = Springs.of(twin, sample(len(twin.topology.springs))), strain_scale(TOO_MUCH)
-    for frame, nodes in enumerate(positions):
+    for nodes, held in zip(positions, hands, strict=False):
         image = np.full((camera.height, camera.width, 3), 255, np.uint8)
-        hands = controls.start.hands if frame == 0 else controls.hands[frame - 1]
-        ends = parts.ends(nodes, twin.topology.controllers if hands is None else hands)
+        ends = parts.ends(nodes, held)
         strain = parts.strain(ends)
         colors = scale.paint(strain)
         colors[strain > TOO_MUCH] = OVER

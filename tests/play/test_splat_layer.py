@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 from neuspring.core.artifacts import SplatCenters
-from neuspring.play.dress import UNIT, Dress, covariances
+from neuspring.play.layers import UNIT, SplatLayer, covariances
 from neuspring.play.results import find
 from neuspring.play.serve import start
 from neuspring.splats.harmonics import C0
@@ -54,17 +54,17 @@ def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
     run = find([scenario]).runs[0]
     assert run.splats_path is None and any("no splats" in note for note in run.notes)
     player = Player(server.scene, find([scenario]))
-    player.look.splats = True
+    player.display.splats = True
     player.apply()
-    assert player._bodies["baseline/0"].dress is None
+    assert player._bodies["baseline/0"].splats is None
 
 
 def test_they_turn_with_the_body(scenario, server):
     splats, run = dressed(scenario), find([scenario]).runs[0]
     nodes = run.trajectory.positions[0]
     turn, shift = Rotation.from_rotvec([0.3, -0.8, 1.1]), np.array([0.5, 0.1, -0.2])
-    dress = Dress(server.scene, "turned", splats, nodes)
-    means, quaternions = dress.placed(turn.apply(nodes) + shift)
+    layer = SplatLayer(server.scene, "turned", splats, nodes)
+    means, quaternions = layer.carried(turn.apply(nodes) + shift)
     assert means == pytest.approx(turn.apply(splats.means) + shift, abs=1e-5)
     expected = turn.as_matrix() @ covariances(splats.quaternions, np.exp(splats.log_scales)) @ turn.as_matrix().T
     assert covariances(quaternions, np.exp(splats.log_scales)) == pytest.approx(expected, abs=1e-8)
@@ -72,8 +72,8 @@ def test_they_turn_with_the_body(scenario, server):
 
 def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
     splats, run = dressed(scenario, degree=2), find([scenario]).runs[0]
-    dress = Dress(server.scene, "colors", splats, run.trajectory.positions[0])
-    handle = dress.handle
+    layer = SplatLayer(server.scene, "colors", splats, run.trajectory.positions[0])
+    handle = layer.handle
     assert handle.centers * UNIT == pytest.approx(splats.means, abs=1e-6)
     gaussians = Gaussians.of(splats)
     scales = torch.diag_embed(gaussians.scales).numpy()
@@ -86,29 +86,29 @@ def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
 def test_frames_may_be_shown_in_any_order_and_hidden_splats_cost_nothing(scenario, server):
     splats, run = dressed(scenario), find([scenario]).runs[0]
     x = run.trajectory.positions
-    dress = Dress(server.scene, "order", splats, x[0])
-    before = dress.handle.centers.copy()
-    dress.move(x[5])
-    assert np.array_equal(dress.handle.centers, before)
-    dress.show(True)
+    layer = SplatLayer(server.scene, "order", splats, x[0])
+    before = layer.handle.centers.copy()
+    layer.move(x[5])
+    assert np.array_equal(layer.handle.centers, before)
+    layer.show(True)
     for frame in (5, 2, 7, 5):
-        dress.move(x[frame])
-    again = Dress(server.scene, "order again", splats, x[0])
+        layer.move(x[frame])
+    again = SplatLayer(server.scene, "order again", splats, x[0])
     again.show(True)
     again.move(x[5])
-    assert np.array_equal(dress.handle.centers, again.handle.centers)
-    assert (dress.handle.centers != before).any()
+    assert np.array_equal(layer.handle.centers, again.handle.centers)
+    assert (layer.handle.centers != before).any()
 
 
 def test_a_model_with_splats_of_its_own_moves_them_itself(scenario, server):
     splats, run = dressed(scenario), find([scenario]).runs[0]
     positions = splats.means[None] + np.arange(8)[:, None, None] * np.array([0.01, 0, 0])
-    dress = Dress(server.scene, "own", splats, run.trajectory.positions[0], SplatCenters(positions=positions))
-    assert np.array_equal(dress.placed(run.trajectory.positions[3], 3)[0], positions[3].astype(np.float32))
+    layer = SplatLayer(server.scene, "own", splats, run.trajectory.positions[0], SplatCenters(positions=positions))
+    assert np.array_equal(layer.carried(run.trajectory.positions[3], 3)[0], positions[3].astype(np.float32))
 
 
 def test_of_too_many_a_sample_is_drawn(scenario, server, monkeypatch):
-    monkeypatch.setattr("neuspring.play.dress.MOST_SPLATS", 100)
+    monkeypatch.setattr("neuspring.play.layers.MOST_SPLATS", 100)
     splats, run = dressed(scenario), find([scenario]).runs[0]
-    dress = Dress(server.scene, "many", splats, run.trajectory.positions[0])
-    assert len(dress.handle.centers) == 100 and dress.left_out == 200
+    layer = SplatLayer(server.scene, "many", splats, run.trajectory.positions[0])
+    assert len(layer.handle.centers) == 100

@@ -7,8 +7,8 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.play.controls import Controls
-from neuspring.play.film import HAND, _camera, write_film
 from neuspring.play.results import find
+from neuspring.play.video import HAND, _camera, write_video
 from tests.support.played import dressed, results
 
 FRAMES, NODE = 5, 4
@@ -54,10 +54,10 @@ def test_a_recording_is_written_as_a_video(scenario, tmp_path, capsys):
 def test_a_run_with_splats_is_drawn_as_splats(scenario, tmp_path):
     dressed(scenario)
     found = find([scenario])
-    film = write_film(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4")
+    film = write_video(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4")
     assert film.kind == "splats"
     plain = results(tmp_path / "plain")
-    without = write_film(find([plain]), find([plain]).runs[-1], pulled(found.runs[-1]), tmp_path / "plain.mp4")
+    without = write_video(find([plain]), find([plain]).runs[-1], pulled(found.runs[-1]), tmp_path / "plain.mp4")
     covered, points = ((read(path)[0] < 230).any(axis=2).mean() for path in (film.path, without.path))
     assert covered > points > 0
 
@@ -65,7 +65,7 @@ def test_a_run_with_splats_is_drawn_as_splats(scenario, tmp_path):
 def test_the_hands_are_where_the_camera_sees_them(scenario, tmp_path):
     found = find([scenario])
     run = found.runs[-1]
-    write_film(found, run, pulled(run), tmp_path / "film.mp4")
+    write_video(found, run, pulled(run), tmp_path / "film.mp4")
     view = _camera(found, run.twin, None)
     ((x, y),) = np.round(view.project(run.twin.topology.controllers[:1].astype(float))[0]).astype(int)
     assert np.abs(read(tmp_path / "film.mp4")[0][y, x].astype(int) - HAND).max() < 60
@@ -74,7 +74,7 @@ def test_the_hands_are_where_the_camera_sees_them(scenario, tmp_path):
 def test_a_camera_that_is_not_there_is_named(scenario, tmp_path):
     found = find([scenario])
     with pytest.raises(InputError, match="must be a camera of the capture"):
-        write_film(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4", "7")
+        write_video(found, found.runs[-1], pulled(found.runs[-1]), tmp_path / "film.mp4", "7")
     assert not (tmp_path / "film.mp4").exists()
 
 
