@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,18 +18,19 @@ import numpy as np
 import torch
 
 from neuspring.baselines.spring_gaus import vgg
-from neuspring.config import Config
-from neuspring.core.artifacts import Material, Simulation, Topology, Twin
+from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
 from neuspring.core.text import masked
 from neuspring.core.weights import hub_folder
+from neuspring.data.synthetic import toy
 from neuspring.experiments import needs
 from neuspring.experiments.tracking import store
 from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
 from neuspring.scores import lpips_weights
 from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.view import View
+from neuspring.twin.rollout import roll_out
 
 State = Literal["ok", "absent", "broken"]
 FREE_GB = 20.0
@@ -52,12 +53,7 @@ class Finding:
 
 def examine(settings: Config) -> list[Finding]:
     """All findings, for what a configuration asks for."""
-    return [
-        *_libraries(settings),
-        *_devices(settings),
-        *_weights(settings),
-        *_storage(settings),
-    ]
+    return [*_libraries(settings), *_devices(settings), *_weights(settings), *_storage(settings)]
 
 
 def text(findings: list[Finding]) -> str:
@@ -76,15 +72,21 @@ def text(findings: list[Finding]) -> str:
 
 def _libraries(settings: Config) -> Iterator[Finding]:
     yield Finding("Python", "ok", sys.version.split()[0])
-    cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "build for the CPU"
-    yield Finding("torch", "ok", f"{torch.__version__}, {cuda}")
-    for package in ("warp-lang", "snakemake", "mlflow", "optuna", "newton"):
-        yield _installed(package)
-    yield _encoder()
+    yield Finding(
+        "torch", "ok", f"{torch.__version__}, {f'CUDA {torch.version.cuda}' if torch.version.cuda else 'build for the CPU'}"
+    )
+    for package in ("warp-lang", "snakemake", "mlflow", "optuna"):
+        try:
+            yield Finding(package, "ok", version(package))
+        except PackageNotFoundError:
+            yield Finding(package, "broken", "not installed", "make install")
+    segments = settings.perception.segment.backend == "grounded_sam2"
     extras = {
+        "av": ("video", False),
+        "newton": ("synthetic", False),
         "gsplat": ("gpu", settings.images.backend == "gsplat"),
-        "transformers": ("perception", settings.perception.segment.backend == "grounded_sam2"),
-        "torchvision": ("perception", settings.perception.segment.backend == "grounded_sam2"),
+        "transformers": ("perception", segments),
+        "torchvision": ("perception", segments),
         "snakemake_executor_plugin_slurm": ("slurm", False),
         "psycopg2": ("postgresql", bool(settings.tune and settings.tune.storage)),
     }
@@ -94,101 +96,58 @@ def _libraries(settings: Config) -> Iterator[Finding]:
         else:
             remedy = f'.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[{extra}]"'
             yield Finding(module, "broken" if wanted else "absent", f"extra {extra} is not installed", remedy)
+    if importlib.util.find_spec("av"):
+        import av
+
+        try:
+            av.codec.Codec("libx264", "w")
+            yield Finding("H.264 encoder", "ok", f"libx264, av {av.__version__}")
+        except (ValueError, LookupError) as error:
+            remedy = "Install av from its wheel: .venv/bin/pip install --force-reinstall av"
+            yield Finding("H.264 encoder", "broken", str(error), remedy)
 
 
-def _installed(package: str) -> Finding:
+def _checked(subject: str, check: Callable[[], str], remedy: str = "") -> Finding:
+    """What a check says; broken where it raises InputError."""
     try:
-        return Finding(package, "ok", version(package))
-    except PackageNotFoundError:
-        return Finding(package, "broken", "not installed", "make install")
-
-
-def _encoder() -> Finding:
-    import av
-
-    try:
-        av.codec.Codec("libx264", "w")
-    except (ValueError, LookupError) as error:
-        return Finding(
-            "H.264 encoder", "broken", str(error), "Install av from its wheel: .venv/bin/pip install --force-reinstall av"
-        )
-    return Finding("H.264 encoder", "ok", f"libx264, av {av.__version__}")
+        return Finding(subject, "ok", check())
+    except InputError as error:
+        return Finding(subject, "broken", str(error), remedy)
 
 
 def _devices(settings: Config) -> Iterator[Finding]:
-    try:
-        device = resolve_device(settings.device)
-    except InputError as error:
-        yield Finding("device", "broken", str(error), "Set device: cpu, or install what the message names.")
-        return
     import warp as wp
 
+    found = _checked("device", lambda: resolve_device(settings.device), "Set device: cpu, or install what the message names.")
+    yield found
+    if found.state == "broken":
+        return
+    device = found.detail
     start_warp()
-    names = ", ".join(str(one.alias) for one in wp.get_devices())
-    yield Finding("Warp devices", "ok", names)
-    try:
-        pool = needs.gpu_pool(settings.gpus, settings.device)
-        lease = ", ".join(pool) or "none: jobs run on the CPU"
-        yield Finding("GPUs that jobs may lease", "ok" if pool else "absent", lease, "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
-    except InputError as error:
-        yield Finding("GPUs that jobs may lease", "broken", str(error))
-    try:
-        yield Finding("rasterizer", "ok", choose_backend(settings.images.backend, device))
-    except InputError as error:
-        yield Finding("rasterizer", "broken", str(error))
+    yield Finding("Warp devices", "ok", ", ".join(str(one.alias) for one in wp.get_devices()))
+    leased = _checked("GPUs that jobs may lease", lambda: ", ".join(needs.gpu_pool(settings.gpus, settings.device)))
+    none = Finding(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
+    yield leased if leased.detail else none
+    yield _checked("rasterizer", lambda: choose_backend(settings.images.backend, device))
     if device.startswith("cuda"):
         yield from _parity(device)
 
 
 def _parity(device: str) -> Iterator[Finding]:
-    """Simulator and rasterizer on CUDA against the CPU, in about two seconds after kernels are compiled."""
-    from neuspring.twin.rollout import roll_out
-
-    twin, hands = _small_twin()
-    positions = [roll_out(twin, hands, where).positions for where in ("cpu", device)]
-    difference = float(np.abs(positions[0] - positions[1]).max())
-    good = difference <= PARITY_POSITION
-    detail = f"{difference:.1e} m in 10 frames from the CPU's (limit {PARITY_POSITION:.0e})"
-    yield Finding(f"simulator on {device}", "ok" if good else "broken", detail, "Use device: cpu, and report this.")
+    """Simulator and rasterizer on CUDA against the CPU, in a few seconds after kernels are compiled."""
+    row = ScenarioRow(
+        scenario="parity", source="toy", category="cloth", path="cloth/lift/smooth", self_collision=False, ground=True
+    )
+    scene = toy.make(row, Toy(frames=11))
+    hands = scene.observations.controller_points
+    positions = [roll_out(scene.truth, hands, where).positions for where in ("cpu", device)]
     pictures = [_small_picture(where) for where in ("cpu", device)]
-    difference = float((pictures[0] - pictures[1]).abs().max())
-    good = difference <= PARITY_COLOR
-    detail = f"{difference:.1e} in color from the CPU's (limit {PARITY_COLOR:.0e})"
-    yield Finding(f"rasterizer on {device}", "ok" if good else "broken", detail, "Use device: cpu, and report this.")
-
-
-def _small_twin() -> tuple[Twin, np.ndarray]:
-    """A sheet of 8 x 8 nodes that hangs from two controllers, which lift it."""
-    side, spacing = 8, 0.02
-    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
-    nodes = np.concatenate([spacing * grid, np.full((len(grid), 1), 0.3)], axis=1)
-    gaps = np.linalg.norm(grid[:, None] - grid[None], axis=-1)
-    pairs = np.argwhere(np.triu((gaps > 0) & (gaps < 1.5)))
-    hands = nodes[[0, side - 1]] + np.array([0.0, -spacing, 0.0])
-    held = np.array([[0, len(nodes)], [side - 1, len(nodes) + 1]])
-    springs = np.concatenate([pairs, held]).astype(np.int32)
-    points = np.concatenate([nodes, hands])
-    lengths = np.linalg.norm(points[springs[:, 0]] - points[springs[:, 1]], axis=1)
-    topology = Topology(
-        nodes=nodes.astype(np.float32),
-        controllers=hands.astype(np.float32),
-        springs=springs,
-        rest_lengths=lengths.astype(np.float32),
-        labels=np.zeros(len(nodes), np.int32),
-    )
-    material = Material(
-        stiffness=np.full(len(springs), 500.0, np.float32),
-        dashpot=np.full(len(springs), 1.0, np.float32),
-        drag=1.0,
-        ground_elasticity=0.5,
-        ground_friction=0.3,
-        contact_elasticity=0.5,
-        contact_friction=0.3,
-        contact_distance=0.01,
-    )
-    twin = Twin(topology=topology, material=material, simulation=Simulation(frame_time=1 / 30, substeps=67))
-    lifted = hands[None] + np.linspace(0, 0.05, 11)[:, None, None] * np.array([0.0, 0.0, 1.0])
-    return twin, lifted.astype(np.float32)
+    for what, difference, limit, unit in (
+        ("simulator", float(np.abs(positions[0] - positions[1]).max()), PARITY_POSITION, "m in 10 frames"),
+        ("rasterizer", float((pictures[0] - pictures[1]).abs().max()), PARITY_COLOR, "in color"),
+    ):
+        detail = f"{difference:.1e} {unit} from the CPU's (limit {limit:.0e})"
+        yield Finding(f"{what} on {device}", "ok" if difference <= limit else "broken", detail, "Use device: cpu, and report this.")
 
 
 def _small_picture(device: str) -> torch.Tensor:
@@ -211,12 +170,9 @@ def _small_picture(device: str) -> torch.Tensor:
 
 
 def _weights(settings: Config) -> Iterator[Finding]:
-    yield from _checked_weights(settings)
-    yield from _hub_weights(settings)
+    from huggingface_hub import try_to_load_from_cache
 
-
-def _checked_weights(settings: Config) -> Iterator[Finding]:
-    """Weight files that are known by their checksum."""
+    # Files that are known by their checksum.
     hub = hub_folder()
     checked = {
         "LPIPS (AlexNet)": (
@@ -238,12 +194,7 @@ def _checked_weights(settings: Config) -> Iterator[Finding]:
             yield Finding(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
         else:
             yield Finding(subject, "ok", "checksum is right")
-
-
-def _hub_weights(settings: Config) -> Iterator[Finding]:
-    """Weights of perception, which their libraries keep in caches of their own."""
-    from huggingface_hub import try_to_load_from_cache
-
+    # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
     for subject, name in {
         "GroundingDINO": segment.grounded_sam2.detector,
