@@ -31,6 +31,7 @@ RENAMED = {
     "start": "of a search now variables.NAME: {start: ...}",
     "betas": "a constant of neuspring/twin/fit.py now",
     "last_frame": REMOVED,
+    "warmup_scenarios": "a third of the scenarios now",
 }
 RENAMED |= dict.fromkeys(
     (

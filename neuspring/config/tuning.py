@@ -73,11 +73,9 @@ class Tune(Section):
     halving drops."""
     startup_trials: Whole = 10
     """Number of random trials, before the sampler (TPE) learns from earlier ones and before the median prunes any."""
-    warmup_scenarios: Whole | None = None
-    """Number of scenarios that every trial runs to their end before it may be pruned, because the loss of one alone says little
-    about the mean. They are run in the order given; null: a third of them, rounded up, if there are several."""
     warmup_epochs: Whole = 5
-    """Epochs of the next scenario in which no trial is pruned either."""
+    """Epochs in which no trial is pruned. Of several scenarios, every trial first runs a third, in the order given, to their end:
+    the loss of one alone says little about the mean."""
 
     def __post_init__(self) -> None:
         if not self.space:

@@ -89,7 +89,6 @@ def test_pruning_waits_for_whole_scenarios():
     for scenarios, steps in ((1, 5), (2, 15), (22, 85)):
         pruner = worker.pruner_of(sweep(warmup_epochs=5), scenarios, 10)
         assert pruner._inner._n_warmup_steps == steps
-    assert worker.pruner_of(sweep(warmup_epochs=5, warmup_scenarios=0), 22, 10)._inner._n_warmup_steps == 5
 
 
 def test_a_numerical_failure_is_a_failed_trial_with_its_reason(folder):

@@ -8,9 +8,11 @@ where a trial was begun again.
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 import json
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -24,7 +26,7 @@ import yaml
 from optuna.study import Study
 
 from neuspring import config
-from neuspring.config import Config
+from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_atomically, write_table, write_text
 from neuspring.core.records import canonical
@@ -143,32 +145,35 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
     """
     if findings.best is None:
         return
-    plan = findings.plan
-    values = findings.best.trials[-1].user_attrs[VALUES]
-    methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
-    name = tuned_name(plan.tune)
-    sections: dict[str, dict[str, Any]] = {name: {} for name in SECTIONS}
+    plan, values = findings.plan, findings.best.trials[-1].user_attrs[VALUES]
+    name, method = tuned_name(plan.tune), plan.tune.method
+    sections: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
     for path, value in values.items():
         if path != CLUSTERS:
             *above, key = path.split(".")
-            place: dict[str, Any] = sections
-            for part in above:
-                place = place.setdefault(part, {})
-            place[key] = value
-    text = f"{plan.tune.method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"
-    search, row = plan.method.search, plan.row
+            functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
+
+    def tuned(row: Method | SearchRow, section: str, **changes: Any) -> Any:
+        merged = copy.deepcopy(dict(row.settings))
+        config.merge(merged, sections[section])
+        text = f"{method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"  # type: ignore[union-attr]
+        return replace(row, settings=merged, description=text, **changes)
+
+    methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
+    search = plan.method.search
     if sections["search"] or CLUSTERS in values:
         search = name
-        clusters = values.get(CLUSTERS, row.clusters)
-        searches[search] = replace(row, clusters=clusters, settings=_merged(row.settings, sections["search"]), description=text)
-    methods[name] = replace(plan.method, search=search, settings=_merged(plan.method.settings, sections["fit"]), description=text)
-    _write_yaml(folder / "methods.yaml", {key: config.plain(value) for key, value in methods.items()})
-    _write_yaml(folder / "searches.yaml", {key: config.plain(value) for key, value in searches.items()})
-    overlay: dict[str, Any] = {"methods": [plan.tune.method, name], "compare_with": plan.tune.method, "tables": f"tables-{name}"}
+        searches[name] = tuned(plan.row, "search", clusters=values.get(CLUSTERS, plan.row.clusters))
+    methods[name] = tuned(plan.method, "fit", search=search)
+    overlay: dict[str, Any] = {"methods": [method, name], "compare_with": method, "tables": f"tables-{name}"}
     # Absolute: relative ones would start from the Snakefile.
-    overlay |= {f"{table}_table": str((folder / name).resolve()) for table, name in TABLES_OF_ROWS.items()}
+    overlay |= {f"{table}_table": str((folder / file).resolve()) for table, file in TABLES_OF_ROWS.items()}
     overlay |= {section: sections[section] for section in SHARED if sections[section]}
-    _write_yaml(folder / "best.yaml", overlay)
+    contents = {"best.yaml": overlay}
+    contents["methods.yaml"] = {key: config.plain(value) for key, value in methods.items()}
+    contents["searches.yaml"] = {key: config.plain(value) for key, value in searches.items()}
+    for file, content in contents.items():
+        write_text(folder / file, yaml.safe_dump(content, sort_keys=False, width=120))
 
 
 def tuned_name(tune: Tune) -> str:
@@ -176,68 +181,75 @@ def tuned_name(tune: Tune) -> str:
     return f"{tune.method}_{tune.study}"
 
 
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    values = copy.deepcopy(dict(below))
-    config.merge(values, above)
-    return values
-
-
-def _write_yaml(path: Path, values: Mapping[str, Any]) -> None:
-    write_text(path, yaml.safe_dump(dict(values), sort_keys=False, width=120))
-
-
 def summary(findings: Findings, folder: Path) -> str:
     """The sweep in Markdown."""
-    plan, tune, best = findings.plan, findings.plan.tune, findings.best
-    counts = {state: sum(slot.state == state for slot in findings.slots) for state in ("complete", "pruned", "failed", "running")}
+    plan, tune = findings.plan, findings.plan.tune
+    counts = Counter(slot.state for slot in findings.slots)
     ended = counts["complete"] + counts["pruned"] + counts["failed"]
-    lines = [f"# Sweep {tune.study}: {tune.method} tuned", ""]
-    how = f"{counts['complete']} finished, {counts['pruned']} pruned, {counts['failed']} failed"
-    lines += [f"{ended} of {tune.trials} trials: {how}."]
+    share, many = plan.base["fit"]["tail_fraction"], f"{len(findings.scenes)} scenario{'s' * (len(findings.scenes) > 1)}"
+    lines = [
+        f"# Sweep {tune.study}: {tune.method} tuned",
+        "",
+        f"{ended} of {tune.trials} trials: {counts['complete']} finished, {counts['pruned']} pruned, {counts['failed']} failed.",
+    ]
     if counts["running"]:
         lines += [f"{counts['running']} more are running, or were left behind by a killed worker."]
-    share, many = plan.base["fit"]["tail_fraction"], f"{len(findings.scenes)} scenario{'s' * (len(findings.scenes) > 1)}"
-    lines += ["", f"The loss, m², is that of the last {share:.0%} of the training frames, which neither search nor fit has seen."]
-    lines += [f"It is the mean over {many}: {', '.join(findings.scenes)}. Test frames were not read.", ""]
-    codes = findings.table["code"].dropna().unique()
-    if len(codes) > 1:
-        lines += [f"Trials were made by {len(codes)} versions of the code (see trials.csv) and may not be comparable.", ""]
-    lines += _best_lines(findings, folder) if best else ["No trial has finished, so there is no best one.", ""]
+    lines += [
+        "",
+        f"The loss, m², is that of the last {share:.0%} of the training frames, which neither search nor fit has seen.",
+        f"It is the mean over {many}: {', '.join(findings.scenes)}. Test frames were not read.",
+        "",
+    ]
+    if (codes := findings.table["code"].nunique()) > 1:
+        lines += [f"Trials were made by {codes} versions of the code (see trials.csv) and may not be comparable.", ""]
+    lines += _best_lines(findings, folder)
     lines += ["## Importance", ""]
     if findings.importances:
         lines += markdown(["Setting", "Importance"], [[name, f"{value:.2f}"] for name, value in findings.importances.items()])
         lines += ["", "PED-ANOVA over finished trials. With few trials it says little.", ""]
     else:
         lines += ["Not computable: too few trials have finished, or they do not differ.", ""]
-    lines += _trial_lines(findings)
-    failed = [slot for slot in findings.slots if slot.state == "failed"]
-    if failed:
-        lines += ["## Failed", "", *(f"- trial {slot.number}: {slot.reason}" for slot in failed), ""]
+    done = findings.table[findings.table["state"] == "complete"].sort_values(["loss", "trial"]).head(SHOWN)
+    rows = [
+        [str(row["trial"]), f"{row['loss']:.4e}", *(_shown(row[name]) for name in tune.space)] for row in done.to_dict("records")
+    ]
+    table = markdown(["Trial", "Loss [m²]", *tune.space], rows) if rows else ["None."]
+    lines += [f"## The best {SHOWN} finished trials", "", *table, "", "All trials: `trials.csv`.", ""]
+    if failed := [f"- trial {slot.number}: {slot.reason}" for slot in findings.slots if slot.state == "failed"]:
+        lines += ["## Failed", "", *failed, ""]
     lines += [line for name, text in PICTURES.items() if (folder / name).is_file() for line in (f"![{text}]({name})", "")]
     return "\n".join(lines)
 
 
 def _best_lines(findings: Findings, folder: Path) -> list[str]:
-    assert findings.best is not None
     plan, best, baseline = findings.plan, findings.best, findings.baseline
+    if best is None:
+        return ["No trial has finished, so there is no best one.", ""]
     loss = best.trials[-1].value
     assert loss is not None
-    lines = ["## Best", "", f"Trial {best.number}: {loss:.4e} m²."]
     if baseline is None:
-        lines += ["The unchanged configuration (trial 0) has not finished."]
+        compared = "The unchanged configuration (trial 0) has not finished."
     elif best.number == 0:
-        lines += ["That is the unchanged configuration: no trial was better."]
+        compared = "That is the unchanged configuration: no trial was better."
     else:
-        lines += [f"The unchanged configuration (trial 0): {baseline:.4e} m²; a ratio of {loss / baseline:.3f}."]
-    lines += ["The smallest of many losses on the same few frames is optimistic: compare the two methods on test frames.", ""]
+        compared = f"The unchanged configuration (trial 0): {baseline:.4e} m²; a ratio of {loss / baseline:.3f}."
     values, unchanged = labels(best.trials[-1].user_attrs[VALUES]), labels(plan.baseline)
-    lines += markdown(["Setting", "Best", "Unchanged"], [[name, _shown(values[name]), _shown(unchanged[name])] for name in values])
-    lines += [
+    lines = [
+        "## Best",
+        "",
+        f"Trial {best.number}: {loss:.4e} m².",
+        compared,
+        "The smallest of many losses on the same few frames is optimistic: compare the two methods on test frames.",
+        "",
+        *markdown(["Setting", "Best", "Unchanged"], [[name, _shown(values[name]), _shown(unchanged[name])] for name in values]),
         "",
         f"`{folder / 'best.yaml'}` is an overlay with both as rows, `{plan.tune.method}` and `{tuned_name(plan.tune)}`:",
         "",
+        "```",
+        f"snakemake ... --configfile <the benchmark's> {folder / 'best.yaml'}",
+        "```",
+        "",
     ]
-    lines += ["```", f"snakemake ... --configfile <the benchmark's> {folder / 'best.yaml'}", "```", ""]
     if shared := [name for name in values if name.split(".")[0] in SHARED]:
         lines += [f"It sets {', '.join(shared)} for both rows: these settings belong to no method.", ""]
     return lines
@@ -248,51 +260,39 @@ def _shown(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
 
 
-def _trial_lines(findings: Findings) -> list[str]:
-    names = list(findings.plan.tune.space)
-    done = findings.table[findings.table["state"] == "complete"].sort_values(["loss", "trial"]).head(SHOWN)
-    rows = [[str(row["trial"]), f"{row['loss']:.4e}", *(_shown(row[name]) for name in names)] for row in done.to_dict("records")]
-    lines = markdown(["Trial", "Loss [m²]", *names], rows) if rows else ["None."]
-    return [f"## The best {SHOWN} finished trials", "", *lines, "", "All trials: `trials.csv`.", ""]
-
-
 def _draw(study: Study, folder: Path, *, importances: bool) -> None:
     """Draw a sweep that has a finished or pruned trial; `importances`: whether they can be computed."""
     import optuna.visualization.matplotlib as plots
-
-    losses = [trial.value for trial in study.get_trials(deepcopy=False) if trial.value is not None]
-    columns = len({name for trial in study.get_trials(deepcopy=False) for name in trial.params})
-    if losses:
-        _save(lambda: plots.plot_optimization_history(study, target_name=LOSS), folder / "history.png", 2.4, losses)
-        _save(lambda: plots.plot_slice(study, target_name=LOSS), folder / "slices.png", columns, losses)
-        _save(lambda: plots.plot_parallel_coordinate(study, target_name=LOSS), folder / "parallel.png", columns)
-    if importances:
-        _save(lambda: plots.plot_param_importances(study, target_name=LOSS), folder / "importances.png", 2.4)
-    values = [value for trial in study.get_trials(deepcopy=False) for value in trial.intermediate_values.values()]
-    if values:
-        _save(
-            lambda: plots.plot_intermediate_values(study), folder / "steps.png", 3.0, values, "epoch, counted through the scenarios"
-        )
-
-
-def _save(plot: Callable[[], Any], path: Path, columns: float, losses: list[float] | None = None, label: str = "") -> None:
-    """Save a picture of `columns` panels; `losses` are those on its y axis."""
     from matplotlib import pyplot as plt
 
-    with warnings.catch_warnings(), plt.style.context("default"):
-        warnings.simplefilter("ignore")
-        axes = list(np.ravel(plot()))
-    figure = axes[0].figure.get_figure(root=True)
-    assert figure is not None
-    figure.set_size_inches(WIDTH * columns + 0.8, HEIGHT)
-    if losses and min(losses) > 0 and max(losses) >= LOG_FROM * min(losses):
-        axes[0].set_yscale("log")
-    if (legend := axes[0].get_legend()) and len(legend.get_texts()) > LEGEND:
-        legend.remove()
-    if label:
-        axes[0].set(xlabel=label, ylabel="mean " + LOSS, title="")
-    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=DPI, format="png", bbox_inches="tight"))
-    plt.close(figure)
+    def save(name: str, columns: float, plot: Callable[[], Any], losses: Sequence[float] = (), **labels: str) -> None:
+        """Save a picture of `columns` panels; `losses` are those on its y axis."""
+        with warnings.catch_warnings(), plt.style.context("default"):
+            warnings.simplefilter("ignore")
+            axes = list(np.ravel(plot()))
+        figure = axes[0].figure.get_figure(root=True)
+        figure.set_size_inches(WIDTH * columns + 0.8, HEIGHT)
+        if losses and max(losses) >= LOG_FROM * min(losses) > 0:
+            axes[0].set_yscale("log")
+        if (legend := axes[0].get_legend()) and len(legend.get_texts()) > LEGEND:
+            legend.remove()
+        axes[0].set(**labels)
+        write_atomically(folder / name, lambda path: figure.savefig(path, dpi=DPI, format="png", bbox_inches="tight"))
+        plt.close(figure)
+
+    trials = study.get_trials(deepcopy=False)
+    losses = [trial.value for trial in trials if trial.value is not None]
+    steps = [value for trial in trials for value in trial.intermediate_values.values()]
+    columns = len({name for trial in trials for name in trial.params})
+    if losses:
+        save("history.png", 2.4, lambda: plots.plot_optimization_history(study, target_name=LOSS), losses)
+        save("slices.png", columns, lambda: plots.plot_slice(study, target_name=LOSS), losses)
+        save("parallel.png", columns, lambda: plots.plot_parallel_coordinate(study, target_name=LOSS))
+    if importances:
+        save("importances.png", 2.4, lambda: plots.plot_param_importances(study, target_name=LOSS))
+    if steps:
+        told = {"xlabel": "epoch, counted through the scenarios", "ylabel": f"mean {LOSS}", "title": ""}
+        save("steps.png", 3.0, lambda: plots.plot_intermediate_values(study), steps, **told)
 
 
 def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any], folder: Path) -> None:

@@ -199,9 +199,8 @@ class MedianOfStep(BasePruner):
 
 def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
     """The pruner of a sweep whose trials have at most `epochs` steps for each of its scenarios."""
-    unpruned = tune.warmup_scenarios
-    if unpruned is None:
-        unpruned = math.ceil(scenarios / 3) if scenarios > 1 else 0
+    # The loss of one scenario says little about the mean.
+    unpruned = math.ceil(scenarios / 3) if scenarios > 1 else 0
     warmup = unpruned * epochs + tune.warmup_epochs
     if tune.pruner == "hyperband":
         return HyperbandPruner(min_resource=max(warmup, 1), max_resource=max(scenarios * epochs, warmup, 1))
