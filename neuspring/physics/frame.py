@@ -39,36 +39,15 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def _open(real: Any, width: int) -> motion.Position:
-    """The positions of motion.py, with a last argument that they have no use for."""
-    lane = lanes(real, width)
-    Vector, Number = lane.Vector, lane.Number
-    Table: Any = wp.array2d(dtype=real)
-    plain, plain_adjoint = motion.position(real, width)
-
-    @wp.func
-    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, table: Table):
-        x, v = plain(p, w, dt, up, e, mu)
-        return x, v
-
-    @wp.func
-    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector, table: Table):
-        adj_x, adj_v, adj_e, adj_mu = plain_adjoint(p, w, dt, up, e, mu, hx, hv)
-        return adj_x, adj_v, adj_e, adj_mu
-
-    return motion.Position(moved, moved_adjoint)
-
-
-@functools.cache
 def kernels(real: Any, width: int, among: bool = False) -> Kernels:
     """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; `among` obstacles, or without any."""
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
-    moved, moved_adjoint = obstacles.position(real, width) if among else _open(real, width)
+    moved, moved_adjoint = (obstacles if among else motion).position(real, width)
     collided, collided_adjoint = collision.functions(real, width)
-    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)[2:]
+    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
 
     @wp.func
     def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):

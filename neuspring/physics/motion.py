@@ -42,9 +42,9 @@ class Position(NamedTuple):
     """Positions, for one scalar type and width."""
 
     moved: Any
-    """(x, v, dt, up, e, mu) -> x', v'."""
+    """(x, v, dt, up, e, mu, obstacles [O, 16], which only obstacles.py reads) -> x', v'."""
     moved_adjoint: Any
-    """(x, v, dt, up, e, mu, dL/dx', dL/dv') -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)."""
+    """(x, v, dt, up, e, mu, dL/dx', dL/dv', obstacles) -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)."""
 
 
 @functools.cache
@@ -85,6 +85,7 @@ def position(real: Any, width: int) -> Position:
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
+    Table: Any = wp.array2d(dtype=real)
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
@@ -105,7 +106,7 @@ def position(real: Any, width: int) -> Position:
         return vec3(a * w[0], a * w[1], -e * w[2])
 
     @wp.func
-    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number):
+    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, table: Table):
         x = p + scaled(w, dt)
         v = w
         # Almost no node is at the ground: one look at all lanes first.
@@ -144,7 +145,7 @@ def position(real: Any, width: int) -> Position:
         return vec3(hx[0], hx[1], hx[2] - htoi / w[2]), vec3(gx, gy, gz), he, hmu
 
     @wp.func
-    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector):
+    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector, table: Table):
         adj_x = hx
         adj_v = hv + scaled(hx, dt)
         adj_e = Number()

@@ -34,7 +34,7 @@ def allocate(b: Buffers) -> None:
 
 @functools.cache
 def position(real: Any, width: int) -> Position:
-    """Functions for a scalar type and a number of lanes: those of motion.py, with obstacles [O, 16] as a last argument."""
+    """Functions for a scalar type and a number of lanes: those of motion.py, among obstacles [O, 16]."""
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)

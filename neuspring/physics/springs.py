@@ -4,7 +4,7 @@ With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing spe
 
     f_e = (Y s + gamma w) d        to node i, and -f_e to node j.
 
-`Graph` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
+`allocate` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
 and as links, each spring at both ends, for a thread per node that shares nothing with others. A node's sum goes through its
 partners in ascending order both ways, so both give the same numbers.
 """
@@ -23,59 +23,30 @@ from neuspring.physics.lanes import lanes
 class Functions(NamedTuple):
     """Functions of this file for one scalar type and width."""
 
-    force: Any
-    """(offset, relative velocity, parameters) -> the force on the first end. Rows of the parameters: Y, 1 / l0, gamma."""
-    force_adjoint: Any
-    """(the same, c) -> adjoints of c . f: of offset, of relative velocity, of the parameters (second row over Y)."""
     add_row: Any
     add_row_adjoint: Any
     gathered: Any
     gathered_adjoint: Any
 
 
-class Graph(NamedTuple):
-    """Springs of a solver in its own order: by lower end, then by upper end."""
-
-    order: np.ndarray
-    """Where each spring stands in the caller's list [S]."""
-    ranks: np.ndarray
-    """Where each spring of the caller's list stands here [S]."""
-    rows: np.ndarray
-    """First spring of each node's row [N + 1]."""
-    partners: np.ndarray
-    """Upper end of each spring [S]."""
-    links: np.ndarray
-    """First link of each node [N + 1]."""
-    link_partners: np.ndarray
-    """Other end of each link, ascending within a node."""
-    link_springs: np.ndarray
-    """The link's spring."""
-
-    @classmethod
-    def of(cls, pairs: np.ndarray, nodes: int) -> "Graph":
-        """From springs [S, 2] between points; i >= nodes means controller i - nodes."""
-        ends = np.sort(np.asarray(pairs, np.int32).reshape(-1, 2), axis=1)
-        order = np.lexsort((ends[:, 1], ends[:, 0]))
-        lower, upper = ends[order].T
-        first, other, spring = np.concatenate([lower, upper]), np.concatenate([upper, lower]), np.tile(np.arange(len(order)), 2)
-        linked = np.lexsort((other, first))
-        linked = linked[first[linked] < nodes]
-        places = np.arange(nodes + 1)
-        return cls(
-            order,
-            np.argsort(order),
-            np.searchsorted(lower, places),
-            upper,
-            np.searchsorted(first[linked], places),
-            other[linked],
-            spring[linked],
-        )
-
-
 def allocate(b: Buffers, pairs: np.ndarray) -> None:
-    """Springs between `pairs` [S, 2] of points."""
-    graph = Graph.of(pairs, b.nodes)
-    b.add_integers(**{name: getattr(graph, name) for name in Graph._fields})
+    """Springs [S, 2] between points, ordered by lower end, then by upper end; i >= nodes means controller i - nodes."""
+    ends = np.sort(np.asarray(pairs, np.int32).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    lower, upper = ends[order].T
+    first, other, spring = np.concatenate([lower, upper]), np.concatenate([upper, lower]), np.tile(np.arange(len(order)), 2)
+    linked = np.lexsort((other, first))
+    linked = linked[first[linked] < b.nodes]
+    places = np.arange(b.nodes + 1)
+    b.add_integers(
+        order=order,  # Where each spring stands in the caller's list [S].
+        ranks=np.argsort(order),  # Where each spring of the caller's list stands here [S].
+        rows=np.searchsorted(lower, places),  # First spring of each node's row [N + 1].
+        partners=upper,  # Upper end of each spring [S].
+        links=np.searchsorted(first[linked], places),  # First link of each node [N + 1].
+        link_partners=other[linked],  # Other end of each link, ascending within a node.
+        link_springs=spring[linked],  # The link's spring.
+    )
 
 
 @functools.cache
@@ -94,6 +65,7 @@ def functions(real: Any, width: int) -> Functions:
 
     @wp.func
     def force(offset: Vector, relative: Vector, p: Vector) -> Vector:
+        """The force on the first end. Rows of the parameters p: Y, 1 / l0, gamma."""
         length = root(dot(offset, offset))
         d = divided(offset, floored(length))
         strain = wp.cw_mul(length, p[1]) - one
@@ -101,6 +73,7 @@ def functions(real: Any, width: int) -> Functions:
 
     @wp.func
     def force_adjoint(offset: Vector, relative: Vector, p: Vector, c: Vector):
+        """Adjoints of c . f: of offset, of relative velocity, of p (second row over Y)."""
         # With d = offset / l written out, so that d itself is never formed.
         length = root(dot(offset, offset))
         inverse = wp.cw_div(one, floored(length))
@@ -193,4 +166,4 @@ def functions(real: Any, width: int) -> Functions:
         adjoint.x[i, g] = adj_x
         adjoint.v[i, g] = adj_v
 
-    return Functions(force, force_adjoint, add_row, add_row_adjoint, gathered, gathered_adjoint)
+    return Functions(add_row, add_row_adjoint, gathered, gathered_adjoint)

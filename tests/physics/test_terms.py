@@ -19,7 +19,7 @@ from neuspring.physics.motion import APPROACH
 from tests.support import terms
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import scene, solver_for
-from tests.support.terms import launch, numbers, twins, vectors
+from tests.support.terms import launch, no_obstacles, numbers, twins, vectors
 
 KERNEL = 1e-7
 """Relative to the largest entry of the gradient compared; measured 1e-9 to 1e-8."""
@@ -73,14 +73,13 @@ def forces(values: Arrays, way: str) -> np.ndarray:
     return b.get_vectors("force", count=b.nodes).numpy()
 
 
-def force_adjoints(values: Arrays, weight: np.ndarray, way: str, times: int = 1) -> Arrays:
+def force_adjoints(values: Arrays, weight: np.ndarray, way: str) -> Arrays:
     b, kernels = fill_net(values), terms.kernels(len(values["x"]))
     for name, tensor in b.tensors.items():
         if name.startswith("adj_"):
             tensor.zero_()
     b.set_vectors("adj_force", torch.tensor(weight), slot=0)
-    for _ in range(times):
-        launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments())
+    launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments())
     stiffness, inverse_length, dashpot = b.gradients()["springs"].numpy().transpose(2, 0, 1)
     state = {name: b.get_vectors(f"adj_{name}", count=b.nodes).numpy() for name in ("x", "v")}
     # d(1 / l0) = -d(l0) / l0^2
@@ -109,36 +108,6 @@ def test_springs(dashpot: float, way: str, width: int) -> None:
     got = force_adjoints(at, weight, way)
     for adjoint, wanted in compared(at, {}, lambda values: forces(values, way), got, weight):
         assert_gradients(adjoint, wanted, KERNEL)
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-def test_both_ways_give_the_same_forces_and_adjoints(width: int) -> None:
-    """Bit for bit: both sum a node's springs by partner, in ascending order."""
-    at, weight = net_values(1, width, 2.0)
-    np.testing.assert_array_equal(forces(at, "rows"), forces(at, "links"))
-    rows, links = (force_adjoints(at, weight, way) for way in ("rows", "links"))
-    for name, values in rows.items():
-        np.testing.assert_array_equal(values, links[name], err_msg=name)
-
-
-@pytest.mark.parametrize("way", ["rows", "links"])
-def test_spring_adjoints_accumulate(way: str) -> None:
-    """Adjoints add to what is there: substeps share the buffers."""
-    at, weight = net_values(2, 1, 0.5)
-    once, twice = (force_adjoints(at, weight, way, times) for times in (1, 2))
-    for name, values in once.items():
-        assert values.any()
-        np.testing.assert_allclose(twice[name], 2 * values, rtol=EXACT, err_msg=name)
-
-
-def test_a_force_counts_in_its_substep_only() -> None:
-    """One thread adds to the sums of all nodes; they are zero again before the next substep."""
-    body = scene(2, [(0, 1)], [1.0], stiffness=3.0, substeps=3)
-    solver, x = solver_for(body, 0), torch.tensor([[0.0, 0, 0], [0.5, 0, 0]]).double()
-    nobody = torch.zeros(0, 3).double()
-    _, v = solver.forward(x, 0 * x, nobody, nobody)
-    assert not solver.buffers.tensors["force"].any()
-    assert v.any()
 
 
 # Velocity -------------------------------------------------------------------------------------------------------------
@@ -188,7 +157,7 @@ def moved(values: Arrays, up: float) -> np.ndarray:
     after = [vectors(np.zeros_like(values["x"])) for _ in range(2)]
     state, response = (vectors(values["x"]), vectors(values["v"])), (numbers(values["e"]), numbers(values["mu"]))
     kernel, count = terms.kernels(len(values["x"])).motion, values["x"].shape[1]
-    launch(kernel, count, *state, numbers(values["dt"]), up, *response, *after)
+    launch(kernel, count, *state, numbers(values["dt"]), up, *response, no_obstacles(), *after)
     return np.stack([twins(array) for array in after], axis=2)
 
 
@@ -196,26 +165,9 @@ def moved_adjoints(values: Arrays, up: float, weight: np.ndarray) -> Arrays:
     width, count = values["x"].shape[:2]
     adjoints = [vectors(weight[:, :, 0]), vectors(weight[:, :, 1]), *(numbers(np.zeros((width, count))) for _ in range(2))]
     state, response = (vectors(values["x"]), vectors(values["v"])), (numbers(values["e"]), numbers(values["mu"]))
-    launch(terms.kernels(width).motion_adjoint, count, *state, numbers(values["dt"]), up, *response, *adjoints)
+    launch(terms.kernels(width).motion_adjoint, count, *state, numbers(values["dt"]), up, *response, no_obstacles(), *adjoints)
     adj_x, adj_v, adj_e, adj_mu = map(twins, adjoints)
     return {"x": adj_x, "v": adj_v, "e": adj_e.sum(axis=1), "mu": adj_mu.sum(axis=1)}
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-def test_position_without_ground(width: int) -> None:
-    """x' = x + dt v', v' unchanged, also for nodes below z = 0."""
-    x, v = np.random.default_rng(3).standard_normal((2, width, 4, 3))
-    weight = np.random.default_rng(5).standard_normal((width, 4, 2, 3))
-    dt = DT[:width, None, None]
-    values = {"x": x, "v": v, "dt": DT[:width], "e": np.full(width, 0.5), "mu": np.full(width, 0.3)}
-    assert (x[..., 2] < 0).any()
-    np.testing.assert_allclose(moved(values, 0.0)[:, :, 0], x + dt * v)
-    np.testing.assert_array_equal(moved(values, 0.0)[:, :, 1], v)
-    got = moved_adjoints(values, 0.0, weight)
-    assert not got["e"].any()
-    assert not got["mu"].any()
-    np.testing.assert_allclose(got["x"], weight[:, :, 0])
-    np.testing.assert_allclose(got["v"], weight[:, :, 1] + dt * weight[:, :, 0])
 
 
 GROUND_CASES = {

@@ -38,7 +38,8 @@ def kernels(width: int) -> Kernels:
     lane = lanes(real, width)
     vectors: Any = wp.array(dtype=lane.Vector)
     numbers: Any = wp.array(dtype=lane.Number)
-    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)[2:]
+    table: Any = wp.array2d(dtype=real)
+    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
     _, updated, updated_adjoint = velocity(real, width)
     moved, moved_adjoint = position(real, width)
     collided, collided_adjoint = collision.functions(real, width)
@@ -89,9 +90,19 @@ def kernels(width: int) -> Kernels:
         adj_force[i] = own_force
         adj_decay[i] = own_decay
 
-    def motion(x: vectors, v: vectors, dt: numbers, up: wp.float64, e: numbers, mu: numbers, after_x: vectors, after_v: vectors):
+    def motion(
+        x: vectors,
+        v: vectors,
+        dt: numbers,
+        up: wp.float64,
+        e: numbers,
+        mu: numbers,
+        none: table,
+        after_x: vectors,
+        after_v: vectors,
+    ):
         i = wp.tid()
-        own_x, own_v = moved(x[i], v[i], dt[0], up, e[0], mu[0])
+        own_x, own_v = moved(x[i], v[i], dt[0], up, e[0], mu[0], none)
         after_x[i] = own_x
         after_v[i] = own_v
 
@@ -102,13 +113,14 @@ def kernels(width: int) -> Kernels:
         up: wp.float64,
         e: numbers,
         mu: numbers,
+        none: table,
         adj_x: vectors,
         adj_v: vectors,
         adj_e: numbers,
         adj_mu: numbers,
     ):
         i = wp.tid()
-        own_x, own_v, own_e, own_mu = moved_adjoint(x[i], v[i], dt[0], up, e[0], mu[0], adj_x[i], adj_v[i])
+        own_x, own_v, own_e, own_mu = moved_adjoint(x[i], v[i], dt[0], up, e[0], mu[0], adj_x[i], adj_v[i], none)
         adj_x[i] = own_x
         adj_v[i] = own_v
         adj_e[i] = own_e
@@ -130,6 +142,11 @@ def kernels(width: int) -> Kernels:
 def launch(kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
     """Run a kernel on the CPU."""
     wp.launch(load(kernel, "cpu"), size, list(arguments), device="cpu")
+
+
+def no_obstacles() -> Any:
+    """A table of no obstacles."""
+    return wp.zeros((0, 16), dtype=wp.float64, device="cpu")
 
 
 def vectors(values: np.ndarray) -> Any:
