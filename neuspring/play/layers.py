@@ -75,6 +75,7 @@ class BodyLayer:
         self.radius = radius = max(SIZE * spacing(nodes), LEAST * size)
         self._reach = max(radius, REACH * size)
         self.splats: SplatLayer | None = None
+        self.overlay: TrackOverlay | None = None
         self._handles: Any = None
         self._colors = node_colors(twin) if twin else np.tile(np.array(NODE, np.uint8), (len(nodes), 1))
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, self._colors)
@@ -98,6 +99,8 @@ class BodyLayer:
             self.springs.visible = display.springs
         if self.splats is not None:
             self.splats.show(display.splats)
+        if self.overlay is not None:
+            self.overlay.show(display.tracks)
 
     def move(self, nodes: np.ndarray, hands: np.ndarray, quantity: str, scale: Scale | None, most: float = np.inf) -> np.ndarray:
         """Draw nodes [N, 3] and hands [C, 3], m; springs stretched beyond `most` are red. Returns the strain of drawn springs."""
@@ -281,14 +284,15 @@ class Surroundings:
                 position=camera.camera_to_world[:3, 3],
             )
 
-    def show(self, *, points: bool, tracks: bool, cameras: bool, images: bool) -> None:
-        """Show the parts that are wanted."""
-        self.points.visible, self.tracks.visible = points, tracks
+    def show(self, display: Display, hidden: bool) -> None:
+        """Show the parts that are wanted; while they are hidden, cameras alone, without images."""
+        self.points.visible, self.tracks.visible = display.points and not hidden, display.tracks and not hidden
+        images = display.images and display.cameras and not hidden
         for camera in self.cameras.values():
-            camera.visible = cameras
-            if not (images and cameras) and self._images:
+            camera.visible = display.cameras
+            if self._images and not images:
                 camera.image = None
-        self._images = images and cameras
+        self._images = images
 
     def move(self, frame: int) -> None:
         """Show a frame."""

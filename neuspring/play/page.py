@@ -55,29 +55,36 @@ class Page:
     """The controls of a recording, shared by all browsers that have it open."""
 
     def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
-        self.server, self.found = server, found
-        scenario = found.observations.scenario
-        server.scene.set_up_direction(scenario.up)
-        # Beside the scene, not over it.
-        server.gui.main_panel.dock_right()
-        self.player = Player(server.scene, found)
+        self.server, self.found, self.player = server, found, Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
         self._alive, self._before = False, self.player.display.quantity
-        self._look_at()
-        server.gui.add_markdown(
+        self.boxes: dict[str, Any] = {}
+        self.parts: dict[str, Any] = {}
+        scenario, gui = found.observations.scenario, server.gui
+        server.scene.set_up_direction(scenario.up)
+        # Beside the scene, not over it.
+        gui.main_panel.dock_right()
+        # The first view: all shown runs, across the row in which they stand.
+        camera = server.initial_camera
+        camera.fov = OPENING
+        camera.up, camera.look_at, camera.position = self.player.view(OPENING)
+        gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
         )
-        self._springs()
-        tabs = server.gui.add_tab_group()
+        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self._before)
+        self.legend = gui.add_html("")
+        tabs = gui.add_tab_group()
         with tabs.add_tab("Recording"):
-            self._time()
-            self._runs()
+            self._add_time()
+            self._add_runs()
         with tabs.add_tab("Show"):
-            self._shown()
+            self._add_parts()
         with tabs.add_tab("Live"):
             self.panel = LivePanel(server, self.player, save_to, self._lived)
+        for handle in (self.quantity, self.gap, *self.boxes.values(), *self.parts.values()):
+            handle.on_update(lambda _: self._changed())
         self._changed()
-        self._keys()
+        self._add_keys()
         self._thread = threading.Thread(target=self._tick, name="clock", daemon=True)
         self._thread.start()
 
@@ -87,71 +94,44 @@ class Page:
         self._thread.join(5)
         self.panel.stop()
 
-    def _look_at(self) -> None:
-        """The first view: all shown runs, across the row in which they stand."""
-        camera = self.server.initial_camera
-        camera.fov = OPENING
-        camera.up, camera.look_at, camera.position = self.player.view(OPENING)
-
-    def _springs(self) -> None:
-        gui = self.server.gui
-        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self.player.display.quantity)
-        self.legend = gui.add_html("")
-        self.quantity.on_update(lambda _: self._changed())
-
-    def _time(self) -> None:
+    def _add_time(self) -> None:
         gui, clock = self.server.gui, self.player.clock
         with gui.add_folder("Time"):
-            self.bar = gui.add_html(clock.bar())
-            self.errors = gui.add_html("")
+            self.bar, self.errors = gui.add_html(clock.bar()), gui.add_html("")
             last = clock.count - 1
-            self.slider: Any = gui.add_slider(
-                "Frame", 0, last, 1, 0, marks=((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
-            )
+            marks = ((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
+            self.slider: Any = gui.add_slider("Frame", 0, last, 1, 0, marks=marks)
             self.play = gui.add_button("Play")
-            self.speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 ×")
-            self.loop = gui.add_checkbox("Loop", clock.loop)
+            speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 ×")
+            loop = gui.add_checkbox("Loop", clock.loop)
         self.slider.on_update(lambda event: self._scrubbed(event))
         self.play.on_click(lambda _: self.toggle())
-        self.speed.on_update(lambda _: setattr(clock, "speed", SPEEDS[self.speed.value]))
-        self.loop.on_update(lambda _: setattr(clock, "loop", bool(self.loop.value)))
+        speed.on_update(lambda _: setattr(clock, "speed", SPEEDS[speed.value]))
+        loop.on_update(lambda _: setattr(clock, "loop", bool(loop.value)))
 
-    def _runs(self) -> None:
+    def _add_runs(self) -> None:
         gui, display = self.server.gui, self.player.display
-        self.boxes: dict[str, Any] = {}
         with gui.add_folder("Runs", expand_by_default=len(self.found.runs) <= 12):
             for run in self.found.runs:
                 self.boxes[run.name] = gui.add_checkbox(run.name, run.name in display.runs, hint="; ".join(run.notes) or None)
-            self.gap = gui.add_slider("Side by side", 0.0, 3.0, 0.1, display.gap, hint="0: all in one place")
+            self.gap: Any = gui.add_slider("Side by side", 0.0, 3.0, 0.1, display.gap, hint="0: all in one place")
             self.notes = gui.add_html("")
-        for box in self.boxes.values():
-            box.on_update(lambda _: self._changed())
-        self.gap.on_update(lambda _: self._changed())
 
-    def _shown(self) -> None:
-        gui, display = self.server.gui, self.player.display
-        absent = self._absent()
-        self.parts: dict[str, Any] = {}
+    def _add_parts(self) -> None:
+        gui, found, absent = self.server.gui, self.found, dict[str, str]()
+        if found.capture is None:
+            absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
+        if not found.observations.tracks.size:
+            absent["tracks"] = "no tracks were annotated"
+        if not any(run.splats_path for run in found.runs):
+            absent["splats"] = "no run here has splats"
         for name, title in PARTS.items():
-            hint = absent.get(name)
-            self.parts[name] = gui.add_checkbox(title, getattr(display, name) and not hint, disabled=bool(hint), hint=hint)
+            hint, wanted = absent.get(name), getattr(self.player.display, name)
+            self.parts[name] = gui.add_checkbox(title, wanted and not hint, disabled=bool(hint), hint=hint)
         marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
         gui.add_html(f"<div style='{SMALL};margin-top:.6em'>{marks}</div>")
-        for box in self.parts.values():
-            box.on_update(lambda _: self._changed())
 
-    def _absent(self) -> dict[str, str]:
-        """Part -> why it cannot be shown."""
-        absent = {}
-        if self.found.capture is None:
-            absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
-        if not self.found.observations.tracks.size:
-            absent["tracks"] = "no tracks were annotated"
-        if not any(run.splats_path for run in self.found.runs):
-            absent["splats"] = "no run here has splats"
-        return absent
-
-    def _keys(self) -> None:
+    def _add_keys(self) -> None:
         gui, clock = self.server.gui, self.player.clock
         gui.add_html(f"<div style='{SMALL}'>{KEYS}</div>")
         for label, key, action in (

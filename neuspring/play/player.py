@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.play.colors import Scale, Springs, region_legend, scale_of, strain_scale
+from neuspring.play.colors import Scale, region_legend, scale_of, strain_scale
 from neuspring.play.layers import BodyLayer, Display, SplatLayer, Surroundings, TrackOverlay
 from neuspring.play.results import Run, Scene
 
@@ -97,7 +96,7 @@ class Player:
         self.scale: Scale | None = None
         self.notes: dict[str, str] = {}
         """Run -> why it is not shown, or what to know about it."""
-        self._scene, self._bodies, self._overlays = scene, dict[str, BodyLayer](), dict[str, TrackOverlay]()
+        self._scene, self._bodies = scene, dict[str, BodyLayer]()
         self._hidden = False
         self.limit: float | None = None
         """Strain at the end of the colors of a live twin; None: the recording is shown."""
@@ -122,20 +121,15 @@ class Player:
             wanted = self.display.runs[:MOST_SHOWN]
             for name in [name for name in self._bodies if name not in wanted]:
                 self._bodies.pop(name).remove()
-                self._overlays.pop(name)
             for name in wanted:
                 if name not in self._bodies:
                     self._add(self.run(name))
-            display = self.display
             for index, name in enumerate(name for name in wanted if name in self._bodies):
                 body = self._bodies[name]
                 self.add_splats(body, self.run(name))
-                body.show(display)
-                self._overlays[name].show(display.tracks)
+                body.show(self.display)
                 body.root.position, body.root.visible = self.offset(index), not self._hidden
-            seen = not self._hidden
-            points, tracks, images = (wish and seen for wish in (display.points, display.tracks, display.images))
-            self.around.show(points=points, tracks=tracks, cameras=display.cameras, images=images)
+            self.around.show(self.display, hidden=self._hidden)
             self.scale = self._scale()
             self.draw()
 
@@ -163,7 +157,7 @@ class Player:
 
     def view(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Up [3], the middle of the shown runs [3], m, and from where all are seen [3], m, with an angle of view, rad."""
-        sign = 1.0 if self.found.observations.scenario.up == "+z" else -1.0
+        sign = self.found.observations.scenario.up_sign
         last = np.array(self.offset(max(min(len(self.display.runs), MOST_SHOWN) - 1, 0)))
         middle, reach = 0.5 * (self.low + self.high + last), self.size + float(np.linalg.norm(last))
         way = np.array([1.0, -0.35, 0.45 * sign])
@@ -178,7 +172,8 @@ class Player:
             for name, body in self._bodies.items():
                 nodes = self._positions(self.run(name), frame)
                 body.move(nodes, hands, self.display.quantity, self.scale)
-                self._overlays[name].move(nodes, frame)
+                if body.overlay is not None:
+                    body.overlay.move(nodes, frame)
                 if body.splats is not None:
                     body.splats.move(nodes, frame)
             self.around.move(frame)
@@ -197,42 +192,33 @@ class Player:
     def errors(self) -> str:
         """The track error of each shown run in the shown frame, mm, in words; empty without tracks."""
         with self.lock:
-            found = {name: one.error for name, one in self._overlays.items() if one.error is not None and not self._hidden}
-        return "; ".join(f"{name} {1e3 * error:.1f} mm" for name, error in found.items())
+            overlays = {} if self._hidden else {name: body.overlay for name, body in self._bodies.items() if body.overlay}
+            return "; ".join(f"{name} {1e3 * one.error:.1f} mm" for name, one in overlays.items() if one.error is not None)
 
     def _add(self, run: Run) -> None:
         """Put a run into the scene; what it lacks is a note."""
-        notes = list(run.notes)
+        notes, seen = list(run.notes), self.found.observations
         try:
             if run.trajectory is None or not len(run.trajectory.positions):
                 self.notes[run.name] = "; ".join(notes) or "no prediction"
                 return
-            twin = self._twin(run, notes)
+            nodes, hands = run.trajectory.positions[0], seen.controller_points[0]
             if run.trajectory.diverged_frame is not None:
                 notes.append(f"left the scene in frame {run.trajectory.diverged_frame}; it stays where it was before")
-            hands = self.found.observations.controller_points[0]
-            nodes = run.trajectory.positions[0]
+            twin = None
+            try:
+                twin = run.twin
+                counts = (len(twin.topology.nodes), len(twin.topology.controllers)) if twin else (len(nodes), len(hands))
+                if counts != (len(nodes), len(hands)):
+                    notes.append(f"no springs: its twin has {counts} nodes and hands, its prediction {(len(nodes), len(hands))}")
+                    twin = None
+            except InputError as error:
+                notes.append(f"no springs: {error}")
             body = self._bodies[run.name] = BodyLayer(self._scene, run.name, twin, nodes, hands)
-            self._overlays[run.name] = TrackOverlay(self._scene, run.name, self.found.observations.tracks, nodes, 1.2 * body.radius)
+            body.overlay = TrackOverlay(self._scene, run.name, seen.tracks, nodes, 1.2 * body.radius)
         except InputError as error:
             notes.append(str(error))
         self.notes[run.name] = "; ".join(notes)
-
-    def _twin(self, run: Run, notes: list[str]) -> Twin | None:
-        try:
-            twin = run.twin
-        except InputError as error:
-            notes.append(f"no springs: {error}")
-            return None
-        if twin is None:
-            return None
-        assert run.trajectory is not None
-        counts = (len(twin.topology.nodes), len(twin.topology.controllers))
-        found = (run.trajectory.positions.shape[1], self.found.observations.controller_points.shape[1])
-        if counts != found:
-            notes.append(f"no springs: its twin has {counts} nodes and hands, its prediction {found}")
-            return None
-        return twin
 
     def _positions(self, run: Run, frame: int) -> np.ndarray:
         assert run.trajectory is not None
@@ -241,14 +227,11 @@ class Player:
     def _scale(self) -> Scale | None:
         if self.limit is not None and self.display.quantity == "strain":
             return strain_scale(self.limit)
-        parts: list[Springs] = []
-        strains = []
+        frames = np.unique(np.linspace(0, self.clock.count - 1, SAMPLES).astype(int))
         hands = self.found.observations.controller_points
-        for name, body in self._bodies.items():
-            if body.parts is None:
-                continue
-            frames = np.unique(np.linspace(0, self.clock.count - 1, SAMPLES).astype(int))
-            run, own = self.run(name), body.parts
-            parts.append(own)
-            strains.append(np.stack([own.strain(own.ends(self._positions(run, t), hands[t])) for t in frames]))
-        return scale_of(self.display.quantity, parts, strains)
+        bodies = {name: body.parts for name, body in self._bodies.items() if body.parts is not None}
+        strains = [
+            np.stack([parts.strain(parts.ends(self._positions(self.run(name), t), hands[t])) for t in frames])
+            for name, parts in bodies.items()
+        ]
+        return scale_of(self.display.quantity, list(bodies.values()), strains)

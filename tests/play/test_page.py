@@ -93,12 +93,12 @@ def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, tmp_path):
     page = opened(results(tmp_path))
     page.show(5)
     until(lambda: page.player.clock.frame == 5 and not page._moved)
-    until(lambda: page.player._overlays[RUN].error is not None)
+    until(lambda: page.player._bodies[RUN].overlay.error is not None)
     run, seen = page.player.run(RUN), page.found.observations
     expected = track_errors(run.trajectory.positions, seen.tracks)[5]
     with page.player.lock:
         page.player.draw()
-        assert page.player._overlays[RUN].error == pytest.approx(expected, rel=1e-5)
+        assert page.player._bodies[RUN].overlay.error == pytest.approx(expected, rel=1e-5)
     assert f"{RUN} {1e3 * expected:.1f} mm" in page.player.errors()
 
 
