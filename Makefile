@@ -2,25 +2,38 @@
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
+# Two marks: what the demo needs is installed; and so is what tests and linters need, which has the demo's.
+COMMA := ,
+DEMO := .venv/.demo
 INSTALLED := .venv/.installed
+ifndef CORES
+CORES := $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
+endif
 SNAKEMAKE := $(BIN)/snakemake --profile workflow/profiles/default
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
-CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
 .PHONY: install demo test test-slow test-all lint format bench gpu clean
 
+define INSTALL
+@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
+@echo "Installing neuspring[$(1)] with $(PYTHON) into .venv (two to four minutes, up to 3.1 GB)"
+$(PYTHON) -m venv .venv
+PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[$(1)]"
+@touch $@
+endef
+
+$(DEMO): pyproject.toml workflow/envs/constraints.txt
+	$(call INSTALL,synthetic$(COMMA)video)
+
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
-	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
-	@echo "Creating .venv with $(PYTHON) (two to four minutes, 2.9 GB)"
-	$(PYTHON) -m venv .venv
-	PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
-	@touch $@
+	$(call INSTALL,dev)
+	@touch $(DEMO)
 
 install: $(INSTALLED)
 
-demo: $(INSTALLED)
+demo: $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
 	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml
 
 test: $(INSTALLED)

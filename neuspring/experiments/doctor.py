@@ -21,6 +21,7 @@ from neuspring.baselines.spring_gaus import vgg
 from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
+from neuspring.core.extras import EXTRAS, install
 from neuspring.core.text import masked
 from neuspring.core.weights import hub_folder
 from neuspring.data.synthetic import toy
@@ -81,21 +82,18 @@ def _libraries(settings: Config) -> Iterator[Finding]:
         except PackageNotFoundError:
             yield Finding(package, "broken", "not installed", "make install")
     segments = settings.perception.segment.backend == "grounded_sam2"
-    extras = {
-        "av": ("video", False),
-        "newton": ("synthetic", False),
-        "gsplat": ("gpu", settings.images.backend == "gsplat"),
-        "transformers": ("perception", segments),
-        "torchvision": ("perception", segments),
-        "snakemake_executor_plugin_slurm": ("slurm", False),
-        "psycopg2": ("postgresql", bool(settings.tune and settings.tune.storage)),
+    wanted = {
+        "gsplat": settings.images.backend == "gsplat",
+        "transformers": segments,
+        "torchvision": segments,
+        "psycopg2": bool(settings.tune and settings.tune.storage),
     }
-    for module, (extra, wanted) in extras.items():
+    for module, extra in EXTRAS.items():
         if importlib.util.find_spec(module):
             yield Finding(module, "ok", f"extra {extra}")
         else:
-            remedy = f'.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[{extra}]"'
-            yield Finding(module, "broken" if wanted else "absent", f"extra {extra} is not installed", remedy)
+            state = "broken" if wanted.get(module) else "absent"
+            yield Finding(module, state, f"extra {extra} is not installed", install(extra))
     if importlib.util.find_spec("av"):
         import av
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
 from neuspring.export import ply
 from neuspring.export.source import Source
@@ -22,11 +23,7 @@ THIN, THICK = 0.1, 0.3
 
 def write(source: Source, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
     """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
-    try:
-        from pxr import Gf, Usd, UsdGeom, Vt
-    except ImportError as error:
-        remedy = '.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[export]"'
-        raise InputError("--to usd", "needs usd-core", error, remedy) from error
+    Gf, Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
     if output.suffix not in SUFFIXES:
         raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
     if rate is not None and not (np.isfinite(rate) and rate > 0):

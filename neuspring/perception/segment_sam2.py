@@ -17,6 +17,7 @@ import numpy as np
 
 from neuspring.config.perception import GroundedSam2, MarksSegmentation
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.marks.carry import Carried, Cues, doubt_of, frame_mask
 from neuspring.perception.marks.marks import Mark
@@ -124,11 +125,7 @@ def carry_masks(images: list[np.ndarray], masks: dict[int, np.ndarray], models: 
 
 def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
     """Networks with pretrained weights, the detector only for `words`. Raises InputError saying which are missing."""
-    try:
-        import transformers
-    except ImportError as error:
-        remedy = 'Install it: .venv/bin/pip install -e ".[perception]"'
-        raise InputError("perception.segment.backend: grounded_sam2", "needs the extra `perception`", str(error), remedy) from error
+    transformers = needed("transformers")
     local = not settings.download
     # Safetensors alone: weights in a pickle are not read.
     weights = {"local_files_only": local, "use_safetensors": True}

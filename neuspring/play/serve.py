@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
 from neuspring.perception.annotate.guard import Refused, check_host, check_origin
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ HEADERS = {
 """Of every file of the page."""
 PAGE_HEADERS = {"Cache-Control": "no-store"}
 """Of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
-INSTALL = "Install it: pip install 'neuspring[play]'."
 
 
 def start(
@@ -38,10 +38,9 @@ def start(
     `scenario` is the one that is shown: an address that ends in &scenario=<name> of another one is refused. None: all are answered.
     Raises InputError where it cannot listen there, or without viser.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError("neuspring play", "the package viser is required", str(error), INSTALL) from error
+    needed("viser")
+    import viser
+
     _require_free(host, port)
     # viser takes another port from this variable, whatever it is told.
     os.environ.pop("_VISER_PORT_OVERRIDE", None)

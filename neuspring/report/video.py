@@ -8,10 +8,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Self
 
-import av
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
 
 BT709 = 1
@@ -38,6 +38,7 @@ class Video:
         self._path, self._rate, self._quality = path, Fraction(rate).limit_denominator(1001), quality
         self._shape: tuple[int, ...] = ()
         self._count = 0
+        self._av = needed("av")
 
     def __enter__(self) -> Self:
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +60,9 @@ class Video:
         if picture.shape != self._shape:
             raise InputError(where, f"picture {number} of this video must have the size of the first, {self._shape}", picture.shape)
         height, width = self._shape[:2]
-        rgb = av.VideoFrame.from_ndarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"), format="rgb24")
+        rgb = self._av.VideoFrame.from_ndarray(
+            np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"), format="rgb24"
+        )
         frame = rgb.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", threads=1)
         self._container.mux(self._stream.encode(frame))
         self._count += 1
@@ -78,7 +81,7 @@ class Video:
 
     def _open(self, shape: tuple[int, ...]) -> None:
         # The index goes to the front, so that a browser begins before it has everything.
-        self._container = av.open(self._part, "w", format="mp4", options={"movflags": "+faststart"})
+        self._container = self._av.open(self._part, "w", format="mp4", options={"movflags": "+faststart"})
         stream = self._container.add_stream("libx264", rate=self._rate, options={"crf": str(self._quality)})
         stream.height, stream.width = (side + side % 2 for side in shape[:2])
         stream.pix_fmt = "yuv420p"

@@ -10,13 +10,16 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
-import av
 import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
+
+if TYPE_CHECKING:
+    import av
 
 Kind = Literal["color", "depth"]
 PICTURES = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
@@ -174,7 +177,7 @@ class VideoFile:
                         wanted.pop(0)
                         image = frame.to_ndarray(format="rgb24" if self.kind == "color" else "gray16le")
                         yield require_kind(self.path, self.kind, image)
-            except av.error.FFmpegError as error:
+            except needed("av").error.FFmpegError as error:
                 raise InputError(self.path, "this video must be readable", str(error)) from error
         if wanted:
             raise InputError(self.path, f"a picture {wanted[0]} is required", "the video ends before it")
@@ -203,6 +206,9 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
 
 
 def _opened(path: Path) -> av.container.InputContainer:
+    needed("av")
+    import av
+
     try:
         container = av.open(str(path))
     except (av.error.FFmpegError, OSError) as error:

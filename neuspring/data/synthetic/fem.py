@@ -9,17 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-import newton
 import numpy as np
 import warp as wp
 
 from neuspring.core.errors import NumericalFailure
+from neuspring.core.extras import needed
 from neuspring.data.synthetic import kernels
 from neuspring.data.synthetic.bodies import SoftBody
 from neuspring.data.synthetic.meshes import edges, volumes
 from neuspring.data.synthetic.scenes import FIST_RADIUS, Hand
+
+if TYPE_CHECKING:
+    import newton
+else:
+    newton = needed("newton")
 
 GRAVITY = 9.81
 """m/s^2, towards -z."""

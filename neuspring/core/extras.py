@@ -1,0 +1,40 @@
+"""Packages that serve one corner of the platform, and the extra of the installation that brings each."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from neuspring.core.errors import InputError
+
+EXTRAS = {
+    "newton": "synthetic",
+    "av": "video",
+    "viser": "play",
+    "pxr": "export",
+    "mujoco": "export",
+    "transformers": "perception",
+    "torchvision": "perception",
+    "gsplat": "gpu",
+    "psycopg2": "postgresql",
+    "snakemake_executor_plugin_slurm": "slurm",
+    "snakemake_executor_plugin_cluster_generic": "kubernetes",
+}
+"""Module -> extra, as in pyproject.toml."""
+
+
+def install(extra: str) -> str:
+    """The command that installs an extra in the pinned versions."""
+    return f'.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[{extra}]"'
+
+
+def needed(module: str) -> Any:
+    """A module of an extra, imported. Raises InputError that names the extra if the package is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        package = module.partition(".")[0]
+        if error.name is None or error.name.partition(".")[0] != package:
+            raise
+        extra = EXTRAS[package]
+        raise InputError(f"package {package}", f"the extra [{extra}] is required here", "not installed", install(extra)) from error
