@@ -88,8 +88,8 @@ class Fit(Section):
     """Adam's epsilon, in the loss unit. Gradients far below it are not followed. The released code has 1e-8, with
     `loss_unit: meter`."""
     loss_unit: Literal["spacing", "meter"] = "spacing"
-    """Unit of the loss that is differentiated, and of its penalties. spacing: squared node spacings (neuspring/twin/spacing.py), so
-    that a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
+    """Unit of the loss that is differentiated, and of its penalties. spacing: squared node spacings (twin/topology.py), so that
+    a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
     output_bound: NonNegative = 0.0

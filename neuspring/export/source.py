@@ -17,7 +17,7 @@ from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
 from neuspring.splats.of_run import splats_file
 from neuspring.twin.hand_paths import with_hands
-from neuspring.twin.motion import initial_velocity
+from neuspring.twin.rollout import initial_velocity
 
 TWIN_RECORDS = ("fit.json", "search.json")
 """Records that name a twin, the later stage first."""

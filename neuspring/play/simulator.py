@@ -21,8 +21,7 @@ from neuspring.physics import stability
 from neuspring.physics.controllers import BEGINS, begins, waypoints
 from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.hand_paths import with_hands
-from neuspring.twin.motion import initial_velocity
-from neuspring.twin.rollout import FAR, Diverged
+from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 
 if TYPE_CHECKING:
     from neuspring.play.results import Run

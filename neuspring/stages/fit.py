@@ -43,7 +43,7 @@ def fit(
     from neuspring.core.files import write_history
     from neuspring.twin.fit import fit as fit_twin
     from neuspring.twin.losses import frames_seen
-    from neuspring.twin.pooled import PooledFit
+    from neuspring.twin.pool import PooledFit
 
     problem, checkpoint, key = prepared(observations, search, settings, run, kind, oracle, device)
     run_of = partial(PooledFit, pool=pool, leave_out=leave_out) if pool or leave_out else None

@@ -21,7 +21,7 @@ from neuspring.stages.search import launch_size
 from neuspring.stages.stage import Job, Written, json_value, read_settings, stage
 
 if TYPE_CHECKING:
-    from neuspring.twin.company import Seat
+    from neuspring.twin.batch import Lane
     from neuspring.twin.fit import FitProblem, FitResult
 
 
@@ -67,7 +67,7 @@ def fits(
     its own `fit` meets it again.
     """
     from neuspring.physics.lanes import WIDTHS
-    from neuspring.twin.company import together
+    from neuspring.twin.batch import run_batch
     from neuspring.twin.fit import FitResult
 
     asked = [config.parse(Row, row, f"--rows, entry {place}") for place, row in enumerate(json_value("--rows", rows, list))]
@@ -76,7 +76,7 @@ def fits(
     batches = batched(jobs, launch_size(twins_per_launch) or (WIDTHS[-1] if device == "cpu" else len(jobs)))
     facts["batches"] = [[job.output for job in batch] for batch in batches]
     for batch in batches:
-        results = together([job.problem.twin for job in batch], device, [_work(job) for job in batch])
+        results = run_batch([job.problem.twin for job in batch], device, [_work(job) for job in batch])
         for job, result in zip(batch, results, strict=True):
             if isinstance(result, FitResult):
                 counts, frames = result.twin.counts, job.problem.frame_end - 1
@@ -105,12 +105,12 @@ def batched(jobs: Sequence[FitJob], most: int) -> list[list[FitJob]]:
     return [batch for batch in batches if len(batch) > 1]
 
 
-def _work(job: FitJob) -> Callable[[Seat], FitResult]:
+def _work(job: FitJob) -> Callable[[Lane], FitResult]:
     from neuspring.twin.fit import fit
 
-    def work(seat: Seat) -> FitResult:
+    def work(lane: Lane) -> FitResult:
         job.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        return fit(job.problem, partial=job.checkpoint, key=job.key, seat=seat)
+        return fit(job.problem, partial=job.checkpoint, key=job.key, lane=lane)
 
     return work
 

@@ -15,8 +15,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     """
     from neuspring.core.artifacts import Twin
     from neuspring.twin.hand_paths import with_hands
-    from neuspring.twin.motion import initial_velocity
-    from neuspring.twin.rollout import roll_out
+    from neuspring.twin.rollout import initial_velocity, roll_out
 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True

@@ -48,9 +48,8 @@ def search(
     """
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
-    from neuspring.twin.polish import CMAES, SLOPES
-    from neuspring.twin.recordings import Recording
-    from neuspring.twin.search import SearchProblem
+    from neuspring.twin.candidates import CMAES, Recording, SearchProblem
+    from neuspring.twin.polish import SLOPES
     from neuspring.twin.search import search as search_twin
 
     if threads < 1:

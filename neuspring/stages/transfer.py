@@ -36,7 +36,7 @@ def transfer(
 
     `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json). All frames after the
     first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2 also set the initial velocity. A twin's
-    rest lengths are re-based on the target's rest shape, unless they were trained. Other nodes are registered (twin/resample.py),
+    rest lengths are re-based on the target's rest shape, unless they were trained. Other nodes are registered (twin/transfer.py),
     and the record says how well they fit. A rollout that diverges leaves out its target.
     """
     import pandas as pd
@@ -72,8 +72,7 @@ def _baseline_predictor(learned: Before, settings: Config, device: str) -> Predi
 
 def _twin_predictor(learned: Before, settings: Config, device: str) -> Predictor:
     """How a twin predicts another recording."""
-    from neuspring.twin.motion import initial_velocity
-    from neuspring.twin.rollout import roll_out
+    from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
 
     twin = Twin.load(learned.file("twin"))

@@ -1,11 +1,12 @@
 """The paper's method: from observations to a twin, and from a twin to a prediction.
 
-topology: points to regions, regions to springs. search: CMA-ES (proposals) over topology and a homogeneous material, with lengths
-in units of spacing, then a polish on residuals; trace: its record; trials: its candidates, simulated and judged together. fit: Adam
-through the simulation, on what parameters says is trained, by losses; field is the neural spring field; company: fits that share
-launches. rollout: prediction. motion: velocities from observed points. transfer: a twin on another recording.
-
-For others: topology.regions, piecewise_topology, uniform_topology; field.SpringField; parameters.TwinParameters;
-losses.FrameLoss; search.SearchProblem, search; fit.FitProblem, fit, tail_start; company.together; rollout.roll_out;
-transfer.rebase.
+topology    points to regions, regions to springs; the spacing of nodes
+search      CMA-ES over topology and a homogeneous material: candidates (variables, twin, cost), trials (many on the lanes of one
+            solver), polish (Levenberg-Marquardt)
+field       the neural spring field
+fit         Adam through the simulation: parameters (what is trained), rest_shape (an unloaded shape), batch (fits that share
+            launches), pool (one twin for several recordings)
+losses      every term of the training loss, for search, fit and polish
+rollout     prediction; hand_paths: hands in front of one camera without depth
+transfer    a twin on another recording, with register where its nodes are others
 """

@@ -32,12 +32,11 @@ from neuspring.physics import stability
 from neuspring.physics.controllers import Grips, waypoints
 from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
-from neuspring.twin.company import Seat
+from neuspring.twin.batch import Lane
 from neuspring.twin.losses import FrameLoss, frames_seen
-from neuspring.twin.motion import initial_velocity
-from neuspring.twin.movement import median_gradient, movement, watched
-from neuspring.twin.parameters import TwinParameters
-from neuspring.twin.unloaded import topology_spacing
+from neuspring.twin.parameters import TwinParameters, median_gradient, movement, watched
+from neuspring.twin.rest_shape import topology_spacing
+from neuspring.twin.rollout import initial_velocity
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates of the first and the second moment, as released."""
@@ -144,8 +143,8 @@ def tail_start(train_end: int, tail_fraction: float) -> int:
 class TwinFit:
     """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
 
-    def __init__(self, problem: FitProblem, seat: Seat | None = None) -> None:
-        self.problem, self._seat = problem, seat
+    def __init__(self, problem: FitProblem, lane: Lane | None = None) -> None:
+        self.problem, self._lane = problem, lane
         observations, settings = problem.observations, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
@@ -162,8 +161,8 @@ class TwinFit:
         self.grips = Grips(graph.springs, len(graph.nodes), problem.device)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
-        self.head_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
-        self.horizon = settings.horizon or self.head_end - 1
+        self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
+        self.horizon = settings.horizon or self.fitted_end - 1
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
@@ -173,7 +172,7 @@ class TwinFit:
         self.gradients: list[float] | None = None
         """Where to put the median |gradient| of each step, if it is wanted."""
         self.twin = problem.twin
-        self._solver: FrameSolver | Seat | None = None
+        self._solver: FrameSolver | Lane | None = None
         self._overflow = 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
@@ -181,19 +180,19 @@ class TwinFit:
     @property
     def one_step(self) -> bool:
         """Whether an epoch is a single optimizer step, so that its losses belong to the values before it."""
-        return self.horizon >= self.head_end - 1
+        return self.horizon >= self.fitted_end - 1
 
-    def solver(self) -> FrameSolver | Seat:
-        """The solver for the current number of substeps, or the seat in a shared one."""
+    def solver(self) -> FrameSolver | Lane:
+        """The solver for the current number of substeps, or the lane in a shared one."""
         if self._solver is None:
-            self._solver = self._seat.sit(self.twin) if self._seat else solver_for(self.twin, self.problem.device)
+            self._solver = self._lane.of_twin(self.twin) if self._lane else solver_for(self.twin, self.problem.device)
         return self._solver
 
     @property
     def collision_overflow(self) -> int:
         """Collision candidates that did not fit the list, summed over all solvers so far."""
-        if self._seat:
-            return self._seat.collision_overflow
+        if self._lane:
+            return self._lane.collision_overflow
         return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
 
     def use_substeps(self, count: int) -> None:
@@ -202,7 +201,7 @@ class TwinFit:
             self.twin = replace(self.twin, simulation=replace(self.twin.simulation, substeps=count))
             self._overflow, self._solver = self.collision_overflow, None
 
-    def settled(self) -> Parameters:
+    def stable_parameters(self) -> Parameters:
         """The present parameters, packed, after seeing that they can be integrated.
 
         More substeps are taken where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
@@ -256,10 +255,10 @@ class TwinFit:
         """
         state: _Motion = (self.rest, self.velocity, None)
         total, largest, row = 0.0, 0.0, {}
-        for start in range(1, self.head_end, self.horizon):
-            window = range(start, min(start + self.horizon, self.head_end))
+        for start in range(1, self.fitted_end, self.horizon):
+            window = range(start, min(start + self.horizon, self.fitted_end))
             self.optimizer.zero_grad(set_to_none=True)
-            packed = self.settled()
+            packed = self.stable_parameters()
             state, mean = self._simulate(state, window, packed)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
@@ -269,20 +268,20 @@ class TwinFit:
             total += float(mean.detach()) * len(window)
             x, v, lengths = state
             state = (x.detach(), v.detach(), None if lengths is None else lengths.detach())
-            if self.one_step and self.head_end < len(self.hands):
+            if self.one_step and self.fitted_end < len(self.hands):
                 with torch.no_grad():
-                    row["tail_loss"] = float(self._simulate(state, range(self.head_end, len(self.hands)), packed)[1])
+                    row["tail_loss"] = float(self._simulate(state, range(self.fitted_end, len(self.hands)), packed)[1])
             largest = max(largest, self._step(window))
-        return row | {"loss": total / (self.head_end - 1), "gradient_norm": largest}
+        return row | {"loss": total / (self.fitted_end - 1), "gradient_norm": largest}
 
     def tail_loss(self) -> float:
         """Mean loss of the held-back frames, m^2, in a rollout from rest with the present values. Raises NonFinite."""
         with torch.no_grad():
-            packed = self.settled()
+            packed = self.stable_parameters()
             state: _Motion = (self.rest, self.velocity, None)
-            for frame in range(1, self.head_end):
+            for frame in range(1, self.fitted_end):
                 state = self._frame(state, frame, packed)
-            loss = float(self._simulate(state, range(self.head_end, len(self.hands)), packed)[1])
+            loss = float(self._simulate(state, range(self.fitted_end, len(self.hands)), packed)[1])
         if not math.isfinite(loss):
             raise NonFinite("the loss of the held-back frames is not finite")
         return loss
@@ -332,19 +331,19 @@ def fit(
     partial: Path | None = None,
     key: str = "",
     on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
-    seat: Seat | None = None,
-    run_of: Callable[[FitProblem, Seat | None], TwinFit] | None = None,
+    lane: Lane | None = None,
+    run_of: Callable[[FitProblem, Lane | None], TwinFit] | None = None,
 ) -> FitResult:
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
-    `seat` the simulation shares launches with other fits (company.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
-    several recordings (pooled.py). Raises NumericalFailure if no epoch could be completed.
+    `lane` the simulation shares launches with other fits (batch.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
+    several recordings (pool.py). Raises NumericalFailure if no epoch could be completed.
     """
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
-    share = 1 / len(seat.company.seats) if seat else 1.0
+    share = 1 / len(lane.batch.lanes) if lane else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
-    run = (run_of or TwinFit)(problem, seat)
+    run = (run_of or TwinFit)(problem, lane)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)
@@ -405,7 +404,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
         before = (state.values, state.substeps)
         run.gradients = [] if state.gradient_over_epsilon is None else None
         losses = run.epoch()
-        run.settled()
+        run.stable_parameters()
         if run.gradients and (median := float(np.median(run.gradients))):
             state.gradient_over_epsilon = median / problem.fit.epsilon
         if problem.fit.selection == "tail" and not run.one_step:

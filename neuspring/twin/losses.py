@@ -1,31 +1,122 @@
-"""Training losses (those of the released PhysTwin code), differentiable in the predicted nodes.
+"""The training loss, in one place: a term is a function that says a frame's errors, and search, fit and polish sum their squares.
 
-Chamfer: mean over visible observed points of the squared Euclidean distance to the nearest surface node (assignment fixed).
-Track: smooth-L1 (beta = 1 m) between node i and track i where the motion is valid, mean over points and axes.
-Acceleration: smooth-L1 between consecutive velocity changes, mean over nodes and axes; search only.
-A term is weighted by the field of `config.Losses` that has its name.
+A term's loss is weight / count times the sum of s(e)^2 over its errors e, m, with the weight of `config.Losses` that has its name:
+
+    chamfer       e from each visible observed point to its nearest surface node (assignment fixed), s(e) = e
+    track         e from track i to node i where the motion is valid, s(e)^2 smooth-L1 (beta = 1 m)
+    acceleration  e the change of a node's velocity change, m/s, s(e)^2 smooth-L1; the search alone uses it, as released
+    image_track   e = p (u(x_i) - q_i) of tracked points that are seen, s(e)^2 smooth-L1 beyond BETA, since trackers slide
+    silhouette    e = p |m - u(x_i)| from each point m of the mask to the nearest surface node, and p D(u(x_i)) of each node,
+                  s(e) = e; D is the distance from object and hands, bilinear between cells: a node that a hand hides is not wrong
+
+The last two are of one camera without depth, with the projection u(x) = K R^T (x - c) / depth, pixels, and p, m per pixel at the
+object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`, the polish
+`Errors.residuals`. The search takes the first three on the lanes of its solver (trials.py, tested against this file) and what else
+there is from here: a term needs its function, its line in TERMS, and its weight.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
-from torch.nn.functional import smooth_l1_loss
+from torch.nn.functional import grid_sample, smooth_l1_loss
 
 from neuspring.config import Losses
 from neuspring.core.artifacts import Observations
-from neuspring.twin.image_losses import ImageLoss
 
 CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
+BETA = 0.03
+"""m: beyond it a track's error in the image counts linearly."""
+NEAR = 0.05
+"""m: nodes nearer to the camera are projected as if they were there."""
 
 
 def frames_seen(observations: Observations, *, oracle: bool) -> int:
     """Frames that a loss may read, from frame 0 on: those before the split; all of them for an oracle."""
     scenario = observations.scenario
     return scenario.frame_count if oracle else scenario.train_end
+
+
+class Penalty(NamedTuple):
+    """s, and the sum of s(e)^2 where it is not summed as it stands: rounded as the released losses are."""
+
+    root: Callable[[torch.Tensor], torch.Tensor]
+    total: Callable[[torch.Tensor], torch.Tensor] | None = None
+
+
+def _smooth_root(e: torch.Tensor, beta: float) -> torch.Tensor:
+    """s(e), whose square is e^2 / 2 below beta and beta (|e| - beta / 2) beyond; its slope is continuous."""
+    size = e.abs()
+    # The unused branch must have a finite slope too.
+    linear = (beta * (size.clamp_min(beta) - beta / 2)).sqrt()
+    return torch.where(size < beta, e / 2**0.5, e.sign() * linear)
+
+
+SQUARES = Penalty(lambda e: e, lambda e: e.square().sum())
+SMOOTH_L1 = Penalty(lambda e: _smooth_root(e, 1.0), lambda e: smooth_l1_loss(e, torch.zeros_like(e), reduction="sum", beta=1.0))
+IMAGE_SQUARES = Penalty(lambda e: e)
+IMAGE_SMOOTH_L1 = Penalty(lambda e: _smooth_root(e, BETA))
+
+
+class Errors(NamedTuple):
+    """Errors of a term in a frame: weight / count times the sum of s(e)^2 over `values`."""
+
+    values: torch.Tensor
+    """[k, d]."""
+    weight: float
+    count: int | torch.Tensor
+    """At least 1."""
+    penalty: Penalty
+    rows: torch.Tensor | None = None
+    """Where the values stand among all points of the term, bool [P]; none: they are all."""
+    single: bool = False
+    """Residuals are scaled in single precision, as earlier polishes did."""
+
+    def loss(self) -> torch.Tensor:
+        """The sum."""
+        if self.penalty.total is None:
+            return self.residuals().square().sum()
+        return self.weight * (self.penalty.total(self.values) / self.count)
+
+    def residuals(self, frames: int = 1) -> torch.Tensor:
+        """[P, d]: their squares sum up to the loss over `frames`; 0 where there is no error."""
+        result = self.penalty.root(self.values)
+        if self.penalty.total is None:
+            result = result * _root(self.weight / self.count)
+            result = result / frames**0.5 if frames > 1 else result
+        elif self.single:
+            result = result * (torch.tensor(self.weight / self.count) / frames).sqrt()
+        else:
+            result = result * _root(self.weight / self.count / frames)
+        if self.rows is None:
+            return result
+        everywhere = result.new_zeros(len(self.rows), result.shape[1])
+        everywhere[self.rows] = result
+        return everywhere
+
+
+def _root(value: float | torch.Tensor) -> float | torch.Tensor:
+    return value.sqrt() if isinstance(value, torch.Tensor) else math.sqrt(value)
+
+
+class FrameState(NamedTuple):
+    """What the terms of a frame read."""
+
+    frame: int
+    x: torch.Tensor
+    """Nodes [N, 3], m."""
+    near: Mapping[str, torch.Tensor] | None = None
+    """Assignments by term (`FrameLoss.assigned`); none: those of x."""
+    jerk: torch.Tensor | None = None
+    """Change of the velocity change [N, 3], m/s; none: not counted."""
+    u: torch.Tensor | None = None
+    """The nodes in the image [N, 2], pixels, where there is one."""
 
 
 def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
@@ -43,30 +134,153 @@ def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
     return torch.cat(found)
 
 
-def chamfer(
-    nodes: torch.Tensor, target: torch.Tensor, visible: torch.Tensor, surface: int, count: int | None = None
-) -> torch.Tensor:
-    """Squared Chamfer loss [m^2] from visible targets [P, 3] to the first `surface` nodes. 0 if nothing is visible.
-
-    `count` replaces the number of visible points as divisor (released quirk 4).
-    """
-    points = target[visible]
-    if len(points) == 0:
-        return nodes.sum() * 0.0
+def _near(loss: FrameLoss, state: FrameState, term: str) -> torch.Tensor:
+    """Index of the surface node that each point of a term is assigned to."""
+    if state.near is not None:
+        return state.near[term]
     with torch.no_grad():
-        index = nearest(points, nodes[:surface])
-    return (nodes[index] - points).square().sum() / (len(points) if count is None else max(count, 1))
+        return ASSIGNED[term](loss, state.frame, state.x)
 
 
-def track(nodes: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, count: int | None = None) -> torch.Tensor:
-    """Smooth-L1 track loss [m^2 below 1 m] between node i and target i where `valid` [P]. 0 if nothing is valid."""
-    total = smooth_l1_loss(nodes[: len(target)][valid], target[valid], reduction="sum", beta=1.0)
-    return total / (3 * max(int(valid.sum()) if count is None else count, 1))
+def _nearest_visible(loss: FrameLoss, frame: int, x: torch.Tensor) -> torch.Tensor:
+    return nearest(loss.points[frame][loss.visible[frame]], x[: loss.surface])
 
 
-def acceleration(change: torch.Tensor, previous: torch.Tensor) -> torch.Tensor:
-    """Smoothness of motion: smooth-L1 between a frame's velocity change [N, 3] and that of the frame before."""
-    return smooth_l1_loss(change, previous, reduction="mean", beta=1.0)
+def chamfer(loss: FrameLoss, state: FrameState) -> list[Errors]:
+    """From visible points to nearest surface nodes, over the points that are visible."""
+    visible = loss.visible[state.frame]
+    values = state.x[_near(loss, state, "chamfer")] - loss.points[state.frame][visible]
+    return [Errors(values, loss.weights.chamfer, max(loss.counts[state.frame][0], 1), SQUARES, visible)]
+
+
+def track(loss: FrameLoss, state: FrameState) -> list[Errors]:
+    """From tracks to their nodes, over valid tracks and axes. Frame t uses the validity of t - 1."""
+    target, valid = loss.points[state.frame], loss.motion_valid[state.frame - 1]
+    values = state.x[: len(target)][valid] - target[valid]
+    return [Errors(values, loss.weights.track, 3 * max(loss.counts[state.frame][1], 1), SMOOTH_L1, valid)]
+
+
+def acceleration(loss: FrameLoss, state: FrameState) -> list[Errors]:
+    """Smoothness of motion, over nodes and axes."""
+    if state.jerk is None:
+        return []
+    return [Errors(state.jerk, loss.weights.acceleration, state.jerk.numel(), SMOOTH_L1, single=True)]
+
+
+def image_track(loss: FrameLoss, state: FrameState) -> list[Errors]:
+    """From tracked pixels to the projections of their nodes, over those that are seen and over x and y."""
+    image, u = loss.image, state.u
+    if image is None or u is None:
+        return []
+    seen = image.visible[state.frame]
+    error = image.size * (u[: len(seen)] - image.pixels[state.frame])
+    return [image.errors(error * seen[:, None], loss.weights.image_track, 2 * seen.sum(), IMAGE_SMOOTH_L1)]
+
+
+def silhouette(loss: FrameLoss, state: FrameState) -> list[Errors]:
+    """From points of the mask to projected surface nodes, and of nodes from object and hands, the mean of each."""
+    image, u = loss.image, state.u
+    if image is None or u is None:
+        return []
+    inside = ~torch.isnan(image.inside[state.frame, :, 0])
+    points = torch.nan_to_num(image.inside[state.frame])
+    away = image.size * (u[_near(loss, state, "silhouette")] - points) * inside[:, None]
+    left = image.size * image.distance(state.frame, u)[:, None]
+    weight = loss.weights.silhouette
+    return [image.errors(away, weight, inside.sum(), IMAGE_SQUARES), image.errors(left, weight, len(u), IMAGE_SQUARES)]
+
+
+def _nearest_in_image(loss: FrameLoss, frame: int, x: torch.Tensor) -> torch.Tensor:
+    assert loss.image is not None
+    points, u = torch.nan_to_num(loss.image.inside[frame]), loss.image.project(x[: loss.surface])
+    found: torch.Tensor = torch.cdist(points, u).argmin(dim=1)
+    return found
+
+
+Term = Callable[["FrameLoss", FrameState], list[Errors]]
+TERMS: dict[str, Term] = {
+    "chamfer": chamfer,
+    "track": track,
+    "acceleration": acceleration,
+    "image_track": image_track,
+    "silhouette": silhouette,
+}
+"""Every term of the training loss, by the name of its weight."""
+OF_IMAGES = ("image_track", "silhouette")
+"""Terms of one camera without depth."""
+ASSIGNED = {"chamfer": _nearest_visible, "silhouette": _nearest_in_image}
+"""How terms that compare with a nearest node find it."""
+
+
+@dataclass(frozen=True)
+class ImageEvidence:
+    """What a camera without depth saw in the frames that a loss may read, as tensors."""
+
+    world_to_camera: torch.Tensor
+    intrinsics: torch.Tensor
+    pixels: torch.Tensor
+    """[E, No, 2]."""
+    visible: torch.Tensor
+    """[E, No]."""
+    inside: torch.Tensor
+    """[E, P, 2], NaN where there are fewer."""
+    outside: torch.Tensor
+    """[E, h, w], pixels."""
+    cell: int
+    size: float
+    """p, m per pixel."""
+
+    @classmethod
+    def of(cls, observations: Observations, device: str, dtype: torch.dtype) -> ImageEvidence | None:
+        """None for captures with depth."""
+        image = observations.image
+        if image is None:
+            return None
+        end = len(image.inside)
+        pose = torch.linalg.inv(torch.tensor(image.camera_to_world, dtype=torch.float64))
+
+        def tensor(values: object) -> torch.Tensor:
+            return torch.as_tensor(values).to(dtype=dtype, device=device)
+
+        return cls(
+            tensor(pose),
+            tensor(image.intrinsics.copy()),
+            tensor(image.pixels[:end].copy()),
+            torch.tensor(image.visible[:end], device=device),
+            tensor(image.inside.copy()),
+            tensor(image.outside.copy()),
+            image.cell,
+            image.pixel_size,
+        )
+
+    def to(self, device: str, dtype: torch.dtype) -> ImageEvidence:
+        """The same on another device, in another precision."""
+        values = dict(vars(self))
+        for name in ("world_to_camera", "intrinsics", "pixels", "inside", "outside"):
+            values[name] = values[name].to(device=device, dtype=dtype)
+        return ImageEvidence(**values | {"visible": self.visible.to(device)})
+
+    def project(self, x: torch.Tensor) -> torch.Tensor:
+        """Pixels [..., 2] of points [..., 3], m."""
+        local = x @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        flat = local @ self.intrinsics.T
+        return flat[..., :2] / flat[..., 2:].clamp_min(NEAR)
+
+    def distance(self, frame: int, u: torch.Tensor) -> torch.Tensor:
+        """D [N], pixels, at pixels [N, 2]; beyond the image as at its border."""
+        rows, columns = self.outside.shape[1:]
+        # From -1 to 1 over whole cells, as `grid_sample` with align_corners = False.
+        extent = torch.tensor([columns, rows], dtype=u.dtype, device=u.device) * self.cell
+        grid = 2 * (u + 0.5) / extent - 1
+        sampled = grid_sample(
+            self.outside[frame][None, None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+        )
+        return sampled[0, 0, 0]
+
+    @staticmethod
+    def errors(values: torch.Tensor, weight: float, count: torch.Tensor | int, penalty: Penalty) -> Errors:
+        """Errors whose squares are to be averaged over `count`, in the precision of the values."""
+        return Errors(values, weight, torch.as_tensor(count, dtype=values.dtype, device=values.device).clamp_min(1), penalty)
 
 
 @dataclass(frozen=True)
@@ -82,7 +296,7 @@ class FrameLoss:
     surface: int
     weights: Losses
     frozen_counts: bool = False
-    image: ImageLoss | None = None
+    image: ImageEvidence | None = None
     """Of captures without depth."""
 
     @classmethod
@@ -104,9 +318,17 @@ class FrameLoss:
         points = torch.tensor(observations.object_points[:end], dtype=dtype, device=device)
         visible = torch.tensor(observations.object_visibility[:end], device=device)
         valid = torch.tensor(observations.object_motion_valid[:end], device=device)
-        image = ImageLoss.of(observations, weights, device, dtype)
+        image = ImageEvidence.of(observations, device, dtype)
         return cls(points, visible, valid, observations.surface_count, weights, frozen_counts, image)
 
+    def to(self, device: str, dtype: torch.dtype) -> FrameLoss:
+        """The same on another device, in another precision."""
+        flags = self.visible.to(device), self.motion_valid.to(device)
+        image = self.image.to(device, dtype) if self.image else None
+        points = self.points.to(device=device, dtype=dtype)
+        return FrameLoss(points, *flags, self.surface, self.weights, self.frozen_counts, image)
+
+    @cached_property
     def counts(self) -> list[tuple[int, int]]:
         """(visible points, points whose motion is valid) that each frame's terms are divided by; none in frame 0."""
         visible = self.visible.sum(dim=1).tolist()
@@ -115,31 +337,36 @@ class FrameLoss:
             visible, valid = [visible[1]] * len(visible), [valid[1]] * len(valid)
         return list(zip(visible, valid, strict=True))
 
-    def terms(self, frame: int, nodes: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Weighted terms of a frame >= 1 for nodes [N, 3], by name. Frame t uses visibility[t] but motion_valid[t - 1]."""
-        target, visible, valid = self.points[frame], self.visible[frame], self.motion_valid[frame - 1]
-        visible_count = int(self.visible[1].sum()) if self.frozen_counts else None
-        valid_count = int(self.motion_valid[0].sum()) if self.frozen_counts else None
-        values = {
-            "chamfer": chamfer(nodes, target, visible, self.surface, visible_count),
-            "track": track(nodes, target, valid, valid_count),
-        }
-        weighted = {name: getattr(self.weights, name) * value for name, value in values.items()}
-        return weighted | (self.image.terms(frame, nodes) if self.image else {})
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Terms that count: those with a weight, those of images where there are any."""
+        return tuple(name for name in TERMS if getattr(self.weights, name) and (self.image is not None or name not in OF_IMAGES))
 
-    def __call__(self, frame: int, nodes: torch.Tensor) -> torch.Tensor:
-        """The sum of a frame's terms."""
-        first, *others = self.terms(frame, nodes).values()
-        return sum(others, start=first)
+    def errors(
+        self,
+        frame: int,
+        x: torch.Tensor,
+        near: Mapping[str, torch.Tensor] | None = None,
+        jerk: torch.Tensor | None = None,
+        without: Collection[str] = (),
+    ) -> dict[str, list[Errors]]:
+        """Errors of a frame >= 1 by term, for what `FrameState` holds; terms named in `without` are left out."""
+        state = FrameState(frame, x, near, jerk, self.image.project(x) if self.image else None)
+        found = {name: TERMS[name](self, state) for name in self.names if name not in without}
+        return {name: parts for name, parts in found.items() if parts}
 
-    def of_rollout(self, states: Iterable[tuple[int, torch.Tensor, torch.Tensor]], velocity: torch.Tensor) -> float:
-        """Mean loss of the frames (frame, x, v) of a rollout from `velocity` [N, 3] on, acceleration included."""
-        total, count = 0.0, 0
-        previous: torch.Tensor | None = None
-        for frame, x, v in states:
-            total += float(self(frame, x))
-            change = v - velocity
-            if previous is not None:
-                total += self.weights.acceleration * float(acceleration(change, previous))
-            velocity, previous, count = v, change, count + 1
-        return total / count
+    def terms(
+        self, frame: int, x: torch.Tensor, jerk: torch.Tensor | None = None, without: Collection[str] = ()
+    ) -> dict[str, torch.Tensor]:
+        """Weighted losses of a frame >= 1 by term, for nodes x [N, 3], m."""
+        errors = self.errors(frame, x, jerk=jerk, without=without)
+        return {name: torch.stack([part.loss() for part in parts]).sum() for name, parts in errors.items()}
+
+    def __call__(self, frame: int, x: torch.Tensor) -> torch.Tensor:
+        """The sum of a frame's terms, without acceleration."""
+        losses = list(self.terms(frame, x).values())
+        return sum(losses[1:], start=losses[0]) if losses else x.sum() * 0.0
+
+    def assigned(self, frame: int, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The surface nodes that points are assigned to, for nodes x [N, 3], by term."""
+        return {name: find(self, frame, x) for name, find in ASSIGNED.items() if name in self.names}

@@ -5,7 +5,7 @@ rest lengths stay free per spring). With b(o) = bound tanh(o / bound), or o with
 
     stiffness    Y = Y0 exp(b(o_Y)), clamped to the stiffness range
     rest length  l = l0 exp(r tanh(o_l))                                if rest_length_bound r > 0
-                 l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (unloaded.py)
+                 l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (rest_shape.py)
 
 Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
@@ -26,7 +26,7 @@ from neuspring.config import Kind
 from neuspring.core.artifacts import Twin
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
-from neuspring.twin.unloaded import UnloadedShape
+from neuspring.twin.rest_shape import UnloadedShape
 
 CONTACT_SCALARS = tuple(LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
@@ -197,3 +197,55 @@ class TwinParameters(nn.Module):
             shape = topology.canonical + self.unloaded.displacement().detach().cpu().numpy()
             topology = replace(topology, rest_shape=shape.astype(np.float32))
         return replace(twin, material=replace(twin.material, **material), topology=topology)
+
+
+MOVED = 0.1
+"""A texel has moved if it changed by more than this fraction of the texels' scale at the start."""
+AT_BOUND = 0.95
+"""A spring is at its bound beyond this fraction of it."""
+
+
+def watched(parameters: TwinParameters) -> torch.Tensor:
+    """The values whose gradients are compared with Adam's epsilon: offsets of springs, texels, or the field's first layer."""
+    if parameters.offsets is not None:
+        return parameters.offsets
+    field = parameters.field
+    assert field is not None
+    return field.planes.texels if field.planes is not None else next(iter(field.layers[0].parameters()))
+
+
+def median_gradient(tensor: torch.Tensor) -> float:
+    """Median |gradient| of a tensor; 0 if it has none."""
+    return 0.0 if tensor.grad is None else float(tensor.grad.abs().median())
+
+
+def movement(parameters: TwinParameters) -> dict[str, Any]:
+    """Figures of the present values against those before the first step; those that do not apply are left out.
+
+    texels_moved: share of texels that moved by more than a tenth of their scale at the start. at_bound: share of springs whose
+    stiffness lies within 5 % of the bound of its deviation (logarithm). at_stiffness_range: share at or beyond an end of the
+    stiffness range. factors: common factors. rest_strain: root mean square relative change of rest lengths.
+    """
+    s, figures = parameters.settings, dict[str, Any]()
+    with torch.no_grad():
+        if parameters.field is not None and parameters.field.planes is not None:
+            first = torch.from_numpy(parameters.first["field.planes.texels"])
+            change = (parameters.field.planes.texels.cpu() - first).abs()
+            figures["texels_moved"] = _share(change > MOVED * s.field.texel_scale)
+        if s.output_bound:
+            deviation = parameters.deviation(parameters.raw()["stiffness"]).log()
+            figures["at_bound"] = _share(deviation.abs() >= AT_BOUND * s.output_bound)
+        physical = parameters.physical()
+        low, high = s.stiffness_range
+        stiffness = physical["stiffness"]
+        figures["at_stiffness_range"] = _share((stiffness >= high) | (stiffness <= low))
+        if parameters.factors:
+            figures["factors"] = {name: float(value.exp()) for name, value in parameters.factors.items()}
+        if s.rest_length_bound or parameters.unloaded is not None:
+            strain = physical["rest_lengths"] / parameters.start["rest_lengths"] - 1
+            figures["rest_strain"] = float(strain.square().mean().sqrt())
+    return figures
+
+
+def _share(which: torch.Tensor) -> float:
+    return float(which.double().mean())

@@ -1,7 +1,8 @@
 """Levenberg-Marquardt in few variables, after CMA-ES: asked for candidates and told what they cost, as CMA-ES is.
 
-A round first asks for slopes: the base and one neighbor per variable, by whose residuals r (residuals.py) the products J'J and J'r
-of finite differences are formed. Then it asks for four damped steps d of the normalized variables,
+A round first asks for slopes: the base and one neighbor per variable. Their residuals r (losses.py, |r|^2 is the cost; points stay
+assigned as in the base, so that r is smooth) give the products J'J and J'r of finite differences. Then it asks for four damped
+steps d of the normalized variables,
 
     (J'J + damping diag J'J) d = -J'r        within the ranges, and at most `REACH` per variable,
 
@@ -11,18 +12,22 @@ for next, so a polish is replayed from its record.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from neuspring.config.search import TRIALS, Search
-from neuspring.twin.residuals import Residuals
+from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made, recordings
+from neuspring.twin.losses import OF_IMAGES, TERMS, FrameLoss
+from neuspring.twin.rollout import FAR
+from neuspring.twin.trials import motions
 
-CMAES, SLOPES, POLISH = "cmaes", "slopes", "polish"
-"""Stages of a search; candidates of `SLOPES` are its means alone and never its result."""
+SLOPES, POLISH = "slopes", "polish"
+"""Stages of a search after CMA-ES; candidates of `SLOPES` are its means alone and never its result."""
 RESIDUAL, PRODUCT = "product.residual", "product."
 """Columns of the trace: J_k'r and J_k'J_l in the row of the neighbor in variable k."""
 REACH = 0.25
@@ -117,8 +122,32 @@ def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float, low:
     return step
 
 
-def slopes(
-    residuals: Residuals, positions: torch.Tensor, velocities: torch.Tensor, fine: Sequence[bool], steps: np.ndarray
+def residuals(
+    loss: FrameLoss, velocity: torch.Tensor, x: torch.Tensor, v: torch.Tensor, near: Sequence[Mapping[str, torch.Tensor]]
+) -> np.ndarray:
+    """r of a rollout from `velocity` [N, 3], m/s: positions x and velocities v [F, N, 3] of the frames after the first.
+
+    `near` are the assignments of each frame. All in double precision on the CPU.
+    """
+    change = torch.diff(torch.cat([velocity[None], v]), dim=0)
+    jerk = [None, *torch.diff(change, dim=0)]
+    rows, last = list[tuple[int, int, torch.Tensor]](), len(TERMS)
+    rank = {name: last if name in OF_IMAGES else place for place, name in enumerate(TERMS)}
+    for frame, (nodes, assigned, own) in enumerate(zip(x, near, jerk, strict=True), start=1):
+        for name, parts in loss.errors(frame, nodes, assigned, own).items():
+            rows += [(rank[name], frame, part.residuals(len(x)).flatten()) for part in parts]
+    # Sums depend on the order by a rounding; it is that of earlier results: terms one after the other, those of images by frames.
+    result: np.ndarray = torch.cat([r for _, _, r in sorted(rows, key=lambda row: row[:2])]).numpy()
+    return result
+
+
+def products(
+    loss: FrameLoss,
+    velocity: torch.Tensor,
+    positions: torch.Tensor,
+    velocities: torch.Tensor,
+    fine: Sequence[bool],
+    steps: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(costs [1 + V], J'J [V, V], J'r [V]) of the rollouts [F, 1 + V, N, 3] of a base and its neighbors, `steps` [V] away.
 
@@ -127,11 +156,57 @@ def slopes(
     costs, none = np.full(1 + len(steps), np.inf), (np.zeros((len(steps), len(steps))), np.zeros(len(steps)))
     if not fine[0]:
         return costs, *none
-    assigned = residuals.assigned(positions[:, 0])
-    base = residuals(positions[:, 0], velocities[:, 0], assigned)
+    loss, velocity = loss.to("cpu", torch.float64), velocity.double().cpu()
+    x, v = positions.double(), velocities.double()
+    near = [loss.assigned(frame, nodes) for frame, nodes in enumerate(x[:, 0], start=1)]
+    base = residuals(loss, velocity, x[:, 0], v[:, 0], near)
     jacobian, costs[0] = np.zeros((len(steps), len(base))), base @ base
     for k in np.flatnonzero(fine[1:]):
-        near = residuals(positions[:, k + 1], velocities[:, k + 1], assigned)
-        costs[k + 1] = near @ near
-        jacobian[k] = (near - base) / steps[k]
+        neighbor = residuals(loss, velocity, x[:, k + 1], v[:, k + 1], near)
+        costs[k + 1] = neighbor @ neighbor
+        jacobian[k] = (neighbor - base) / steps[k]
     return costs, jacobian @ jacobian.T, jacobian @ base
+
+
+def slope_rows(
+    problem: SearchProblem,
+    population: Sequence[np.ndarray],
+    steps: np.ndarray,
+    loss: FrameLoss,
+    index: int,
+    generation: int,
+    each: Map,
+) -> list[dict[str, Any]]:
+    """Rows of a base and its neighbors, with the products of their slopes.
+
+    The residuals of R recordings are stacked and divided by sqrt(R), so that the sum of their squares is the mean cost: products
+    are means over the recordings. A neighbor that leaves the scene in one of them has no slope.
+    On each recording all take as many substeps as the one that needs most: another step would move a twin as a small change of a
+    variable does.
+    """
+    clock = time.perf_counter()
+    candidates = list(each(lambda normalized: made(problem, normalized), population))
+    base = candidates[0][1]
+    assert base, "the base was simulated before"
+    families = [family or base for _, family in candidates]
+    most = [max(twin.simulation.substeps for twin in twins) for twins in zip(*families, strict=True)]
+    fine, seen = [bool(family) for _, family in candidates], []
+    for place, recording in recordings(problem, [family[0] for family in families], loss).items():
+        twins = [family[place] for family in families]
+        twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
+        positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
+        fine = [known and bool((positions[:, k].abs() < FAR).all()) for k, known in enumerate(fine)]
+        seen.append((recording.loss, recording.velocity, positions, velocities))
+    # Only now is it known which candidates are fine everywhere.
+    parts = [products(*rollout, fine, steps) for rollout in seen]
+    costs, squares, gradient = (np.mean(values, axis=0) for values in zip(*parts, strict=True))
+    share = (time.perf_counter() - clock) / len(candidates)
+    rows = []
+    for k, (row, _) in enumerate(candidates):
+        row |= {"rollout": index + k, "generation": generation, "stage": SLOPES, "substeps": most[0], "seconds": share}
+        row["cost"] = min(float(costs[k]), PENALTY)
+        own = (0.0, np.zeros(len(steps))) if k == 0 else (gradient[k - 1], squares[k - 1])
+        row |= {RESIDUAL: float(own[0])}
+        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.polished, own[1], strict=True)}
+        rows.append(row)
+    return rows

@@ -13,18 +13,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-ITERATIONS = 40
+ICP_STEPS = 40
 MOST_POINTS = 1500
 """Points of each set that ICP looks at; a pose needs no more."""
 CLOSE = 1.02
 """Starts whose residual is within this factor of the best fit alike; the earliest wins, so that a symmetric body does not turn."""
 FLOOR = 0.75
 """In spacings of the coarser set: a rigid fit this close needs no bending."""
-WIDTHS = (0.3, 0.2, 0.12, 0.08)
+BEND_WIDTHS = (0.3, 0.2, 0.12, 0.08)
 """Widths of the smooth displacement, one after the other, as fractions of the extent."""
-NEIGHBORS = 6
+STRETCH_NEIGHBORS = 6
 """Of a point, whose distances tell how much was stretched."""
-STEPS = 8
+BEND_STEPS = 8
 """Steps with each width."""
 
 
@@ -82,7 +82,7 @@ def extent_of(points: np.ndarray) -> float:
 
 def _stretch(points: np.ndarray, bent: np.ndarray) -> float:
     """Mean of |log(distance after / before)| over pairs of near neighbors."""
-    _, near = cKDTree(points).query(points, k=min(NEIGHBORS + 1, len(points)))
+    _, near = cKDTree(points).query(points, k=min(STRETCH_NEIGHBORS + 1, len(points)))
     pairs = np.stack([np.repeat(near[:, :1], near.shape[1] - 1, axis=1), near[:, 1:]], axis=-1).reshape(-1, 2)
     before, after = (np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) for x in (points, bent))
     apart = before > 0
@@ -114,7 +114,7 @@ def _pose(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarra
     tree, poses = cKDTree(source), []
     for start in _starts(source, target):
         rotation, shift = start, source.mean(axis=0) - start @ target.mean(axis=0)
-        for _ in range(ITERATIONS):
+        for _ in range(ICP_STEPS):
             mapped = target @ rotation.T + shift
             ahead, back = tree.query(mapped)[1], cKDTree(mapped).query(source)[1]
             before = rotation, shift
@@ -138,9 +138,9 @@ def _bent(source: np.ndarray, points: np.ndarray, extent: float) -> np.ndarray:
     """Points moved towards the source by displacements that are smooth over ever smaller widths."""
     tree, bent = cKDTree(source), points.copy()
     squares = cdist(points, points, "sqeuclidean")
-    for width in WIDTHS:
+    for width in BEND_WIDTHS:
         weights = np.exp(-squares / (2 * (width * extent) ** 2))
-        for _ in range(STEPS):
+        for _ in range(BEND_STEPS):
             ahead, back = tree.query(bent)[1], cKDTree(bent).query(source)[1]
             pull, count = source[ahead] - bent, np.ones(len(bent))
             np.add.at(pull, back, source - bent[back])

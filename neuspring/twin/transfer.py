@@ -1,17 +1,36 @@
-"""A twin fitted on one recording, moved to another recording of the same object."""
+"""A twin on another recording of the same object, or on other nodes of the same body: another sampling, another spacing.
+
+Where the nodes are the same, springs keep their ends (`move`). Elsewhere the recording's shape is laid onto the twin's
+(register.py) and new springs take the values of the nearest (`resampled`).
+
+Nodes have unit mass, or masses with that mean, so n nodes are a body of n kg, and the same motion needs the same forces per mass at
+every sampling. For a strain eps, a strain rate eps' and a displacement u of the hand against the body, with springs of length l
+along d:
+
+    elastic energy per node    (1/n) sum_e  Y_e l_e (d eps d)^2 / 2     so   sum Y l / n     is kept   (Y ~ 1 / spacing)
+    dissipation per node       (1/n) sum_e  g_e l_e^2 (d eps' d)^2      so   sum g l^2 / n   is kept   (g ~ 1 / spacing^2)
+    grip per held node         sum_e (Y_e / l_e) (d u)^2 / 2            so   sum Y / l and sum g per held node are kept
+
+in one, two and three dimensions, where alike nodes have alike neighbors. Drag, gravity, friction and restitution act per mass and
+stay. Lengths between nodes (object radii, contact distance) scale with the spacing. Hands have a size: their radius stays, and as
+many more nodes are asked for as the body has more.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from neuspring.core.artifacts import Observations, Topology, Twin
+from neuspring import config
+from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
-from neuspring.twin.register import Registration
-from neuspring.twin.resample import resampled
-from neuspring.twin.topology import distances, unloaded
+from neuspring.twin.field import midpoints
+from neuspring.twin.register import Registration, register, spacing
+from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology, unloaded
 
 SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
@@ -102,3 +121,184 @@ def _same_nodes(topology: Topology, observations: Observations, keep_lengths: bo
         rule = "the ends of a spring may not coincide in the rest shape"
         raise InputError(f"transfer to {observations.scenario.name}", rule, f"spring {pair}")
     return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)
+
+
+NEAREST_SPRINGS = 8
+"""Springs that a spring's values are the mean of."""
+LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.15
+"""Beyond these shapes do not fit: the residual of the rigid motion, as a fraction of the extent, and the stretch of the bending,
+which could lay any shape onto any other. Filmed recordings of one plush have at most 0.06; another animal of its size has 0.16."""
+MARGIN = 1 + 1e-6
+"""Of radii, so that the longest spring is made again."""
+
+
+def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
+    """The twin on the nodes and hands of another recording, and how its shape was laid onto the twin's.
+
+    A spring takes stiffness, dashpot and strain at rest (rest length over distance without force) from the nearest springs of the
+    twin, object and controller springs apart, as geometric means weighted by inverse distance, and the sums above are kept. Masses,
+    where nodes have any, are those of the nearest nodes. Substeps and scenario are still the twin's. Raises InputError if the
+    shapes do not fit, or no hand reaches a node.
+    """
+    old, name = twin.topology, f"transfer to {observations.scenario.name}"
+    nodes, count = len(old.nodes), len(observations.nodes)
+    there = observations.canonical
+    laid = register(old.canonical[:nodes], there[:count], there[count:])
+    found = laid.rigid_residual / laid.extent
+    if found > LARGEST_RESIDUAL or laid.stretch > LARGEST_STRETCH:
+        rule = (
+            f"other nodes ({count}, the twin has {nodes}) must be of the same object: within {LARGEST_RESIDUAL:.0%} of its size"
+            f" after a rigid motion, and a bending that stretches by {LARGEST_STRETCH:.0%} at most"
+        )
+        value = f"{found:.1%} of {laid.extent:.3g} m, and {laid.stretch:.0%}"
+        raise InputError(name, rule, value, "Name a recording of this object, in a like pose in frame 0, or sample both alike.")
+    factor = scale_between(old, there[:count])
+    _, nearest = cKDTree(old.canonical[:nodes]).query(laid.points)
+    labels = old.labels[nearest]
+    radii, neighbors = infer_radii(old)
+    reach, held = infer_controller_radius(old)
+    new = piecewise_topology(
+        observations.nodes,
+        observations.controller_points[0],
+        labels,
+        [radius * factor for radius in radii],
+        neighbors,
+        reach,
+        max(round(held * count / nodes), 1),
+        repair=True,
+        rest_shape=observations.rest_shape,
+        controller_rest=old.controller_rest,
+    )
+    if old.object_spring_count < len(old.springs) and new.object_spring_count == len(new.springs):
+        rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
+        raise InputError(name, rule, "none is", "Check the controllers of frame 0.")
+    mass = twin.material.mass[nearest] if len(twin.material.mass) else twin.material.mass
+    material = replace(twin.material, contact_distance=twin.material.contact_distance * factor, mass=mass)
+    return _carried(twin, new, material, np.concatenate([laid.points, laid.others])), laid
+
+
+def scale_between(topology: Topology, nodes: np.ndarray) -> float:
+    """Spacing of other nodes over that of a topology: distances to the neighbor whose rank is the mean number of springs."""
+    before = topology.canonical[: len(topology.nodes)].astype(np.float64)
+    rank = max(round(2 * topology.object_spring_count / len(before)), 1)
+    rank = min(rank, len(before) - 1, len(nodes) - 1)
+    return spacing(nodes.astype(np.float64), rank) / spacing(before, rank)
+
+
+def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
+    """Radius, m, and neighbor count (self included) per region that make the object springs of a topology again.
+
+    They are the largest that a spring within the region shows: its length, and the lower of its ends' ranks for each other. Springs
+    of nodes that repair has joined show nothing; a region without springs of its own takes the values of all.
+    """
+    points = topology.canonical[: len(topology.nodes)].astype(np.float64)
+    springs = topology.springs[: topology.object_spring_count]
+    if not len(springs):
+        return [0.0] * (int(topology.labels.max()) + 1), [2] * (int(topology.labels.max()) + 1)
+    degree = np.bincount(springs.ravel(), minlength=len(points))
+    regular = (degree[springs] > REPAIR_SPRINGS).all(axis=1)
+    springs = springs[regular] if regular.any() else springs
+    length, tree = distances(points, springs), cKDTree(points)
+    ranks = [tree.query_ball_point(points[springs[:, end]], length * MARGIN, return_length=True) for end in (0, 1)]
+    rank = np.minimum(*ranks)
+    region = topology.labels[springs]
+    radii, neighbors = [], []
+    for label in range(int(topology.labels.max()) + 1):
+        within = (region == label).all(axis=1)
+        within = within if within.any() else np.ones(len(springs), dtype=bool)
+        radii.append(float(length[within].max()) * MARGIN)
+        neighbors.append(max(int(rank[within].max()), 2))
+    return radii, neighbors
+
+
+def infer_controller_radius(topology: Topology) -> tuple[float, int]:
+    """Radius, m, and number of nodes that make the controller springs of a topology again."""
+    springs = topology.springs[topology.object_spring_count :]
+    if not len(springs):
+        return 1e-9, 1
+    hands = springs.max(axis=1) - len(topology.nodes)
+    return float(distances(topology.canonical, springs).max()) * MARGIN, int(np.bincount(hands).max())
+
+
+def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) -> Twin:
+    """The twin with another topology, whose canonical points lie at `laid` [M + C, 3] in the frame of the twin's."""
+    old = twin.topology
+    lengths = {id(t): distances(t.canonical, t.springs) for t in (old, new)}
+    values = {
+        "stiffness": twin.material.stiffness.astype(np.float64),
+        "dashpot": twin.material.dashpot.astype(np.float64),
+        "strain": old.rest_lengths / _without_force(old),
+    }
+    middle, middle_laid = midpoints(old.canonical, old.springs), midpoints(laid, new.springs)
+    found = {name: np.zeros(len(new.springs)) for name in values}
+    for here, there in zip(_parts(old), _parts(new), strict=True):
+        if not len(new.springs[there]) or not len(old.springs[here]):
+            continue
+        mean = _means(middle[here], middle_laid[there])
+        for name, numbers in values.items():
+            found[name][there] = mean(numbers[here])
+    for here, there, of_hands in zip(_parts(old), _parts(new), (False, True), strict=True):
+        for name in ("stiffness", "dashpot"):
+            # Powers of length in the sums of the module's text.
+            power = {"stiffness": 1, "dashpot": 2}[name] - 2 * of_hands
+            before = _sum(old, here, values[name], lengths[id(old)], power, of_hands)
+            after = _sum(new, there, found[name], lengths[id(new)], power, of_hands)
+            found[name][there] *= before / after if after > 0 else 1.0
+    found["strain"][found["strain"] == 0] = 1.0
+    material = replace(material, stiffness=found["stiffness"], dashpot=found["dashpot"])
+    return replace(twin, topology=replace(new, rest_lengths=_without_force(new) * found["strain"]), material=material)
+
+
+def _without_force(topology: Topology) -> np.ndarray:
+    """Distance of the ends of each spring [S], m, where it has no force."""
+    parts = topology.nodes, topology.controllers, topology.springs, topology.rest_shape
+    return unloaded(*parts, topology.controller_rest)
+
+
+def _parts(topology: Topology) -> tuple[slice, slice]:
+    """Object springs and controller springs."""
+    return slice(0, topology.object_spring_count), slice(topology.object_spring_count, None)
+
+
+def _sum(topology: Topology, part: slice, values: np.ndarray, lengths: np.ndarray, power: int, of_hands: bool) -> float:
+    """Sum of value times length^power over springs, per node or per node that a hand holds."""
+    held = len(np.unique(topology.springs[part].min(axis=1)))
+    return float((values[part] * lengths[part] ** power).sum()) / max(held if of_hands else len(topology.nodes), 1)
+
+
+def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """How numbers [S] >= 0 at places [S, 3] are carried to [P, 3]: geometric means of the nearest, by inverse distance."""
+    k = min(NEAREST_SPRINGS, len(places))
+    distance, index = cKDTree(places).query(at, k=k)
+    distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
+    # A spring at the same place decides alone; a millionth of a meter is the same place.
+    weights = 1 / np.maximum(distance, 1e-6)
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    def mean(numbers: np.ndarray) -> np.ndarray:
+        result: np.ndarray = np.exp((weights * np.log(np.maximum(numbers, 1e-12))[index]).sum(axis=1))
+        return np.where((numbers == 0).all(), 0.0, result)
+
+    return mean
+
+
+def require_pool(here: Observations, pool: Sequence[Observations], leave_out: bool) -> None:
+    """Raise InputError unless a twin can be judged on the pool: other recordings, with as many nodes and hands."""
+    name = f"pool of {here.scenario.name}"
+    if leave_out and not pool:
+        raise InputError(name, "at least one other recording is required where this one is left out", "none")
+    counts = len(here.nodes), here.controller_points.shape[1]
+    for there in pool:
+        received = len(there.nodes), there.controller_points.shape[1]
+        if received != counts:
+            rule = f"recordings of a pool must have as many nodes and controllers: {counts[0]} and {counts[1]}"
+            value = f"{received[0]} and {received[1]} in {there.scenario.name}"
+            raise InputError(name, rule, value, "Sample all alike (mocap.rings).")
+
+
+def on_recording(twin: Twin, observations: Observations, quirks: config.ReleasedQuirks) -> Twin:
+    """The twin on the nodes of a recording of its pool, node i on node i. Raises InputError if those are others."""
+    if not corresponds(twin.topology, observations):
+        name = f"pool, {observations.scenario.name}"
+        raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
+    return rebase(twin, observations, keep_frame_time=quirks.frame_time_667)

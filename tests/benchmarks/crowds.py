@@ -16,8 +16,9 @@ from neuspring.core.device import load
 from neuspring.physics import frame
 from neuspring.physics.lanes import WIDTHS
 from neuspring.physics.solver import union
-from neuspring.twin import trial_kernels
-from neuspring.twin.search import SearchProblem, SearchResult, search
+from neuspring.twin import trials
+from neuspring.twin.candidates import SearchProblem
+from neuspring.twin.search import SearchResult, search
 from tests.benchmarks.plush import problem
 from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
 from tests.benchmarks.scenes import CASES, box
@@ -154,5 +155,5 @@ def warm(device: str) -> None:
     for width in widths:
         made = frame.kernels(wp.float32, width)
         its = [made.begin, made.substep] if device != "cpu" else [made.forward]
-        for kernel in (*its, *trial_kernels.kernels(width)):
+        for kernel in (*its, *trials.kernels(width)):
             load(kernel, device)

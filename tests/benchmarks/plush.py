@@ -12,7 +12,7 @@ import numpy as np
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Scenario
-from neuspring.twin.search import SearchProblem
+from neuspring.twin.candidates import SearchProblem
 
 FRAMES, RATE = 31, 30.0
 TRACKED, SURFACE, NODES, HANDS = 300, 150, 650, 30

@@ -12,7 +12,8 @@ from scipy.spatial.distance import cdist
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
-from neuspring.twin.search import SearchProblem, SearchResult
+from neuspring.twin.candidates import SearchProblem
+from neuspring.twin.search import SearchResult
 from tests.benchmarks import bench, crowds, limits, rows, sections, table
 from tests.benchmarks.limits import Limits
 from tests.benchmarks.ours import Ours, reference_frame

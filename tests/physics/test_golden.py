@@ -13,7 +13,6 @@ from neuspring.physics import reference, stability
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.reference import Scene
 from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
-from neuspring.twin.losses import acceleration
 from tests.support import scenes
 from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
 from tests.support.scenes import DEVICES
@@ -104,8 +103,9 @@ def optimized_frames(name: str, device: str, dtype: torch.dtype, restart: bool, 
         scalars = [values[scalar].requires_grad_() for scalar in CONTACT_SCALARS]
         parameters = pack(**values, substep=c.twin.simulation.substep)
         after, speed = simulate_frame(solver, parameters, x, v, hands[k - 1], hands[k])
-        near, moved = loss.terms(k, after).values()
-        smooth = near.new_zeros(()) if change is None else c.weights.acceleration * acceleration(speed - v, change)
+        found = loss.terms(k, after, None if change is None else speed - v - change)
+        near, moved = found["chamfer"], found["track"]
+        smooth = found.get("acceleration", near.new_zeros(()))
         total = near + moved + smooth
         total.backward()
         collide = [0.0 if scalar.grad is None else float(scalar.grad) for scalar in scalars]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pandas as pd
 
 from neuspring.stages.search import at_ends
-from neuspring.twin.polish import CMAES, SLOPES
+from neuspring.twin.candidates import CMAES
+from neuspring.twin.polish import SLOPES
 
 VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
 

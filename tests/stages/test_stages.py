@@ -21,7 +21,7 @@ from neuspring.stages.rollout import rollout
 from neuspring.stages.score import _notes, score
 from neuspring.stages.search import search
 from neuspring.stages.transfer import transfer
-from neuspring.twin.spacing import node_spacing
+from neuspring.twin.topology import node_spacing
 from tests.support import small
 
 SETTINGS = config.Config(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pandas as pd
 
-from neuspring.twin.search import SearchProblem
+from neuspring.twin.candidates import SearchProblem
 from tests.support import small
 
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from neuspring import config
-from neuspring.core.artifacts import Observations
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.data.synthetic import toy
+from neuspring.twin.candidates import SearchProblem, candidate, recordings
 from neuspring.twin.fit import FitProblem
-from neuspring.twin.search import SearchProblem, candidate
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.trials import Outcome, outcomes
 
 FRAMES = 8
 
@@ -82,6 +86,23 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
         "quirks": config.ReleasedQuirks(),
     }
     return SearchProblem(**(settings | changes))  # type: ignore[arg-type]
+
+
+def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
+    """What becomes of candidates that are rolled out together over the training frames."""
+    own = recordings(problem, twins, loss)[0]
+    return outcomes(twins, own.hands, own.velocity, own.loss, problem.device)
+
+
+def rollout_loss(loss: FrameLoss, states: Iterable[tuple[int, torch.Tensor, torch.Tensor]], velocity: torch.Tensor) -> float:
+    """Mean loss of the frames (frame, x, v) of a rollout from `velocity` [N, 3] on, acceleration included."""
+    total, count, previous = 0.0, 0, None
+    for frame, x, v in states:
+        change = v - velocity
+        jerk = None if previous is None else change - previous
+        total += sum(float(term) for term in loss.terms(frame, x, jerk).values())
+        velocity, previous, count = v, change, count + 1
+    return total / count
 
 
 def start_values() -> dict[str, float]:

@@ -219,7 +219,7 @@ def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
     with torch.no_grad():
         run.parameters.factors["dashpot"].fill_(100.0)
     with pytest.raises(NonFinite, match="stiffness, rest length or dashpot is not finite"):
-        run.settled()
+        run.stable_parameters()
 
 
 @pytest.mark.parametrize("kind", ["springs", "field"])
@@ -247,11 +247,11 @@ def test_growing_dashpots_get_more_substeps():
     run = TwinFit(small.fit_problem(twin=damped, fit=config.Fit(damping="homogeneous")))
     before = stability.smallest_safe_substeps(stability.twin_spectrum(damped), damped.simulation.frame_time, 0.8)
     run.use_substeps(before)
-    run.settled()
+    run.stable_parameters()
     assert run.twin.simulation.substeps == before
     with torch.no_grad():
         run.parameters.factors["dashpot"].fill_(math.log(3.0))
-    run.settled()
+    run.stable_parameters()
     assert run.twin.simulation.substeps > before
     stability.check(run.parameters.as_twin(run.twin))
 
@@ -343,9 +343,9 @@ def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon):
 
 
 def test_at_least_one_frame_is_held_back_and_one_trained_on():
-    for fraction, head_end in ((0.01, 4), (0.5, 3), (0.99, 2)):
-        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail", tail_fraction=fraction))).head_end == head_end
-    assert TwinFit(small.fit_problem()).head_end == 5
+    for fraction, fitted_end in ((0.01, 4), (0.5, 3), (0.99, 2)):
+        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail", tail_fraction=fraction))).fitted_end == fitted_end
+    assert TwinFit(small.fit_problem()).fitted_end == 5
 
 
 def test_a_single_training_frame_cannot_be_held_back_and_trained_on():

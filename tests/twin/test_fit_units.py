@@ -8,7 +8,7 @@ import torch
 
 from neuspring import config
 from neuspring.twin.fit import FitProblem, TwinFit, fit
-from neuspring.twin.unloaded import topology_spacing
+from neuspring.twin.rest_shape import topology_spacing
 from tests.support import small
 
 SINGLE = 1e-5

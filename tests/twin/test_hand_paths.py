@@ -8,7 +8,7 @@ import pytest
 from neuspring.config import Search
 from neuspring.core.artifacts import ImageObservations, Twin
 from neuspring.twin import hand_paths
-from neuspring.twin.search import candidate
+from neuspring.twin.candidates import candidate
 from tests.support import colored, small
 from tests.support.colored import camera
 

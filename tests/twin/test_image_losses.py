@@ -10,22 +10,20 @@ from neuspring import config
 from neuspring.config import Losses
 from neuspring.core.errors import InputError
 from neuspring.twin import hand_paths
+from neuspring.twin.candidates import Recording, SearchProblem, _motion, candidate
 from neuspring.twin.fit import FitProblem, TwinFit
-from neuspring.twin.image_losses import BETA, ImageLoss
-from neuspring.twin.losses import FrameLoss
-from neuspring.twin.recordings import Recording
-from neuspring.twin.residuals import Residuals
-from neuspring.twin.search import SearchProblem, _motion, candidate, judge, search
+from neuspring.twin.losses import BETA, FrameLoss
+from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import colored, small
 
 ALL = Losses(image_track=1.0, silhouette=1.0)
 
 
-def loss_of(weights: Losses = ALL) -> ImageLoss:
-    made = ImageLoss.of(colored.observed(), weights, "cpu", torch.float64)
-    assert made is not None
-    return made
+def loss_of(weights: Losses = ALL, **image: torch.Tensor) -> FrameLoss:
+    """The loss of the scene as one camera sees it, in double precision; `image` replaces what it saw."""
+    loss = FrameLoss.of(colored.observed(), weights, "cpu", torch.float64)
+    return replace(loss, image=replace(loss.image, **image))
 
 
 def truth(frame: int) -> torch.Tensor:
@@ -44,38 +42,42 @@ def problem_of(**changes: object) -> SearchProblem:
 
 
 def test_tracks_of_the_truth_cost_nothing_and_a_shift_in_the_image_its_square():
-    loss = loss_of(Losses(silhouette=0.0))
-    assert float(loss.terms(2, nodes_of(2))["image_track"]) == pytest.approx(0.0, abs=1e-12)
-    shifted = replace(loss, pixels=loss.pixels + torch.tensor([3.0, 0.0]))
-    error = 3.0 * loss.size
+    image = loss_of().image
+
+    def cost(pixels: float) -> float:
+        shifted = loss_of(pixels=image.pixels + torch.tensor([pixels, 0.0]))
+        return float(shifted.terms(2, nodes_of(2))["image_track"])
+
+    assert cost(0.0) == pytest.approx(0.0, abs=1e-12)
+    error = 3.0 * image.size
     assert error < BETA
     # Half a square in one of two axes.
-    assert float(shifted.terms(2, nodes_of(2))["image_track"]) == pytest.approx(error**2 / 4, rel=1e-4)
-    far = replace(loss, pixels=loss.pixels + torch.tensor([100.0, 0.0]))
-    assert float(far.terms(2, nodes_of(2))["image_track"]) == pytest.approx(BETA * (100 * loss.size - BETA / 2) / 2, rel=1e-4)
+    assert cost(3.0) == pytest.approx(error**2 / 4, rel=1e-4)
+    assert cost(100.0) == pytest.approx(BETA * (100 * image.size - BETA / 2) / 2, rel=1e-4)
 
 
 def test_silhouettes_measure_distances_in_the_image():
-    loss = replace(loss_of(Losses(image_track=0.0)), outside=torch.zeros_like(loss_of().outside))
-    u = loss.project(nodes_of(1))
-    at_nodes = replace(loss, inside=u[None, : loss.surface].expand(len(loss.inside), -1, -1))
-    assert float(at_nodes.terms(1, nodes_of(1))["silhouette"]) == pytest.approx(0.0, abs=1e-12)
+    whole = loss_of()
+    image, u = whole.image, whole.image.project(nodes_of(1))[: whole.surface]
+
+    def cost(inside: torch.Tensor) -> float:
+        loss = loss_of(inside=inside, outside=torch.zeros_like(image.outside))
+        return float(loss.terms(1, nodes_of(1))["silhouette"])
+
+    assert cost(u.expand(len(image.inside), -1, -1)) == pytest.approx(0.0, abs=1e-12)
     # One point 50 px beyond the node that is farthest to the left.
-    left = u[u[: loss.surface, 0].argmin()] - torch.tensor([50.0, 0.0])
-    apart = replace(loss, inside=left.expand(len(loss.inside), 1, 2))
-    assert float(apart.terms(1, nodes_of(1))["silhouette"]) == pytest.approx((50 * loss.size) ** 2, rel=1e-6)
+    left = u[u[:, 0].argmin()] - torch.tensor([50.0, 0.0])
+    assert cost(left.expand(len(image.inside), 1, 2)) == pytest.approx((50 * image.size) ** 2, rel=1e-6)
 
 
 def test_nodes_that_leave_object_and_hands_cost_their_distance():
-    loss = loss_of(Losses(image_track=0.0))
-    columns = torch.arange(loss.outside.shape[2], dtype=torch.float64)
-    ramp = (columns * loss.cell).expand(loss.outside.shape)
-    moved = replace(loss, outside=ramp)
+    image = loss_of().image
+    ramp = (torch.arange(image.outside.shape[2], dtype=torch.float64) * image.cell).expand(image.outside.shape)
+    moved = replace(image, outside=ramp)
     u = torch.tensor([[20.0, 30.0], [41.5, 77.0]], dtype=torch.float64)
     # The center of column j is at 4 j + 1.5.
     torch.testing.assert_close(moved.distance(1, u), u[:, 0] - 1.5)
-    beyond = torch.tensor([[-50.0, 30.0]], dtype=torch.float64)
-    assert float(moved.distance(1, beyond)) == 0.0
+    assert float(moved.distance(1, torch.tensor([[-50.0, 30.0]], dtype=torch.float64))) == 0.0
 
 
 @pytest.mark.parametrize("name", ["image_track", "silhouette"])
@@ -88,14 +90,6 @@ def test_gradients_through_the_projection(name):
     assert torch.autograd.gradcheck(lambda nodes: 1e4 * loss.terms(3, nodes)[name], (x,), eps=1e-7, atol=1e-4, rtol=1e-3)
 
 
-def test_residuals_are_roots_of_the_terms():
-    loss = loss_of()
-    near = loss.assigned(2, nodes_of(1))
-    parts = loss.residuals(2, nodes_of(1), near)
-    for name, value in loss.terms(2, nodes_of(1)).items():
-        assert sum(float(r.square().sum()) for r in parts[name]) == pytest.approx(float(value), rel=1e-12)
-
-
 def test_captures_with_depth_have_no_image_losses():
     assert FrameLoss.of(small.observations(), ALL, "cpu").image is None
 
@@ -106,17 +100,14 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
     values = problem.decode(problem.encode())
     others = values | {"hand_tilt": 20.0, "stiffness": 2e4}
     twins = [candidate(problem, one) for one in (values, others)]
-    together, alone = judge(problem, twins, loss), [judge(problem, [twin], loss)[0] for twin in twins]
+    together, alone = small.judge(problem, twins, loss), [small.judge(problem, [twin], loss)[0] for twin in twins]
     assert together == alone
     assert together[0].cost != together[1].cost
     hands, start = _motion(problem, twins)
     x, v = motions(twins, hands, start, "cpu")
     for k, outcome in enumerate(together):
         states = [(frame, x[frame - 1, k], v[frame - 1, k]) for frame in range(1, len(x) + 1)]
-        assert loss.of_rollout(states, start) == pytest.approx(outcome.cost, rel=1e-5)
-        residuals = Residuals.of(loss, start)
-        r = residuals(x[:, k], v[:, k], residuals.assigned(x[:, k]))
-        assert r @ r == pytest.approx(outcome.cost, rel=1e-5)
+        assert small.rollout_loss(loss, states, start) == pytest.approx(outcome.cost, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["image_track", "silhouette"])
@@ -133,8 +124,8 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
         run = TwinFit(FitProblem(seen, twin, settings, config.Simulation(substeps=100), weights, config.ReleasedQuirks()))
         with torch.no_grad():
             run.parameters.factors["stiffness"] += shift
-        packed = run.settled()
-        mean = run._simulate((run.rest, run.velocity, None), range(1, run.head_end), packed)[1]
+        packed = run.stable_parameters()
+        mean = run._simulate((run.rest, run.velocity, None), range(1, run.fitted_end), packed)[1]
         mean.backward()
         return float(mean), float(run.parameters.factors["stiffness"].grad)
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from neuspring import config
 from neuspring.config import Losses
 from neuspring.twin import losses
+from neuspring.twin.candidates import _motion, candidate
+from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import FrameLoss
+from neuspring.twin.polish import products
+from neuspring.twin.trials import motions
+from tests.support import small
 
 GOLDEN = {float: 1e-12, "float32": 1e-5}
 """Relative: the golden README accepts 1e-5 from float32; values are float64 sums of some 100 terms of float32 inputs."""
@@ -46,34 +52,19 @@ def assert_close(got: torch.Tensor, wanted: np.ndarray, relative: float) -> None
 
 
 @pytest.mark.parametrize("k", CASES)
-def test_golden_chamfer(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
-    """Small errors, errors beyond 1 m, nothing visible: value and gradient."""
-    c, surface = case(golden, k, dtype), int(golden[f"num_surface_points{k}"])
-    nodes = c["pred"].requires_grad_()
-    value = losses.chamfer(nodes, c["gt"], c["visible"], surface)
-    value.backward()
-    assert_close(value, golden[f"exp_chamfer{k}"], tolerance(dtype))
-    assert_close(nodes.grad, golden[f"exp_chamfer_grad{k}"], tolerance(dtype))
-
-
-@pytest.mark.parametrize("k", CASES)
-def test_golden_track(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+    """Small errors, errors beyond 1 m, nothing visible: values and gradients of each term, and their sum."""
     c = case(golden, k, dtype)
+    points, visible, valid = (torch.stack([c[name]] * 2) for name in ("gt", "visible", "motion_valid"))
+    loss = FrameLoss(points, visible, valid, int(golden[f"num_surface_points{k}"]), Losses())
     nodes = c["pred"].requires_grad_()
-    value = losses.track(nodes, c["gt"], c["motion_valid"])
-    value.backward()
-    assert_close(value, golden[f"exp_track{k}"], tolerance(dtype))
-    assert_close(nodes.grad, golden[f"exp_track_grad{k}"], tolerance(dtype))
-
-
-@pytest.mark.parametrize("k", CASES)
-def test_golden_acceleration_and_total(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
-    c, surface, weights = case(golden, k, dtype), int(golden[f"num_surface_points{k}"]), Losses()
-    smooth = weights.acceleration * losses.acceleration(c["v_end"] - c["v_start"], c["prev_acc"])
-    near = losses.chamfer(c["pred"], c["gt"], c["visible"], surface)
-    total = weights.chamfer * near + weights.track * losses.track(c["pred"], c["gt"], c["motion_valid"]) + smooth
-    assert_close(smooth, golden[f"exp_acc{k}"], tolerance(dtype))
-    assert_close(total, golden[f"exp_total{k}"], tolerance(dtype))
+    terms = loss.terms(1, nodes, c["v_end"] - c["v_start"] - c["prev_acc"])
+    for name, short in (("chamfer", "chamfer"), ("track", "track")):
+        (gradient,) = torch.autograd.grad(terms[name], nodes, retain_graph=True)
+        assert_close(terms[name], golden[f"exp_{short}{k}"], tolerance(dtype))
+        assert_close(gradient, golden[f"exp_{short}_grad{k}"], tolerance(dtype))
+    assert_close(terms["acceleration"], golden[f"exp_acc{k}"], tolerance(dtype))
+    assert_close(sum(terms.values()), golden[f"exp_total{k}"], tolerance(dtype))
 
 
 @pytest.mark.parametrize("k", CASES)
@@ -93,8 +84,8 @@ def test_ties_go_to_the_lowest_index() -> None:
 
 
 def test_the_track_loss_is_linear_beyond_one_meter() -> None:
-    nodes = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True)
-    value = losses.track(nodes, torch.zeros(1, 3), torch.tensor([True]))
+    nodes, seen = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True), torch.ones(2, 1, dtype=torch.bool)
+    value = FrameLoss(torch.zeros(2, 1, 3), ~seen, seen, 1, Losses())(1, nodes)
     assert value.item() == pytest.approx((0.5**2 / 2 + 1.5) / 3)
     value.backward()
     np.testing.assert_allclose(nodes.grad, [[0.5 / 3, 1 / 3, 0.0]])
@@ -102,8 +93,8 @@ def test_the_track_loss_is_linear_beyond_one_meter() -> None:
 
 def test_nothing_seen_is_zero_with_a_gradient() -> None:
     nodes = torch.rand(4, 3, requires_grad=True)
-    nobody = torch.zeros(2, dtype=torch.bool)
-    total = losses.chamfer(nodes, torch.rand(2, 3), nobody, 3) + losses.track(nodes, torch.rand(2, 3), nobody)
+    nobody = torch.zeros(2, 2, dtype=torch.bool)
+    total = FrameLoss(torch.rand(2, 2, 3), nobody, nobody, 3, Losses())(1, nodes)
     total.backward()
     assert total.item() == 0.0
     assert not nodes.grad.any()
@@ -143,8 +134,8 @@ def test_counts_are_what_each_frame_is_divided_by() -> None:
     """Points of the frame, motions from the frame before; frozen: those of frame 1."""
     plain, _ = frame_loss()
     frozen, _ = frame_loss(frozen=True)
-    assert plain.counts() == [(2, 0), (2, 2), (1, 1)]
-    assert frozen.counts() == [(2, 2)] * 3
+    assert plain.counts == [(2, 0), (2, 2), (1, 1)]
+    assert frozen.counts == [(2, 2)] * 3
 
 
 def test_weights() -> None:
@@ -154,13 +145,43 @@ def test_weights() -> None:
     assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())
 
 
-def test_every_term_has_a_weight_of_its_name() -> None:
-    """A weight of 0 removes its term alone."""
-    rng = np.random.default_rng(0)
-    points = torch.tensor(rng.random((3, 5, 3)), dtype=torch.float32)
-    nodes, seen = torch.tensor(rng.random((6, 3)), dtype=torch.float32), torch.ones(3, 5, dtype=torch.bool)
-    full = FrameLoss(points, seen, seen, 6, Losses()).terms(1, nodes)
-    assert set(full) == {"chamfer", "track"}
-    for name in full:
-        terms = FrameLoss(points, seen, seen, 6, replace(Losses(), **{name: 0.0})).terms(1, nodes)
-        assert {other: float(value) for other, value in terms.items()} == {o: float(v) * (o != name) for o, v in full.items()}
+def test_every_term_has_a_weight_of_its_name_and_a_weight_of_zero_leaves_it_out() -> None:
+    assert set(losses.TERMS) == {spec.name for spec in fields(Losses)}
+    for name in ("chamfer", "track"):
+        loss, nodes = frame_loss(weights=replace(Losses(), **{name: 0.0}))
+        full = frame_loss()[0].terms(1, nodes)
+        del full[name]
+        assert loss.terms(1, nodes) == full
+    loss, nodes = frame_loss(weights=Losses(chamfer=0.0, track=0.0))
+    assert loss(1, nodes.requires_grad_()).requires_grad, "a fit without terms stays where it is"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights(Losses):
+    """A weight more: the first place of a new term."""
+
+    height: float = 1.0
+
+
+def height(loss: FrameLoss, state: losses.FrameState) -> list[losses.Errors]:
+    """The second place, with its line in TERMS: nodes are wanted in the plane z = 0.1 m."""
+    return [losses.Errors(state.x[:, 2:] - 0.1, loss.weights.height, len(state.x), losses.SQUARES)]
+
+
+def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search, fit and polish follow: their costs of a rollout agree, with that of the term itself."""
+    monkeypatch.setitem(losses.TERMS, "height", height)
+    weights = Weights(chamfer=0.0, track=0.0, acceleration=0.0)
+    problem = small.search_problem(losses=weights)
+    twin = candidate(problem, small.start_values())
+    loss = FrameLoss.of(problem.observations, weights, "cpu")
+    (searched,) = small.judge(problem, [twin], loss)
+    hands, start = _motion(problem, [twin])
+    x, v = motions([twin], hands, start, "cpu")
+    expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())
+    assert searched.cost == pytest.approx(expected, rel=1e-5)
+    assert small.rollout_loss(loss, zip(range(1, len(hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
+    polished, _, _ = products(loss, start, x, v, [True], np.zeros(0))
+    assert polished.tolist() == pytest.approx([expected])
+    fitted = TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch()["loss"]
+    assert fitted == pytest.approx(expected, rel=1e-5)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.motion import initial_velocity, recent_velocity, spread
-from neuspring.twin.rollout import roll_out
-from neuspring.twin.search import candidate, judge
+from neuspring.twin.rollout import initial_velocity, roll_out, spread
 from tests.support import small
 
 # The interpolation is smoothed by 1e-6 m; float32 positions of about 1 m carry 6e-8 m, times 30 frames per second, times 4.
@@ -49,17 +48,6 @@ def test_spread_takes_coinciding_points():
 def test_velocity_is_exact_under_constant_acceleration():
     seen = moving([0, 0, -9.8], [0.3, -0.2, 1.0])
     np.testing.assert_allclose(initial_velocity(seen, "observed"), np.tile([0.3, -0.2, 1.0], (len(seen.nodes), 1)), atol=ROUNDING)
-
-
-def test_recent_velocity_is_exact_under_constant_acceleration_and_known_where_three_frames_are():
-    seen = moving([0, 0, -9.8], [0.3, -0.2, 1.0])
-    visible, valid = np.array(seen.object_visibility), np.array(seen.object_motion_valid)
-    visible[3, 0] = visible[5, 1] = False
-    valid[4, 2] = False
-    velocity = recent_velocity(replace(seen, object_visibility=visible, object_motion_valid=valid), 5)
-    assert np.isnan(velocity[:3]).all()
-    expected = np.array([0.3, -0.2, 1.0]) + np.array([0, 0, -9.8]) * 5 / seen.scenario.frame_rate
-    np.testing.assert_allclose(velocity[3:], np.tile(expected, (len(velocity) - 3, 1)), atol=ROUNDING)
 
 
 def test_at_rest_nothing_is_read():
@@ -103,7 +91,7 @@ def test_search_and_fit_start_with_the_observed_velocity(kind):
     problem = small.search_problem(seen, simulation=simulation)
     twin = candidate(problem, small.start_values() | {"drag": 0.0})
     loss = FrameLoss.of(seen, config.Losses(acceleration=0.0), "cpu")
-    (truth,) = judge(replace(problem, losses=config.Losses(acceleration=0.0)), [twin], loss)
+    (truth,) = small.judge(replace(problem, losses=config.Losses(acceleration=0.0)), [twin], loss)
     fitted = fit(small.fit_problem(seen, twin=twin, simulation=simulation, fit=config.Fit(epochs=1)))
     # Millimeters squared: dashpots of controllers, which the released simulator holds at rest, leave a little.
     assert (truth.cost < 1e-6) == (fitted.best_loss < 1e-6) == (kind == "observed"), (truth.cost, fitted.best_loss)

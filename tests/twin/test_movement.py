@@ -7,8 +7,7 @@ import torch
 
 from neuspring import config
 from neuspring.twin.fit import TwinFit, fit
-from neuspring.twin.movement import movement
-from neuspring.twin.parameters import TwinParameters
+from neuspring.twin.parameters import TwinParameters, movement
 from tests.support import small
 
 FIELD = config.SpringField(channels=4, hidden=8, bands=2, texel_scale=0.02)

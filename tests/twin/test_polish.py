@@ -11,11 +11,10 @@ from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
 from neuspring.twin import search as module
-from neuspring.twin import trace as trace_file
+from neuspring.twin.candidates import CMAES, SearchProblem, _motion, candidate, evaluate
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.polish import CMAES, POLISH, REACH, SLOPES, Polish, damped_step, slopes
-from neuspring.twin.residuals import Residuals
-from neuspring.twin.search import SearchProblem, candidate, judge, search
+from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, damped_step, products, residuals
+from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
 from tests.support.searches import assert_same_trace, budget
@@ -36,8 +35,16 @@ def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, 
 
 def rollouts_of(problem: SearchProblem, twins: list) -> tuple[torch.Tensor, torch.Tensor, FrameLoss, torch.Tensor]:
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu", frozen_counts=problem.quirks.frozen_loss_denominators)
-    hands, start = module._motion(problem, twins)
+    hands, start = _motion(problem, twins)
     return *motions(twins, hands, start, "cpu"), loss, start
+
+
+def squares(loss: FrameLoss, start: torch.Tensor, x: torch.Tensor, v: torch.Tensor) -> float:
+    """|r|^2 of a rollout."""
+    loss, x = loss.to("cpu", torch.float64), x.double()
+    near = [loss.assigned(frame, nodes) for frame, nodes in enumerate(x, start=1)]
+    r = residuals(loss, start.double(), x, v.double(), near)
+    return float(r @ r)
 
 
 # Residuals ------------------------------------------------------------------------------------------------------------
@@ -50,10 +57,8 @@ def test_the_sum_of_squares_is_the_cost(quirks, weights):
     problem = small.search_problem(seen, quirks=quirks, losses=weights)
     twins = [candidate(problem, small.start_values() | {"stiffness": s}) for s in (8e2, 6e3)]
     x, v, loss, start = rollouts_of(problem, twins)
-    residuals = Residuals.of(loss, start)
-    for k, outcome in enumerate(judge(problem, twins, loss)):
-        r = residuals(x[:, k], v[:, k], residuals.assigned(x[:, k]))
-        assert r @ r == pytest.approx(outcome.cost, rel=FLOAT32)
+    for k, outcome in enumerate(small.judge(problem, twins, loss)):
+        assert squares(loss, start, x[:, k], v[:, k]) == pytest.approx(outcome.cost, rel=FLOAT32)
 
 
 def test_residuals_beyond_a_meter_are_those_of_smooth_l1():
@@ -62,9 +67,7 @@ def test_residuals_beyond_a_meter_are_those_of_smooth_l1():
     problem = small.search_problem(replace(seen, object_points=seen.object_points + away))
     twin = candidate(small.search_problem(), small.start_values())
     x, v, loss, start = rollouts_of(problem, [twin])
-    residuals = Residuals.of(loss, start)
-    r = residuals(x[:, 0], v[:, 0], residuals.assigned(x[:, 0]))
-    assert r @ r == pytest.approx(judge(problem, [twin], loss)[0].cost, rel=FLOAT32)
+    assert squares(loss, start, x[:, 0], v[:, 0]) == pytest.approx(small.judge(problem, [twin], loss)[0].cost, rel=FLOAT32)
 
 
 def test_slopes_are_those_of_the_cost():
@@ -80,13 +83,13 @@ def test_slopes_are_those_of_the_cost():
 
     step = 0.01
     x, v, loss, start = rollouts_of(problem, twins(step))
-    _, products, gradient = slopes(Residuals.of(loss, start), x, v, [True] * 4, np.full(3, step))
-    up, down = ([o.cost for o in judge(problem, twins(s), loss)[1:]] for s in (step, -step))
+    _, matrix, gradient = products(loss, start, x, v, [True] * 4, np.full(3, step))
+    up, down = ([o.cost for o in small.judge(problem, twins(s), loss)[1:]] for s in (step, -step))
     central = (np.array(up) - np.array(down)) / (2 * step)
     # One-sided differences of residuals: off by half a step times the second derivative.
     np.testing.assert_allclose(2 * gradient, central, rtol=0.1, atol=0.02 * np.abs(central).max())
-    np.testing.assert_allclose(products, products.T)
-    assert (np.linalg.eigvalsh(products) > -1e-12 * np.trace(products)).all()
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert (np.linalg.eigvalsh(matrix) > -1e-12 * np.trace(matrix)).all()
 
 
 def test_a_rollout_that_left_has_no_slope():
@@ -94,12 +97,12 @@ def test_a_rollout_that_left_has_no_slope():
     twin = candidate(problem, problem.decode(problem.encode()))
     x, v, loss, start = rollouts_of(problem, [twin] * 3)
     x[:, 2] = float("nan")
-    costs, products, gradient = slopes(Residuals.of(loss, start), x, v, [True, True, False], np.full(2, 0.01))
+    costs, matrix, gradient = products(loss, start, x, v, [True, True, False], np.full(2, 0.01))
     assert np.isinf(costs[2])
     assert np.isfinite(costs[:2]).all()
-    assert not products[1].any()
+    assert not matrix[1].any()
     assert gradient[1] == 0
-    assert not slopes(Residuals.of(loss, start), x, v, [False, True, True], np.full(2, 0.01))[2].any()
+    assert not products(loss, start, x, v, [False, True, True], np.full(2, 0.01))[2].any()
 
 
 # Steps ----------------------------------------------------------------------------------------------------------------
@@ -175,7 +178,7 @@ def test_stiffness_and_drag_of_a_toy_twin_are_recovered():
     problem = replace(problem, observations=replace(seen, object_points=points))
     # The polish alone, from the start of the search.
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    rows = module._evaluate(problem, [problem.encode()], loss, 0, 0, map)
+    rows = evaluate(problem, [problem.encode()], loss, 0, 0, map)
     ends = list(module._polished(problem, rows, [], loss, 0, map))[-1]
     tried = [row for row in ends if row["stage"] == POLISH]
     best = min(tried, key=lambda row: row["cost"])
@@ -197,7 +200,7 @@ def test_a_polish_never_raises_the_cost_and_keeps_the_topology():
     # The result is a candidate that was judged as all are.
     assert result.cost == trace["cost"][trace["stage"] != SLOPES].min()
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    assert judge(problem, [result.twin], loss)[0].cost == result.cost
+    assert small.judge(problem, [result.twin], loss)[0].cost == result.cost
     moved = {name for name in problem.names if result.values[name] != plain.values[name]}
     assert moved <= {"stiffness", "dashpot", "drag"}
     for name in moved:
@@ -223,7 +226,7 @@ def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
     """Killed after some of its generations: slopes, or steps."""
     record, problem = tmp_path / "trace.parquet", polished(35, rounds=3)
     whole, count = search(problem, seed=2), 0
-    save = trace_file.save
+    save = module.save_trace
 
     def dying(*arguments):
         nonlocal count
@@ -233,7 +236,7 @@ def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(trace_file, "save", dying)
+        patch.setattr(module, "save_trace", dying)
         with pytest.raises(KeyboardInterrupt):
             search(problem, seed=2, record=record, key="k")
     kept = len(pd.read_parquet(record))
@@ -243,7 +246,7 @@ def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
     assert_same_trace(continued.trace, whole.trace)
     # Nothing is simulated any more.
     with monkeypatch.context() as patch:
-        for name in ("_evaluate", "_slopes"):
+        for name in ("evaluate", "slope_rows"):
             patch.setattr(module, name, lambda *_: pytest.fail("everything is recorded"))
         assert_same_trace(search(problem, seed=2, record=record, key="k").trace, whole.trace)
 

@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
-from neuspring.twin.resample import asked, held_by_hands, resampled, scale_between
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import distances, piecewise_topology, uniform_topology
-from neuspring.twin.transfer import move
+from neuspring.twin.transfer import infer_controller_radius, infer_radii, move, resampled, scale_between
 
 FRAMES, RATE = 20, 30.0
 SUMS = 1e-4
@@ -128,8 +127,8 @@ def test_what_made_a_topology_is_read_from_its_springs():
     nodes = grid((0.3, 0.2, 0.06), 0.02)
     labels = (nodes[:, 0] > 0).astype(np.int32)
     topology = piecewise_topology(nodes, hands_of((0.3, 0, 0)), labels, [0.05, 0.035], [12, 40], 0.06, 9)
-    radii, neighbors = asked(topology)
-    reach, held = held_by_hands(topology)
+    radii, neighbors = infer_radii(topology)
+    reach, held = infer_controller_radius(topology)
     # By both: in region 0 the count limits, in region 1 the radius.
     assert neighbors[0] == 12
     assert 0.033 < radii[1] <= 0.035
@@ -142,7 +141,7 @@ def test_lonely_nodes_that_were_joined_do_not_widen_the_radius():
     zero = np.zeros(len(nodes), np.int32)
     topology = piecewise_topology(nodes, hands_of((0.2, 0, 0)), zero, [0.045], [30], 0.06, 9, repair=True)
     assert distances(topology.canonical, topology.springs).max() > 0.25
-    assert asked(topology)[0][0] < 0.0451
+    assert infer_radii(topology)[0][0] < 0.0451
 
 
 def test_regions_and_strain_at_rest_are_carried():

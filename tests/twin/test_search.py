@@ -21,9 +21,11 @@ from neuspring.config.search import LENGTHS
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.twin import candidates
 from neuspring.twin import search as module
+from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.search import PENALTY, SearchProblem, candidate, groups, judge, search
+from neuspring.twin.search import search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import small
@@ -102,7 +104,7 @@ def test_the_start_is_decoded_to_itself(changes):
     start = {name: one["start"] for name, one in config.plain(problem.search.variables).items()}
     for name, value in problem.decode(problem.encode()).items():
         # Counts are truncated, and 30 may come back as 29.999...
-        slack = {"abs": 1} if name.partition(".")[0] in module.INTEGERS else {"rel": CODING}
+        slack = {"abs": 1} if name.partition(".")[0] in candidates.INTEGERS else {"rel": CODING}
         assert value == pytest.approx(start[name.partition(".")[0]], **slack)
 
 
@@ -124,7 +126,7 @@ def test_decoded_values_lie_in_their_ranges_and_counts_are_whole(normalized, sca
             base = name.partition(".")[0]
             variable = getattr(problem.search.variables, base)
             assert variable.low * (1 - CODING) <= value <= variable.high * (1 + CODING)
-            assert base not in module.INTEGERS or value == int(value)
+            assert base not in candidates.INTEGERS or value == int(value)
 
 
 @given(st.lists(st.floats(0, 1), min_size=12, max_size=12), st.sampled_from(["spacing", "meter"]))
@@ -139,7 +141,7 @@ def test_what_is_decoded_comes_from_where_it_is_decoded_to(normalized, lengths):
     inside = {name: replace(one, start=float(np.clip(values[name], one.low, one.high))) for name, one in settings.items()}
     back = replace(problem, search=replace(problem.search, variables=replace(problem.search.variables, **inside))).encode()
     for name, u, again in zip(problem.variables, normalized, back, strict=True):
-        slack = 1 / (settings[name].high - settings[name].low) if name in module.INTEGERS else ROUND_TRIP
+        slack = 1 / (settings[name].high - settings[name].low) if name in candidates.INTEGERS else ROUND_TRIP
         assert again == pytest.approx(u, abs=slack)
 
 
@@ -211,7 +213,7 @@ def test_the_released_row_is_the_search_as_it_was(clusters):
     for name in (n.removeprefix("normalized.") for n in names):
         low, high = ranges[name.partition(".")[0]]
         value = low + trace[f"normalized.{name}"] * (high - low)
-        whole = name.partition(".")[0] in module.INTEGERS
+        whole = name.partition(".")[0] in candidates.INTEGERS
         np.testing.assert_array_equal(trace[name], value.astype(int) if whole else value)
     options = {"bounds": [0, 1], "seed": 4, "verbose": -9, "tolfun": 0, "tolx": 0}
     strategy = cma.CMAEvolutionStrategy(start, 1 / 6, options)
@@ -295,7 +297,7 @@ def test_the_truth_costs_less_than_its_neighbors():
     values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbors": 12.0}
     values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
     twins = [candidate(problem, values | {"stiffness": s}) for s in (2e3, 1.2e4, 9e4)]
-    by_stiffness = [outcome.cost for outcome in judge(problem, twins, loss)]
+    by_stiffness = [outcome.cost for outcome in small.judge(problem, twins, loss)]
     assert by_stiffness[1] == min(by_stiffness)
 
 
@@ -306,7 +308,7 @@ def test_the_best_evaluated_candidate_wins_within_the_budget():
     assert result.cost == result.trace["cost"].min()
     # The returned twin is that candidate: simulating it again gives its cost.
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    assert judge(problem, [result.twin], loss) == [Outcome(result.cost, 0, 0)]
+    assert small.judge(problem, [result.twin], loss) == [Outcome(result.cost, 0, 0)]
 
 
 def test_seeds_decide_the_candidates():
@@ -319,7 +321,7 @@ def test_seeds_decide_the_candidates():
 def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupt a search while it evaluates one more candidate."""
     calls = 0
-    evaluate = module._made
+    evaluate = candidates.made
 
     def dying(*arguments):
         nonlocal calls
@@ -329,7 +331,7 @@ def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, m
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_made", dying)
+        patch.setattr(candidates, "made", dying)
         with pytest.raises(KeyboardInterrupt):
             search(problem, seed, record=record, key="k")
 
@@ -375,7 +377,7 @@ def test_a_smaller_budget_is_a_prefix_of_the_record_and_leaves_it(tmp_path, monk
     whole = search(budget(24), seed=2, record=record, key="k")
     before = record.read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_evaluate", lambda *_: pytest.fail("everything is recorded"))
+        patch.setattr(module, "evaluate", lambda *_: pytest.fail("everything is recorded"))
         less = search(budget(13), seed=2, record=record, key="k")
     assert_same_trace(less.trace, whole.trace[:13])
     assert less.cost == whole.trace["cost"][:13].min()
@@ -394,7 +396,7 @@ def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best(
     assert len(trace) == 30
     np.testing.assert_array_equal(trace["cost"][:15], uniform["cost"])
     for name in RELEASED:
-        regional = name in module.REGIONAL
+        regional = name in candidates.REGIONAL
         for column in [f"normalized.{name}.{region}" for region in range(3)] if regional else [f"normalized.{name}"]:
             np.testing.assert_array_equal(trace[column][:15], uniform[f"normalized.{name}"])
     radii = trace[[f"normalized.object_radius.{region}" for region in range(3)]][15:]
@@ -512,7 +514,7 @@ def test_an_unstable_candidate_is_penalized_not_fatal():
     assert penalized["reason"].str.startswith("unstable").all()
 
 
-# Company --------------------------------------------------------------------------------------------------------------
+# Batches --------------------------------------------------------------------------------------------------------------
 
 
 def crowded(**changes: object) -> SearchProblem:
@@ -553,11 +555,11 @@ def test_threads_that_simulate_at_the_same_time_do_not_meet():
     ("first", "second"),
     [({"together": 1}, {"together": 16}), ({"threads": 2}, {"together": 1}), ({}, {"together": 4, "threads": 2})],
 )
-@pytest.mark.parametrize("where", ["_made", "judge"])
-def test_a_killed_search_continues_with_other_company(tmp_path, monkeypatch, first, second, where):
+@pytest.mark.parametrize("where", ["made", "outcomes"])
+def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch, first, second, where):
     """Killed in the second generation, while its candidates are made or simulated."""
     record = tmp_path / "trace.parquet"
-    function, calls = getattr(module, where), 0
+    function, calls = getattr(candidates, where), 0
 
     def dying(*arguments):
         nonlocal calls
@@ -567,7 +569,7 @@ def test_a_killed_search_continues_with_other_company(tmp_path, monkeypatch, fir
         return function(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, where, dying)
+        patch.setattr(candidates, where, dying)
         with pytest.raises(KeyboardInterrupt):
             search(small.search_problem(**first), 5, record=record, key="k")
     assert calls > 1
@@ -578,18 +580,18 @@ def test_a_killed_search_continues_with_other_company(tmp_path, monkeypatch, fir
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("where", ["_made", "judge"])
+@pytest.mark.parametrize("where", ["made", "outcomes"])
 def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, threads):
     """And the record has whole generations alone."""
     record = tmp_path / "trace.parquet"
-    function = getattr(module, where)
+    function = getattr(candidates, where)
 
     def broken(*arguments):
         if record.exists():
             raise MemoryError(f"no room in {where}")
         return function(*arguments)
 
-    monkeypatch.setattr(module, where, broken)
+    monkeypatch.setattr(candidates, where, broken)
     with pytest.raises(MemoryError, match=f"no room in {where}"):
         search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
     assert len(pd.read_parquet(record)) == 11
@@ -598,13 +600,13 @@ def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, thr
 def test_threads_of_a_search_have_none_of_torch(monkeypatch):
     """`threads` cores are busy, not its square; afterwards torch has what it had."""
     before, seen = torch.get_num_threads(), set()
-    function = module.judge
+    function = candidates.outcomes
 
     def watched(*arguments):
         seen.add((threading.get_ident(), torch.get_num_threads()))
         return function(*arguments)
 
-    monkeypatch.setattr(module, "judge", watched)
+    monkeypatch.setattr(candidates, "outcomes", watched)
     torch.set_num_threads(3)
     try:
         search(small.search_problem(threads=2, together=1), seed=0)

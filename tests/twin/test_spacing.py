@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.twin.spacing import controller_reach, node_spacing
+from neuspring.twin.topology import controller_reach, node_spacing
 
 ROUNDING = 1e-12
 """Relative, in float64."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
+from neuspring.twin.candidates import candidate
 from neuspring.twin.rollout import roll_out, simulate
-from neuspring.twin.search import candidate
 from neuspring.twin.transfer import corresponds, move, rebase
 from tests.support import small
 

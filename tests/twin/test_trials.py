@@ -15,9 +15,9 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Topology, Twin
 from neuspring.physics.parameters import packed
 from neuspring.physics.solver import solver_for, stacked, union
+from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR, Diverged, frames
-from neuspring.twin.search import SearchProblem, candidate, judge
 from neuspring.twin.trials import LossSums, Outcome
 from tests.support import small
 
@@ -66,16 +66,16 @@ def hands_of(problem: SearchProblem) -> torch.Tensor:
 
 def alone(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of each candidate in a launch of its own."""
-    return [judge(problem, [twin], loss)[0] for twin in twins]
+    return [small.judge(problem, [twin], loss)[0] for twin in twins]
 
 
 def by_torch(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> float:
     """The cost by the losses of the fit, over the rollout of a solver of the twin's own."""
     states = frames(twin, solver_for(twin, differentiable=False), hands_of(problem), problem.velocity)
-    return loss.of_rollout(states, torch.tensor(problem.velocity, dtype=torch.float32))
+    return small.rollout_loss(loss, states, torch.tensor(problem.velocity, dtype=torch.float32))
 
 
-# Company --------------------------------------------------------------------------------------------------------------
+# Batches --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("crowded", [False, True], ids=["free", "self-collision"])
@@ -85,7 +85,7 @@ def test_candidates_fare_together_as_alone(count, crowded):
     problem = colliding(small.observations()) if crowded else small.search_problem()
     twins, loss = candidates(problem, count), loss_of(problem)
     assert len({t.topology.springs.tobytes() for t in twins}) == len({t.simulation.substeps for t in twins}) == min(count, 6)
-    together = judge(problem, twins, loss)
+    together = small.judge(problem, twins, loss)
     assert together == alone(problem, twins, loss)
     assert len({outcome.cost for outcome in together}) == min(count, 6)
 
@@ -93,7 +93,7 @@ def test_candidates_fare_together_as_alone(count, crowded):
 def test_the_crowded_candidates_do_collide():
     """Else the test above would say nothing of self-collision."""
     free, crowded = small.search_problem(), colliding(small.observations())
-    costs = [[outcome.cost for outcome in judge(p, candidates(p), loss_of(p))] for p in (free, crowded)]
+    costs = [[outcome.cost for outcome in small.judge(p, candidates(p), loss_of(p))] for p in (free, crowded)]
     assert all(without != with_it for without, with_it in zip(*costs, strict=True))
 
 
@@ -102,10 +102,10 @@ def test_candidates_that_diverge_do_not_touch_the_others(crowded):
     problem = colliding(small.observations()) if crowded else small.search_problem()
     steady, loss = candidates(problem), loss_of(problem)
     twins = [unsteady(steady[0]), steady[1], unsteady(steady[2], 0.1), *steady[3:], unsteady(steady[4], 0.05)]
-    together = judge(problem, twins, loss)
+    together = small.judge(problem, twins, loss)
     assert together == alone(problem, twins, loss)
-    assert [bool(outcome.left) for outcome in together] == [True, False, True, False, False, False, True]
-    assert all(np.isfinite(outcome.cost) == (not outcome.left) for outcome in together)
+    assert [bool(outcome.diverged_frame) for outcome in together] == [True, False, True, False, False, False, True]
+    assert all(np.isfinite(outcome.cost) == (not outcome.diverged_frame) for outcome in together)
 
 
 @pytest.mark.parametrize("capacity", [1, 4, 7])
@@ -113,7 +113,7 @@ def test_overflow_is_that_of_a_candidate_alone(capacity):
     """Full lists: of every candidate, of some, of few nodes."""
     problem = colliding(small.observations(), collision_capacity=capacity)
     twins, loss = candidates(problem), loss_of(problem)
-    together = judge(problem, twins, loss)
+    together = small.judge(problem, twins, loss)
     assert together == alone(problem, twins, loss)
     assert any(outcome.collision_overflow for outcome in together)
 
@@ -193,7 +193,7 @@ SCENES = {"plain": small.observations, "hidden": hidden, "dark": dark, "astray":
 def test_the_cost_is_that_of_the_torch_losses(scene, frozen):
     problem = small.search_problem(SCENES[scene](), losses=config.Losses(chamfer=1.3, track=0.7, acceleration=0.2))
     twins, loss = candidates(problem, 3), loss_of(problem, frozen_counts=frozen)
-    costs = [outcome.cost for outcome in judge(problem, twins, loss)]
+    costs = [outcome.cost for outcome in small.judge(problem, twins, loss)]
     assert costs == pytest.approx([by_torch(problem, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
 
 
@@ -202,7 +202,7 @@ def test_each_term_is_that_of_the_torch_losses(term):
     """A term that is small beside the others is compared by itself."""
     problem = small.search_problem(hidden(), losses=config.Losses(**{"chamfer": 0.0, "track": 0.0, "acceleration": 0.0, term: 1.0}))
     twins, loss = candidates(problem, 3), loss_of(problem)
-    costs = [outcome.cost for outcome in judge(problem, twins, loss)]
+    costs = [outcome.cost for outcome in small.judge(problem, twins, loss)]
     assert min(costs) > 0
     assert costs == pytest.approx([by_torch(problem, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
 
@@ -213,7 +213,7 @@ def test_the_velocity_at_the_start_counts():
     thrown = small.search_problem()
     object.__setattr__(thrown, "velocity", np.random.default_rng(0).normal(0, 2.0, rest.velocity.shape).astype(np.float32))
     twins, loss = candidates(rest, 3), loss_of(rest)
-    costs = [outcome.cost for outcome in judge(thrown, twins, loss)]
+    costs = [outcome.cost for outcome in small.judge(thrown, twins, loss)]
     assert costs == pytest.approx([by_torch(thrown, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
     assert costs != pytest.approx([by_torch(rest, twin, loss) for twin in twins], rel=0.01)
 
@@ -229,7 +229,7 @@ def test_divergence_names_the_frame_that_the_rollout_names(part):
             named.append(0)
         except Diverged as end:
             named.append(end.frame)
-    assert [outcome.left for outcome in judge(problem, twins, loss)] == named
+    assert [outcome.diverged_frame for outcome in small.judge(problem, twins, loss)] == named
     assert any(named)
 
 
@@ -246,8 +246,8 @@ def test_a_node_that_comes_back_has_left():
             places[twin, 5 + twin, twin] = -2 * FAR
         solver.start(places, 0 * places)
         sums.add(frame)
-    assert sums.left == [3, 2, 0]
-    assert sums.present
+    assert sums.diverged_frames == [3, 2, 0]
+    assert sums.any_alive
 
 
 # Solvers of several twins ---------------------------------------------------------------------------------------------

@@ -15,8 +15,8 @@ from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released, ReleasedCheckpoint, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
 from neuspring.scores.released.findings import Finding, Tools, of_scores, require
+from neuspring.twin.candidates import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.rollout import simulate
-from neuspring.twin.search import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.topology import uniform_topology
 
 DISTANCES = ("chamfer", "track_error")

@@ -1,4 +1,4 @@
-"""Fits in company: the same numbers, bit for bit, as each alone, whatever the others do."""
+"""Fits in a batch: the same numbers, bit for bit, as each alone, whatever the others do."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neuspring.core.errors import NumericalFailure
 from neuspring.physics.parameters import packed
 from neuspring.physics.solver import solver_for
 from neuspring.twin import fit as module
-from neuspring.twin.company import Seat, together
+from neuspring.twin.batch import Lane, run_batch
 from neuspring.twin.fit import FitProblem, FitResult, fit
 from tests.support import small
 
@@ -36,9 +36,9 @@ def several() -> list[FitProblem]:
     ]
 
 
-def in_company(problems: list[FitProblem], **more) -> list[FitResult | Exception]:
-    works = [lambda seat, problem=problem: fit(problem, seat=seat, **more) for problem in problems]
-    return together([problem.twin for problem in problems], "cpu", works)
+def in_a_batch(problems: list[FitProblem], **more) -> list[FitResult | Exception]:
+    works = [lambda lane, problem=problem: fit(problem, lane=lane, **more) for problem in problems]
+    return run_batch([problem.twin for problem in problems], "cpu", works)
 
 
 def assert_equal(got: FitResult | Exception, wanted: FitResult) -> None:
@@ -51,9 +51,9 @@ def assert_equal(got: FitResult | Exception, wanted: FitResult) -> None:
             np.testing.assert_array_equal(getattr(getattr(got.twin, part), name), value, err_msg=name)
 
 
-def test_fits_in_company_equal_those_alone() -> None:
+def test_fits_in_a_batch_equal_those_alone() -> None:
     problems = several()
-    for got, problem in zip(in_company(problems), problems, strict=True):
+    for got, problem in zip(in_a_batch(problems), problems, strict=True):
         assert_equal(got, fit(problem))
 
 
@@ -65,7 +65,7 @@ def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> N
     fit(small.fit_problem())
     alone = len(frames)
     frames.clear()
-    in_company([small.fit_problem(fit=replace(small.fit_problem().fit, learning_rate=rate)) for rate in (1e-2, 2e-2, 5e-2)])
+    in_a_batch([small.fit_problem(fit=replace(small.fit_problem().fit, learning_rate=rate)) for rate in (1e-2, 2e-2, 5e-2)])
     assert (len(frames), frames[0]) == (alone, 3)
 
 
@@ -73,7 +73,7 @@ def test_one_that_fails_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None
     problems = several()[:3]
     broken = replace(problems[1], twin=replace(problems[1].twin, simulation=replace(problems[1].twin.simulation, substeps=1)))
     broken = replace(broken, simulation=replace(broken.simulation, substeps=1))
-    results = in_company([problems[0], broken, problems[2]])
+    results = in_a_batch([problems[0], broken, problems[2]])
     assert isinstance(results[1], NumericalFailure)
     for k in (0, 2):
         assert_equal(results[k], fit(problems[k]))
@@ -83,7 +83,7 @@ def test_growing_substeps_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit that stiffens beyond its substeps takes more, and the others go on as they would."""
     problems = several()[:2]
     fast = replace(problems[0], fit=replace(problems[0].fit, learning_rate=1.0, epochs=3))
-    results = in_company([fast, problems[1]])
+    results = in_a_batch([fast, problems[1]])
     assert results[0].twin.simulation.substeps >= fast.twin.simulation.substeps
     for got, problem in zip(results, (fast, problems[1]), strict=True):
         assert_equal(got, fit(problem))
@@ -94,16 +94,16 @@ def test_an_error_in_the_shared_launch_reaches_everyone(monkeypatch: pytest.Monk
         raise RuntimeError("no memory")
 
     monkeypatch.setattr(module.FrameSolver, "forward", fail)
-    results = in_company(several()[:3])
+    results = in_a_batch(several()[:3])
     assert [str(result) for result in results] == ["no memory"] * 3
 
 
-def test_self_collision_in_company() -> None:
+def test_self_collision_in_a_batch() -> None:
     base = small.fit_problem()
     seen = base.observations
     crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
     problems = [small.fit_problem(crowded, fit=replace(base.fit, learning_rate=rate)) for rate in (1e-2, 5e-2)]
-    for got, problem in zip(in_company(problems), problems, strict=True):
+    for got, problem in zip(in_a_batch(problems), problems, strict=True):
         assert_equal(got, fit(problem))
         assert torch.is_grad_enabled()
 
@@ -118,21 +118,21 @@ def test_an_adjoint_that_is_asked_for_survives_a_new_solver() -> None:
     alone = solver_for(twin)
     wanted = (alone.run(*inputs), alone.backward(x, x))
 
-    def asks(seat: Seat) -> object:
-        state = seat.run(*inputs)
-        return state, seat.backward(x, x)
+    def asks(lane: Lane) -> object:
+        state = lane.run(*inputs)
+        return state, lane.backward(x, x)
 
     for ends in (False, True):
 
-        def disturbs(seat: Seat, ends: bool = ends) -> None:
-            seat.run(*inputs)
-            other = seat.company.seats[0]
-            while other.request is None or other.request[0] != "backward":
+        def disturbs(lane: Lane, ends: bool = ends) -> None:
+            lane.run(*inputs)
+            other = lane.batch.lanes[0]
+            while other.waiting is None or other.waiting[0] != "backward":
                 time.sleep(0.001)
             if not ends:
-                seat.sit(finer).run(*inputs[:4], packed(finer))
+                lane.of_twin(finer).run(*inputs[:4], packed(finer))
 
-        (state, adjoints), nothing = together([twin, twin], "cpu", [asks, disturbs])  # type: ignore[list-item, misc]
+        (state, adjoints), nothing = run_batch([twin, twin], "cpu", [asks, disturbs])  # type: ignore[list-item, misc]
         assert nothing is None
         for got, expected in zip((*state, *adjoints[:2]), (*wanted[0], *wanted[1][:2]), strict=True):
             assert torch.equal(got, expected)
@@ -148,9 +148,9 @@ def test_an_interrupt_ends_all_at_once() -> None:
         raise KeyboardInterrupt
 
     works = [
-        lambda seat: fit(problem, seat=seat, on_epoch=stops),
-        lambda seat: fit(problem, seat=seat, on_epoch=lambda history: epochs.append(len(history))),
+        lambda lane: fit(problem, lane=lane, on_epoch=stops),
+        lambda lane: fit(problem, lane=lane, on_epoch=lambda history: epochs.append(len(history))),
     ]
     with pytest.raises(KeyboardInterrupt):
-        together([problem.twin] * 2, "cpu", works)
+        run_batch([problem.twin] * 2, "cpu", works)
     assert len(epochs) < 100

@@ -2,7 +2,7 @@
 
 An epoch is one pass over each recording in turn, with the same parameters and the same state of Adam. Stiffness, dashpots, drag and
 contact are shared, and so are trained rest lengths, as factors on the distances in each recording's rest shape: those of springs,
-and those that the estimated shape makes (unloaded.py), whose displacement lives in the rest shape of the problem's own recording.
+and those that the estimated shape makes (rest_shape.py), whose displacement lives in the rest shape of the problem's own recording.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import replace
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.physics.parameters import Parameters
-from neuspring.twin.company import Seat
+from neuspring.twin.batch import Lane
 from neuspring.twin.fit import FitProblem, TwinFit
-from neuspring.twin.recordings import on_recording, require_pool
+from neuspring.twin.transfer import on_recording, require_pool
 
 
 class PooledFit(TwinFit):
@@ -27,12 +27,12 @@ class PooledFit(TwinFit):
     """
 
     def __init__(
-        self, problem: FitProblem, seat: Seat | None = None, *, pool: Sequence[Observations] = (), leave_out: bool = False
+        self, problem: FitProblem, lane: Lane | None = None, *, pool: Sequence[Observations] = (), leave_out: bool = False
     ) -> None:
         """`leave_out`: only frame 0 of the problem's observations is used; the pool alone is fitted. Raises InputError."""
         require_pool(problem.observations, pool, leave_out)
-        if seat is not None:
-            raise InputError("twins_per_launch", "fits on several recordings share no launches", "a seat", "Fit each alone.")
+        if lane is not None:
+            raise InputError("twins_per_launch", "fits on several recordings share no launches", "a lane", "Fit each alone.")
         super().__init__(problem)
         moved = [(on_recording(problem.twin, observations, problem.quirks), observations) for observations in pool]
         self._leave_out = leave_out
@@ -67,12 +67,12 @@ class PooledFit(TwinFit):
         for member in self._members:
             member.use_substeps(count)
 
-    def settled(self) -> Parameters:
+    def stable_parameters(self) -> Parameters:
         """The present parameters, packed, after seeing that they can be integrated on every recording. Raises NonFinite."""
         for member in self._members:
-            member.settled()
+            member.stable_parameters()
         if self._leave_out:
-            super().settled()
+            super().stable_parameters()
         self.use_substeps(max(run.twin.simulation.substeps for run in [self, *self._members]))
         return self.parameters.pack(self.twin.simulation.substep)
 

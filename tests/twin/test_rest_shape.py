@@ -9,8 +9,8 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Topology
 from neuspring.twin.fit import TwinFit, fit
+from neuspring.twin.rest_shape import UnloadedShape, blending, topology_spacing
 from neuspring.twin.topology import distances
-from neuspring.twin.unloaded import UnloadedShape, blending, topology_spacing
 from tests.support import small
 
 EXACT = 1e-9

@@ -11,13 +11,13 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
-from neuspring.twin import search as module
+from neuspring.twin import polish as module
+from neuspring.twin.candidates import PENALTY, Recording, SearchProblem, evaluate, made, mean_outcome
 from neuspring.twin.fit import FitProblem, FitResult, fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish
-from neuspring.twin.pooled import PooledFit
-from neuspring.twin.recordings import Recording, mean_outcome
-from neuspring.twin.search import SearchProblem, search
+from neuspring.twin.pool import PooledFit
+from neuspring.twin.search import search
 from neuspring.twin.trials import Outcome
 from tests.support import small
 
@@ -108,7 +108,7 @@ def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
     columns = [both.variables.index(name) for name in settings.polished]
     polish = Polish(settings, columns, both.encode(), 1.0)
     population, steps = polish.ask(), polish.steps()
-    tables = [pd.DataFrame(module._slopes(each, population, steps, loss, 0, 0, map)) for each in (both, alone, moved)]
+    tables = [pd.DataFrame(module.slope_rows(each, population, steps, loss, 0, 0, map)) for each in (both, alone, moved)]
     judged = ["cost", *(name for name in tables[0] if name.startswith("product."))]
     assert len(judged) == 5
     mean, one, other = (table[judged].to_numpy() for table in tables)
@@ -123,10 +123,7 @@ def test_steps_of_a_polish_cost_the_mean_over_the_recordings():
     rows = trace[trace["stage"] == POLISH]
     assert len(rows) == 4
     population = rows[[f"normalized.{name}" for name in problem.variables]].to_numpy()
-    apart = [
-        module._evaluate(each, population, loss, 0, 0, map)
-        for each in (replace(problem, pool=()), replace(problem, leave_out=True))
-    ]
+    apart = [evaluate(each, population, loss, 0, 0, map) for each in (replace(problem, pool=()), replace(problem, leave_out=True))]
     means = [np.mean([row["cost"] for row in pair]) for pair in zip(*apart, strict=True)]
     np.testing.assert_allclose(rows["cost"], means, rtol=1e-12)
 
@@ -145,9 +142,9 @@ def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
         return x, v
 
     monkeypatch.setattr(module, "motions", leaving)
-    rows = module._slopes(problem, polish.ask(), polish.steps(), loss, 0, 0, map)
+    rows = module.slope_rows(problem, polish.ask(), polish.steps(), loss, 0, 0, map)
     assert len(calls) == 2
-    assert [row["cost"] < module.PENALTY for row in rows] == [True, True, False, True]
+    assert [row["cost"] < PENALTY for row in rows] == [True, True, False, True]
     assert [row["product.residual"] != 0 for row in rows] == [False, True, False, True]
 
 
@@ -157,7 +154,7 @@ def test_springs_and_radii_are_the_same_on_all_recordings():
     alone = replace(polished(seen(LIFTED)), search=search_settings)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
     recording = Recording.of(stretched, alone.simulation, alone.losses, alone.quirks)
-    _, (here, there) = module._made(replace(alone, pool=(recording,)), alone.encode())
+    _, (here, there) = made(replace(alone, pool=(recording,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
     np.testing.assert_allclose(there.topology.rest_lengths, 1.1 * here.topology.rest_lengths, rtol=MEAN)
 
@@ -170,7 +167,7 @@ def test_a_twin_that_leaves_one_recording_has_left():
     one, other = Outcome(0.25, 0, 1), Outcome(float("inf"), 7, 2)
     assert mean_outcome([one]) is one
     assert mean_outcome([one, Outcome(0.75, 0, 2)]) == Outcome(0.5, 0, 3)
-    assert mean_outcome([one, other, Outcome(float("inf"), 3, 0)]).left == 7
+    assert mean_outcome([one, other, Outcome(float("inf"), 3, 0)]).diverged_frame == 7
 
 
 # Fit ------------------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from torch import nn
 
 from neuspring.core.artifacts import Topology
 from neuspring.core.geometry import farthest
-from neuspring.twin.spacing import node_spacing
+from neuspring.twin.topology import node_spacing
 
 
 def topology_spacing(topology: Topology) -> float:

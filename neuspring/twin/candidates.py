@@ -1,0 +1,368 @@
+"""A candidate of the search: its variables, the twin that they make, and its cost on every recording that counts.
+
+Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them, less `search.fixed`. A
+candidate is a whole twin: its springs are built, it is rolled out over the training frames (trials.py), and its cost is the mean
+training loss (losses.py).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuspring import config
+from neuspring.config.search import HANDS, LENGTHS, VARIABLES
+from neuspring.core.artifacts import Material, Observations, Simulation, Twin
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.physics import stability
+from neuspring.physics.controllers import waypoints
+from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.twin import hand_paths
+from neuspring.twin.losses import FrameLoss
+from neuspring.twin.rollout import initial_velocity
+from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
+from neuspring.twin.transfer import on_recording, require_pool
+from neuspring.twin.trials import Outcome, outcomes
+
+INTEGERS = ("object_neighbors", "controller_neighbors")
+REGIONAL = ("object_radius", "object_neighbors")
+"""Variables of which every region has its own."""
+PENALTY = 1e6
+"""Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
+UNSTABLE = "unstable"
+"""How the reasons of candidates begin that a fixed number of substeps cannot integrate."""
+CMAES = "cmaes"
+"""The stage of candidates that CMA-ES proposes."""
+Map = Callable[..., Iterable[Any]]
+"""As the builtin `map`."""
+RELEASED_SUBSTEPS = 667
+RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The training frames of a recording: hands and start velocities of its own, and the losses of its frames."""
+
+    observations: Observations
+    hands: torch.Tensor
+    """Waypoints of the controllers (controllers.py), [train_end, C, 3], m."""
+    velocity: torch.Tensor
+    """Of the nodes in frame 0 [N, 3], m/s."""
+    loss: FrameLoss
+
+    @classmethod
+    def of(
+        cls,
+        observations: Observations,
+        simulation: config.Simulation,
+        losses: config.Losses,
+        quirks: config.ReleasedQuirks,
+        device: str = "cpu",
+    ) -> Recording:
+        """A recording, judged with the settings of a search."""
+        hands = torch.tensor(observations.controller_points, device=device)[: observations.scenario.train_end]
+        velocity = initial_velocity(observations, simulation.initial_velocity)
+        return cls(
+            observations,
+            waypoints(hands, observations.controller_valid),
+            torch.tensor(velocity, dtype=torch.float32, device=device),
+            FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators),
+        )
+
+
+@dataclass(frozen=True)
+class SearchProblem:
+    """Everything that a candidate is judged with."""
+
+    observations: Observations
+    search: config.Search
+    simulation: config.Simulation
+    losses: config.Losses
+    quirks: config.ReleasedQuirks
+    device: str = "cpu"
+    clusters: int = 1
+    together: int = 0
+    """Candidates in one launch at most; 0: as many as pay (`together`). Costs do not depend on it, bit for bit on a CPU."""
+    threads: int = 1
+    """Threads that simulate at the same time, on a CPU."""
+    pool: tuple[Recording, ...] = ()
+    """Other recordings of the object; a candidate's cost is the mean over all.
+
+    Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
+    `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
+    nodes there, and the material of one topology would be judged on another.
+    """
+    leave_out: bool = False
+    """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts, neither for costs nor for slopes."""
+    labels: np.ndarray = field(init=False)
+    """Region of each node [N]."""
+    velocity: np.ndarray = field(init=False)
+    """Velocity of each node in frame 0 [N, 3], m/s."""
+    spacing: float = field(init=False)
+    """Distance between neighboring nodes in the rest shape, m (topology.py)."""
+    reach: float = field(init=False)
+    """Smallest distance between a controller and a node in the rest shape, m."""
+
+    def __post_init__(self) -> None:
+        require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
+        if self.pool and self.observations.image is not None:
+            where = f"pool of {self.observations.scenario.name}"
+            raise InputError(where, "recordings of color alone are searched one by one", f"a pool of {len(self.pool) + 1}")
+        canonical, count = self.observations.canonical, len(self.observations.nodes)
+        nodes, hands = canonical[:count], canonical[count:]
+        object.__setattr__(self, "labels", regions(nodes, self.clusters))
+        object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+        object.__setattr__(self, "spacing", node_spacing(nodes))
+        object.__setattr__(self, "reach", controller_reach(nodes, hands))
+
+    @property
+    def simulated_frames(self) -> int:
+        """Frames that a candidate is simulated over, on all recordings that count."""
+        counted = [*([] if self.leave_out else [self.observations]), *(recording.observations for recording in self.pool)]
+        return sum(observations.scenario.train_end - 1 for observations in counted)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All that makes a candidate: the variables of the settings, regional ones as name.0, name.1, ... (bare for one)."""
+        names: list[str] = []
+        for name in VARIABLES:
+            if name in HANDS:
+                continue
+            regional = name in REGIONAL and self.clusters > 1
+            names += [f"{name}.{region}" for region in range(self.clusters)] if regional else [name]
+        image = self.observations.image
+        return (*names, *(hand_paths.names(image, self.search.hand_knots) if image else ()))
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of what is searched: `names` without `search.fixed`."""
+        return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
+
+    @property
+    def polished(self) -> tuple[str, ...]:
+        """Names of what is polished, in the order of the settings."""
+        bases = self.search.polish.variables
+        return tuple(name for base in bases for name in self.variables if name.partition(".")[0] == base)
+
+    def decode(self, normalized: np.ndarray) -> dict[str, float]:
+        """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
+        searched = dict(zip(self.variables, normalized, strict=True))
+        values = {}
+        for name in self.names:
+            base = name.partition(".")[0]
+            variable = getattr(self.search.variables, base)
+            value = variable.value(float(searched[name])) if name in searched else float(variable.start)
+            values[name] = float(int(value)) if base in INTEGERS else self._meters(base, value)
+        return values
+
+    def encode(self) -> np.ndarray:
+        """Normalized `variables` of the starting values."""
+        settings = [getattr(self.search.variables, name.partition(".")[0]) for name in self.variables]
+        return np.array([variable.normalized(variable.start) for variable in settings])
+
+    def _meters(self, base: str, value: float) -> float:
+        """A setting's value; of a length in m, whatever unit it is searched in."""
+        if base not in LENGTHS or self.search.lengths == "meter":
+            return value
+        return value * self.spacing + (self.reach if base == "controller_radius" else 0.0)
+
+    def of_regions(self, values: dict[str, float], name: str) -> list[float]:
+        """A regional variable's value in each region."""
+        return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
+
+
+def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
+    """The scenario's simulation with a given number of substeps per frame."""
+    scenario, settings = problem.observations.scenario, problem.simulation
+    return Simulation(
+        frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
+        substeps=substeps,
+        up=scenario.up,
+        gravity=settings.gravity,
+        ground=scenario.ground,
+        obstacles=scenario.obstacles,
+        self_collision=scenario.self_collision,
+        collision_capacity=settings.collision_capacity,
+        controller_velocity=settings.controller_velocity,
+        initial_velocity=settings.initial_velocity,
+    )
+
+
+def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
+    """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
+
+    Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
+    """
+    settings = problem.simulation
+    if problem.quirks.frame_time_667 or settings.substeps != "auto":
+        count = RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(settings.substeps)
+        twin = replace(twin, simulation=replace(twin.simulation, substeps=count))
+        stability.check(twin)
+        return twin
+    count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, settings.safety)
+    if count > settings.max_substeps:
+        raise NumericalFailure(f"needs {count} substeps per frame, more than max_substeps = {settings.max_substeps}")
+    return replace(twin, simulation=replace(twin.simulation, substeps=count))
+
+
+def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
+    """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
+    observations = problem.observations
+    topology = piecewise_topology(
+        observations.nodes,
+        observations.controller_points[0],
+        problem.labels,
+        problem.of_regions(values, "object_radius"),
+        [int(n) for n in problem.of_regions(values, "object_neighbors")],
+        values["controller_radius"],
+        int(values["controller_neighbors"]),
+        repair=problem.search.isolated_nodes == "repair",
+        rest_shape=observations.rest_shape,
+        controller_rest=problem.search.controller_rest,
+    )
+    count = len(topology.springs)
+    if count == 0:
+        raise NumericalFailure("no node has a spring")
+    material = homogeneous(values, count)
+    hands = {name: value for name, value in values.items() if name.partition(".")[0] in HANDS}
+    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1), hands=hands))
+
+
+def homogeneous(values: dict[str, float], springs: int) -> Material:
+    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
+    every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
+    numbers: dict[str, Any] = {name: values[name] for name in every}
+    arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}
+    return Material(**(numbers | arrays))
+
+
+def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Waypoints of the hands (controllers.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s.
+
+    Waypoints have an axis [B] of twins where each has hands of its own.
+    """
+    observations, end = problem.observations, problem.observations.scenario.train_end
+
+    def path(points: np.ndarray) -> torch.Tensor:
+        hands = torch.tensor(points, dtype=torch.float32, device=problem.device)[:end]
+        return waypoints(hands, observations.controller_valid)
+
+    if observations.image is None:
+        hands = path(observations.controller_points)
+    else:
+        hands = torch.stack([path(hand_paths.hand_points(observations, twin.hands)) for twin in twins], dim=1)
+    return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
+
+
+def recordings(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> dict[int, Recording]:
+    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own, with its `twins`."""
+    own = {} if problem.leave_out else {0: Recording(problem.observations, *_motion(problem, twins), loss)}
+    return own | dict(enumerate(problem.pool, start=1))
+
+
+def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
+    """Which candidates are simulated together, the slowest group first.
+
+    On CUDA all. On a CPU lanes wait for their group's largest number of substeps, and work on all springs of their group: alike
+    ones are put together, such that the expected time of `threads` is least.
+    """
+    if problem.device != "cpu":
+        size = problem.together or len(twins)
+        return [list(range(first, min(first + size, len(twins)))) for first in range(0, len(twins), size)]
+    substeps = [twin.simulation.substeps for twin in twins]
+    springs = [len(twin.topology.springs) for twin in twins]
+    order = sorted(range(len(twins)), key=lambda k: -substeps[k])
+    most = min(problem.together or WIDTHS[-1], WIDTHS[-1])
+
+    def time_of(members: Sequence[int]) -> float:
+        return COST[width_for(len(members))] * substeps[members[0]] * max(springs[k] for k in members)
+
+    parts = [order[first:last] for first in range(len(order)) for last in range(first + 1, min(first + most, len(order)) + 1)]
+    times = {(part[0], len(part)): time_of(part) for part in parts}
+
+    def split(limit: float) -> tuple[float, float, list[list[int]]]:
+        """(time of all threads, sum, groups) of the split with the least sum, in which no group of several takes longer."""
+        best: list[tuple[float, float, list[list[int]]]] = [(0.0, 0.0, [])]
+        for first in reversed(range(len(order))):
+            choices = []
+            for size in range(1, min(most, len(order) - first) + 1):
+                own = times[order[first], size]
+                total, longest, rest = best[len(order) - first - size]
+                if size == 1 or own <= limit:
+                    choices.append((total + own, max(longest, own), [order[first : first + size], *rest]))
+            best.append(min(choices, key=lambda choice: choice[0]))
+        total, longest, split_parts = best[-1]
+        return max(total / problem.threads, longest), total, split_parts
+
+    return min(map(split, set(times.values())), key=lambda choice: choice[:2])[2]
+
+
+def made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any], tuple[Twin, ...]]:
+    """A candidate's row, its cost the penalty, and its twin, here and on each recording of the pool.
+
+    None, with the reason in the row, if one cannot be integrated.
+    """
+    start = time.perf_counter()
+    values = problem.decode(normalized)
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "cost": PENALTY, "reason": ""}
+    row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
+    row |= values | {f"normalized.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
+    family: tuple[Twin, ...] = ()
+    try:
+        twin = candidate(problem, values)
+        row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
+        moved = (on_recording(twin, recording.observations, problem.quirks) for recording in problem.pool)
+        family = (twin, *(with_substeps(problem, one) for one in moved))
+    except NumericalFailure as failure:
+        row["reason"] = str(failure)
+    except stability.Unstable as failure:
+        # The candidate is too stiff for a fixed number of substeps.
+        row["reason"] = f"{UNSTABLE}: {failure}"
+    row["seconds"] = time.perf_counter() - start
+    return row, family
+
+
+def evaluate(
+    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, each: Map
+) -> list[dict[str, Any]]:
+    """Rows of the trace for the candidates of a generation, numbered from `index` on."""
+    candidates = list(each(lambda normalized: made(problem, normalized), population))
+    for number, (row, _) in enumerate(candidates):
+        row |= {"rollout": index + number, "generation": generation}
+    rows, families = [row for row, family in candidates if family], [family for _, family in candidates if family]
+    twins = [family[0] for family in families]
+
+    def simulate(members: list[int]) -> None:
+        start = time.perf_counter()
+        counted = recordings(problem, [twins[k] for k in members], loss)
+        results = [
+            outcomes([families[k][place] for k in members], one.hands, one.velocity, one.loss, problem.device)
+            for place, one in counted.items()
+        ]
+        share = (time.perf_counter() - start) / len(members)
+        for k, result in zip(members, map(mean_outcome, zip(*results, strict=True)), strict=True):
+            rows[k]["collision_overflow"] = result.collision_overflow
+            rows[k]["seconds"] += share
+            if result.diverged_frame:
+                rows[k]["reason"] = f"a node left the scene in frame {result.diverged_frame}"
+            else:
+                rows[k]["cost"] = min(result.cost, PENALTY)
+
+    # Threads would meet in the one stream of a GPU.
+    simulated = each if problem.device == "cpu" else map
+    list(simulated(simulate, groups(problem, twins) if twins else []))
+    return [row for row, _ in candidates]
+
+
+def mean_outcome(results: Sequence[Outcome]) -> Outcome:
+    """One candidate on several recordings: the mean cost; it diverged if it diverged on any."""
+    if len(results) == 1:
+        return results[0]
+    diverged = next((one.diverged_frame for one in results if one.diverged_frame), 0)
+    cost = float(np.mean([one.cost for one in results]))
+    return Outcome(cost, diverged, sum(one.collision_overflow for one in results))
