@@ -145,13 +145,18 @@ class Artifact:
             return cls._build(arrays, meta["fields"], "")
         except (KeyError, TypeError) as error:
             raise InputError(
-                path, f"this file must hold every field of kind {cls.kind}", f"{type(error).__name__}: {error}"
+                path,
+                f"this file must hold every field of kind {cls.kind}, and no other",
+                f"{type(error).__name__}: {error}",
+                "Of another version? Run the step that makes it again.",
             ) from error
 
     @classmethod
     def _build(cls, arrays: dict[str, np.ndarray], plain: dict[str, Any], prefix: str) -> Self:
         hints = get_type_hints(cls)
         values: dict[str, Any] = {}
+        if unknown := plain.keys() - hints.keys():
+            raise TypeError(f"unknown fields {sorted(unknown)}")
         for spec in dataclasses.fields(cls):
             if "shape" in spec.metadata:
                 optional = spec.default_factory is not dataclasses.MISSING

@@ -10,19 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.records import digest_file
+from neuspring.core.run_folder import RunFolder
 from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
-from neuspring.splats.of_run import splats_file
 from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.rollout import initial_velocity
 
-TWIN_RECORDS = ("fit.json", "search.json")
-"""Records that name a twin, the later stage first."""
-ROLLOUT, OBSERVATIONS = "rollout.json", "observations.npz"
-WHOLE = "Export from the results folder in which the run was made."
+NAMED = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
 FRAMES = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
 
 
@@ -91,30 +88,31 @@ def read_source(path: Path) -> Source:
     if path.is_file():
         return _at_rest(path.parent.name or "twin", Twin.load(path), {path.name: digest_file(path)})
     if not path.is_dir():
-        rule = "must be a run's folder or a twin.npz"
-        raise InputError(path, rule, "no such file or folder", "Name results/<scenario>/<method>/<seed>.")
-    folder = path.resolve()
-    name = "_".join(folder.parts[-3:])
-    if not (folder / ROLLOUT).is_file():
-        return _at_rest(name, *_twin(_own_record(folder)))
-    rollout = StageRecord.load(folder / ROLLOUT)
-    twin, digests = _twin(_record_of(folder, rollout))
-    trajectory = Trajectory.load(rollout.file("trajectory", folder / ROLLOUT))
-    observations = with_hands(_observations(folder, rollout), twin)
+        raise InputError(path, "must be a run's folder or a twin.npz", "no such file or folder", NAMED)
+    run = RunFolder.of(path)
+    name, twin = "_".join(run.folder.parts[-3:]), run.twin
+    if twin is None:
+        failed = next((record.reason for record in run.records.values() if record.status == "failed"), "")
+        found = f"a failure: {failed}" if failed else f"a baseline's model ({run.learning[-1]})" if run.learning else "none"
+        raise InputError(path, "must be the run of a method that makes a twin", found, NAMED)
+    twin_name, digest = run.stages[run.learning[-1]].record.files["twin"]
+    made_from = {twin_name: digest}
+    if run.trajectory is None:
+        return _at_rest(name, twin, made_from)
+    trajectory, observations = run.trajectory, with_hands(run.observations, twin)
     if trajectory.diverged_frame is not None:
         raise InputError(
-            folder,
+            path,
             "the motion must be known in all frames",
             f"a rollout that diverged: {trajectory.reason}",
-            f"Its twin alone can be exported: name {_record_of(folder, rollout).parent / 'twin.npz'}.",
+            f"Its twin alone can be exported: name {run.twin_file}.",
         )
     count = len(trajectory.positions)
     if trajectory.positions.shape[1:] != twin.topology.nodes.shape or count > len(observations.controller_points):
         rule = f"must have the {len(twin.topology.nodes)} nodes of the twin and the frames of the observations"
-        raise InputError(folder / "trajectory.npz", rule, trajectory.positions.shape, f"Delete {folder / ROLLOUT} and run again.")
-    hands = observations.controller_points[:count]
-    valid = observations.controller_valid
-    splats = splats_file(folder)
+        raise InputError(path / "trajectory.npz", rule, trajectory.positions.shape, "Delete rollout.json and run again.")
+    hands, valid = observations.controller_points[:count], observations.controller_valid
+    splats = run.file("appearance", "splats")
     return Source(
         name=name,
         twin=twin,
@@ -123,7 +121,7 @@ def read_source(path: Path) -> Source:
         holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),
         velocity=initial_velocity(observations, twin.simulation.initial_velocity),
         splats=None if splats is None else Splats.load(splats),
-        made_from=digests | {entry[0]: entry[1] for entry in rollout.files.values()},
+        made_from=made_from | {entry[0]: entry[1] for entry in run.stages["rollout"].record.files.values()},
         frames=np.arange(count),
     )
 
@@ -151,44 +149,3 @@ def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> Source:
         velocity=np.zeros(topology.nodes.shape),
         made_from=digests,
     )
-
-
-def _own_record(folder: Path) -> Path:
-    for name in TWIN_RECORDS:
-        if (folder / name).is_file():
-            return folder / name
-    if (folder / "train.json").is_file():
-        raise InputError(folder, "must be the run of a twin", "a baseline's model", "Name the run of a method with a search.")
-    rule = f"must hold {ROLLOUT}, or one of {', '.join(TWIN_RECORDS)}"
-    raise InputError(folder, rule, "neither", "Name results/<scenario>/<method>/<seed> of a run that ended, or a twin.npz.")
-
-
-def _record_of(folder: Path, rollout: StageRecord) -> Path:
-    """The record of the twin that was rolled out: in the folder, or in another of the scenario where methods share it."""
-    wanted = {digest for role, digest in rollout.inputs.items() if role.rstrip("0123456789") in ("fit", "search")}
-    if not wanted:
-        raise InputError(folder, "must be the run of a twin", "a baseline's model", "Name the run of a method with a search.")
-    scenario = folder.parent.parent
-    for name in TWIN_RECORDS:
-        for path in (folder / name, *sorted(scenario.glob(f"*/*/{name}"))):
-            if path.is_file() and digest_file(path) in wanted:
-                return path
-    rule = f"the record of its twin must lie in {scenario}, unchanged since {ROLLOUT} was written"
-    raise InputError(folder, rule, "none", WHOLE)
-
-
-def _twin(path: Path) -> tuple[Twin, dict[str, str]]:
-    record = StageRecord.load(path)
-    if record.status == "failed" or "twin" not in record.files:
-        rule, remedy = "must name a twin", "Choose another method or seed, or run this one again."
-        raise InputError(path, rule, f"a failure: {record.reason}" if record.reason else sorted(record.files), remedy)
-    return Twin.load(record.file("twin", path)), {record.files["twin"][0]: record.files["twin"][1]}
-
-
-def _observations(folder: Path, rollout: StageRecord) -> Observations:
-    path = folder.parent.parent / OBSERVATIONS
-    if not path.is_file():
-        raise InputError(path, "the hands' motion must be there", "no such file", WHOLE)
-    if digest_file(path) != rollout.inputs.get("observations"):
-        raise InputError(path, f"must be what {folder / ROLLOUT} was made from", "other content", "Run the workflow again.")
-    return Observations.load(path)

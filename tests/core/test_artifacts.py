@@ -285,11 +285,22 @@ def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
         topology(rest_shape=np.ones((points - 1, 3)))
 
 
+@pytest.mark.parametrize(("part", "name"), [("material", "drag_quadratic"), ("simulation", "controller_path")])
+def test_fields_of_another_version_are_refused(tmp_path: Path, part: str, name: str) -> None:
+    path = tmp_path / "old.npz"
+    twin().save(path)
+    with np.load(path) as stored:
+        kept = json.loads(stored["meta"].tobytes())["fields"]
+    kept[part][name] = 0.0
+    rewrite(path, fields=kept)
+    refuses(Twin, path, f"and no other.*{name}.*Run the step that makes it again")
+
+
 def test_missing_fields(tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
     trajectory().save(path)
     rewrite(path, fields={})
-    refuses(Trajectory, path, "every field of kind trajectory; received KeyError: 'frame_count'")
+    refuses(Trajectory, path, "every field of kind trajectory.*KeyError: 'frame_count'")
     trajectory().save(path)
     with np.load(path) as stored:
         meta = stored["meta"]

@@ -94,16 +94,22 @@ def other_observations(folder):
 
 
 BROKEN = {
-    "no folder": (shutil.rmtree, "no such file or folder. Name"),
-    "empty folder": (lambda folder: [path.unlink() for path in folder.iterdir()], "Name results/<scenario>/<method>/<seed>"),
+    "no folder": (shutil.rmtree, "no such file or folder"),
+    "empty folder": (
+        lambda folder: [path.unlink() for path in folder.iterdir()],
+        "must be the run of a method that makes a twin; received none",
+    ),
     "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and run again"),
-    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "Export from the results folder"),
+    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "the record of its model must lie in"),
     "no trajectory": (lambda folder: (folder / "trajectory.npz").unlink(), "Delete .*rollout.json and run again"),
-    "no observations": (lambda folder: (folder.parents[1] / "observations.npz").unlink(), "Export from the results folder"),
+    "no observations": (
+        lambda folder: (folder.parents[1] / "observations.npz").unlink(),
+        "the observations of the run must be there",
+    ),
     "other observations": (other_observations, "Run the workflow again"),
     "diverged": (diverged, "diverged: node 1 left.*name .*twin.npz"),
-    "failed": (failed_fit, "all candidates diverged. Choose another"),
-    "baseline": (baseline, "a baseline's model. Name the run of a method with a search"),
+    "failed": (failed_fit, "a failure: all candidates diverged"),
+    "baseline": (baseline, "a baseline's model"),
     "older": (older, "records of format 1. Delete it and run again"),
     "not a twin": (lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"), "Delete .*fit.json and run again"),
 }

@@ -88,12 +88,6 @@ def test_splats_far_away_have_fewer_bits_and_must_fit():
         spz.fractional_bits(np.array([[9e6, 0.0, 0.0]]))
 
 
-def test_without_splats_there_is_nothing_to_write(tmp_path):
-    source = read_source(exported.run_folder(tmp_path, with_splats=False))
-    with pytest.raises(InputError, match="splats are required"):
-        spz.write(source, [0], tmp_path / "out")
-
-
 def test_isotropic_splats_have_one_scale_three_times():
     one = exported.splats(5, 0)
     round_ones = Splats(**{**vars(one), "log_scales": one.log_scales[:, :1]})
