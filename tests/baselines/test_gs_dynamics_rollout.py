@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +17,6 @@ from neuspring.config import Config
 from neuspring.config.baselines import Baselines
 from neuspring.config.gs_dynamics import GsDynamics
 from neuspring.core.artifacts import Observations, Scenario
-from neuspring.core.errors import InputError
 
 PLAIN = GsDynamics(
     width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0, smoothing_passes=0,
@@ -165,16 +163,6 @@ def test_training_that_cannot_go_on_says_so_and_keeps_what_it_had():
     np.testing.assert_array_equal(wild.model.weights, start)
 
 
-def test_a_model_survives_its_file(tmp_path):
-    model = pushes(0.005)
-    model.save(tmp_path / "model.npz")
-    found = GsDynamicsModel.load(tmp_path / "model.npz")
-    assert found.rules == model.rules
-    np.testing.assert_array_equal(found.weights, model.weights)
-    with pytest.raises(InputError, match=r"gs_dynamics.weights: \d+ weights are required; received 7"):
-        GsDynamicsModel(weights=np.zeros(7), rules=RULES)
-
-
 def test_points_wait_while_the_tools_move_less_than_a_step():
     # 4 mm per frame: steps in frames 3, 6 and 9.
     tools = cloud(3, 1)[None] + 0.004 * np.arange(12)[:, None, None] * np.array([0, 1.0, 0])
@@ -226,10 +214,3 @@ def test_particles_on_a_line_turn_by_the_least_angle_and_lone_ones_do_not():
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     torch.testing.assert_close(found[:5], quarter.expand(5, -1, -1), rtol=0, atol=1e-6)
     torch.testing.assert_close(found[5], torch.eye(3))
-
-
-def test_particles_of_a_sheet_are_never_mirrored():
-    flat = torch.tensor(cloud(30, 0)) * torch.tensor([1.0, 1, 0])
-    turn = torch.tensor(Rotation.from_rotvec([2.0, 1.0, 0.0]).as_matrix(), dtype=torch.float32)
-    graph = connect(flat[None], torch.ones(1, 30, dtype=torch.bool), torch.zeros(1, 1, 3), RULES)
-    torch.testing.assert_close(turns(graph, flat, flat @ turn.T), turn.expand(30, -1, -1), rtol=0, atol=1e-5)

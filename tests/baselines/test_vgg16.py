@@ -45,7 +45,7 @@ def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
     assert drawn.grad.abs().sum() > 0
 
 
-def test_a_file_is_known_by_its_digest(network, tmp_path, monkeypatch):
+def test_a_file_is_known_by_its_digest_and_a_damaged_one_is_named(network, tmp_path, monkeypatch):
     path = stored(network, tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
     assert "vgg16-397923af.pth is not there" in vgg.find_weights(None)
@@ -53,9 +53,6 @@ def test_a_file_is_known_by_its_digest(network, tmp_path, monkeypatch):
         vgg.find_weights(str(path))
     monkeypatch.setattr(vgg, "DIGEST", digest_file(path)[:8])
     assert vgg.find_weights(str(path)) == path
-
-
-def test_damaged_weights_are_named(network, tmp_path):
-    path = stored(network[:-2], tmp_path)
+    damaged = stored(network[:-2], tmp_path)
     with pytest.raises(InputError, match=r"`features\.7\.weight` must be a float tensor \[128, 128, 3, 3\]; received NoneType"):
-        vgg.load_features(path, "cpu")
+        vgg.load_features(damaged, "cpu")

@@ -13,18 +13,10 @@ from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
 from neuspring.play.page import Page
 from neuspring.play.results import find
-from neuspring.play.serve import start
 from neuspring.scores.metrics import track_errors
-from tests.support.played import dressed, results, spoil
+from tests.support.played import dressed, spoil
 
 RUN = "baseline/0"
-
-
-@pytest.fixture(scope="module")
-def server():
-    one = start("127.0.0.1", 0)
-    yield one
-    one.stop()
 
 
 @pytest.fixture
@@ -50,8 +42,8 @@ def until(what) -> None:
         time.sleep(0.02)
 
 
-def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, tmp_path):
-    page = opened(results(tmp_path))
+def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, scenario):
+    page = opened(scenario)
     page.panel.start(RUN)
     assert page.quantity.value == "strain" and "-0.3" in page.legend.content
     page.panel.most.value = 0.5
@@ -61,8 +53,8 @@ def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, tmp_
     assert page.quantity.value == "stiffness" and "stiffness Y" in page.legend.content
 
 
-def test_a_stretch_above_the_limit_is_red_and_said(opened, tmp_path):
-    page = opened(results(tmp_path))
+def test_a_stretch_above_the_limit_is_red_and_said(opened, scenario):
+    page = opened(scenario)
     page.panel.most.value = 0.05
     page.panel.start(RUN)
     live = page.panel.live
@@ -75,8 +67,8 @@ def test_a_stretch_above_the_limit_is_red_and_said(opened, tmp_path):
     assert (live.body.springs.colors[:, 0] == [255, 0, 0]).all(axis=1).any()
 
 
-def test_hands_repeat_the_recording_from_a_frame_and_cannot_be_taken(opened, tmp_path):
-    page = opened(results(tmp_path))
+def test_hands_repeat_the_recording_from_a_frame_and_cannot_be_taken(opened, scenario):
+    page = opened(scenario)
     page.panel.frame.value, page.panel.repeat.value = 2, True
     page.panel.start(RUN)
     live = page.panel.live
@@ -86,11 +78,11 @@ def test_hands_repeat_the_recording_from_a_frame_and_cannot_be_taken(opened, tmp
     assert np.array_equal(live.simulator.hands, page.found.observations.controller_points[-1])
     page.panel._save()
     until(lambda: "saved" in live.message)
-    assert len(list((tmp_path / "saved").glob("controls_small_baseline_0_0.npz"))) == 1
+    assert len(list((scenario.parent / "saved").glob("controls_small_baseline_0_0.npz"))) == 1
 
 
-def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, tmp_path):
-    page = opened(results(tmp_path))
+def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, scenario):
+    page = opened(scenario)
     page.show(5)
     until(lambda: page.player.clock.frame == 5 and not page._moved)
     until(lambda: page.player._bodies[RUN].overlay.error is not None)
@@ -102,10 +94,9 @@ def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, tmp_path):
     assert f"{RUN} {1e3 * expected:.1f} mm" in page.player.errors()
 
 
-def test_splats_are_put_on_when_they_are_wanted(opened, tmp_path):
-    folder = results(tmp_path)
-    dressed(folder)
-    page = opened(folder)
+def test_splats_are_put_on_when_they_are_wanted(opened, scenario):
+    dressed(scenario)
+    page = opened(scenario)
     body = page.player._bodies[RUN]
     assert body.splats is None
     page.parts["splats"].value = True
@@ -117,36 +108,33 @@ def test_splats_are_put_on_when_they_are_wanted(opened, tmp_path):
     assert (body.splats.handle.centers != before).any()
 
 
-def test_what_is_not_there_cannot_be_switched_on(opened, tmp_path):
-    page = opened(results(tmp_path))
+def test_what_is_not_there_cannot_be_switched_on(opened, scenario):
+    page = opened(scenario)
     assert {name for name, box in page.parts.items() if box.disabled} == {"splats", "cameras", "images"}
 
 
-def test_a_run_of_an_older_format_is_shown_as_far_as_it_goes(opened, tmp_path):
-    folder = results(tmp_path)
-    path = folder / "baseline" / "0" / "twin.npz"
+def test_a_run_of_an_older_format_is_shown_as_far_as_it_goes(opened, scenario):
+    path = scenario / "baseline" / "0" / "twin.npz"
     arrays, meta = read_npz(path)
     write_npz(path, arrays, json.dumps(meta | {"format": 0}), compress=True)
-    page = opened(folder)
+    page = opened(scenario)
     assert page.player._bodies[RUN].springs is None and "reads format 1" in page.notes.content
     page.panel.start(RUN)
     assert page.panel.live is None and "reads format 1" in page.panel.text.content
 
 
-def test_a_prediction_with_other_nodes_than_its_twin_has_no_springs(opened, tmp_path):
-    folder = results(tmp_path)
-    place = folder / "baseline" / "0"
+def test_a_prediction_with_other_nodes_than_its_twin_has_no_springs(opened, scenario):
+    place = scenario / "baseline" / "0"
     path, old = place / "trajectory.npz", digest_file(place / "trajectory.npz")
     x = Trajectory.load(path).positions
     Trajectory(positions=x[:, :5], frame_count=len(x)).save(path)
     spoil(place / "rollout.json", old, digest_file(path))
-    page = opened(folder)
+    page = opened(scenario)
     assert page.player._bodies[RUN].springs is None and "no springs" in page.notes.content
 
 
-def test_names_of_runs_cannot_put_markup_on_the_page(opened, tmp_path):
-    folder = results(tmp_path)
-    (folder / "baseline").rename(folder / "<img src=x onerror=alert(1)>")
-    spoil(folder / "<img src=x onerror=alert(1)>" / "0" / "rollout.json", '"ok"', '"failed"')
-    page = opened(folder)
+def test_names_of_runs_cannot_put_markup_on_the_page(opened, scenario):
+    (scenario / "baseline").rename(scenario / "<img src=x onerror=alert(1)>")
+    spoil(scenario / "<img src=x onerror=alert(1)>" / "0" / "rollout.json", '"ok"', '"failed"')
+    page = opened(scenario)
     assert "<img" not in page.notes.content and "<img" not in page.errors.content

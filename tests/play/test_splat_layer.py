@@ -9,33 +9,14 @@ pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 from neuspring.core.artifacts import SplatCenters
 from neuspring.play.layers import UNIT, SplatLayer, covariances
+from neuspring.play.player import Player
 from neuspring.play.results import find
-from neuspring.play.serve import start
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Gaussians
-from tests.support.played import dressed, results, spoil
+from tests.support.played import dressed, spoil
 
 ROUNDING = 2e-3
 """Relative error of 16-bit floats, with a margin."""
-
-
-@pytest.fixture(scope="module")
-def server():
-    one = start("127.0.0.1", 0)
-    yield one
-    one.stop()
-
-
-@pytest.fixture
-def scenario(tmp_path):
-    return results(tmp_path)
-
-
-def test_the_splats_of_its_seed_belong_to_a_run(scenario):
-    assert find([scenario]).runs[0].splats is None
-    splats = dressed(scenario)
-    found = find([scenario]).runs[0]
-    assert np.array_equal(found.splats.means, splats.means)
 
 
 def test_a_record_of_splats_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
@@ -47,8 +28,6 @@ def test_a_record_of_splats_that_names_a_file_elsewhere_is_not_followed(scenario
 
 
 def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
-    from neuspring.play.player import Player
-
     dressed(scenario)
     (scenario / "appearance" / "0" / "splats.ply").write_bytes(b"ply\n")
     run = find([scenario]).runs[0]
@@ -60,8 +39,10 @@ def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
 
 
 def test_they_turn_with_the_body(scenario, server):
+    assert find([scenario]).runs[0].splats is None
     splats, run = dressed(scenario), find([scenario]).runs[0]
     nodes = run.trajectory.positions[0]
+    assert np.array_equal(run.splats.means, splats.means)
     turn, shift = Rotation.from_rotvec([0.3, -0.8, 1.1]), np.array([0.5, 0.1, -0.2])
     layer = SplatLayer(server.scene, "turned", splats, nodes)
     means, quaternions = layer.carried(turn.apply(nodes) + shift)

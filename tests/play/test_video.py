@@ -14,11 +14,6 @@ from tests.support.played import dressed, results
 FRAMES, NODE = 5, 4
 
 
-@pytest.fixture
-def scenario(tmp_path):
-    return results(tmp_path)
-
-
 def pulled(run, height: float = 0.3) -> Controls:
     """A pull upwards."""
     nodes, hands = run.twin.topology.nodes, run.twin.topology.controllers
@@ -78,12 +73,9 @@ def test_a_camera_that_is_not_there_is_named(scenario, tmp_path):
     assert not (tmp_path / "film.mp4").exists()
 
 
-@pytest.mark.parametrize("option", [["--compare"], ["--video", "film.mp4"], ["--camera", "0"]])
-def test_what_needs_a_recording_says_so(scenario, option, capsys):
-    assert main(["play", str(scenario), *option]) == 2
-    assert "Give it with --replay FILE" in capsys.readouterr().err
-
-
-def test_a_frame_that_is_not_there_is_refused(scenario, capsys):
+def test_what_needs_a_recording_and_a_frame_that_is_not_there_are_refused(scenario, capsys):
+    for option in (["--compare"], ["--video", "film.mp4"], ["--camera", "0"]):
+        assert main(["play", str(scenario), *option]) == 2
+        assert "Give it with --replay FILE" in capsys.readouterr().err
     assert main(["play", str(scenario), "--frame", "99"]) == 2
     assert "has the frames 0 to 7" in capsys.readouterr().err

@@ -19,16 +19,14 @@ def some(count: int = 7, axes: int = 1, coefficients: int = 4) -> Splats:
     return Splats(**{name: rng.normal(size=shape) for name, shape in shapes.items()})
 
 
-@pytest.mark.parametrize("axes", [1, 3])
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+@pytest.mark.parametrize(("axes", "coefficients"), [(1, 1), (3, 16)])
 def test_what_is_written_is_read_back(tmp_path, axes, coefficients):
     splats = some(axes=axes, coefficients=coefficients)
     splats.save(tmp_path / "splats.ply")
     again = Splats.load(tmp_path / "splats.ply")
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "harmonics"):
         assert np.array_equal(getattr(again, name), getattr(splats, name))
-    stored = Gaussians.of(again).stored()
-    assert np.array_equal(stored.harmonics, splats.harmonics)
+    assert np.array_equal(Gaussians.of(again).stored().harmonics, splats.harmonics)
 
 
 def test_the_layout_is_that_of_splat_viewers(tmp_path):
@@ -56,19 +54,19 @@ def test_a_truncated_file_says_how_much_is_there(tmp_path):
         Splats.load(path)
 
 
+HEAD = b"ply\nformat binary_little_endian 1.0\nelement vertex "
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "must be a binary little-endian PLY"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "must be a binary"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0", "no y, z, f_dc_0"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "properties of type"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nelement face 2\nend_header\n", "vertices alone"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex\nproperty float x\nend_header\n", "vertices alone"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "0 vertices"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float x\nend_header\n", "different"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float f_rest_0\nend_header\n\0\0\0\0", "f_rest_"),
-        (b"end_header\n", "must be a binary"),
+        (HEAD + b"1\nproperty float x\nend_header\n\0\0\0\0", "no y, z, f_dc_0"),
+        (HEAD + b"1\nproperty list uchar int x\nend_header\n", "properties of type"),
+        (HEAD + b"1\nelement face 2\nend_header\n", "vertices alone"),
+        (HEAD + b"0\nproperty float x\nend_header\n", "0 vertices"),
+        (HEAD + b"1\nproperty float x\nproperty float x\nend_header\n", "different"),
+        (HEAD + b"1\nproperty float f_rest_0\nend_header\n\0\0\0\0", "f_rest_"),
     ],
 )
 def test_other_files_are_named(tmp_path, content, message):

@@ -134,16 +134,12 @@ def test_a_camera_among_the_splats_gives_a_finite_picture_and_finite_gradients()
     assert picture.alpha.max() > 0.5
 
 
-@pytest.mark.parametrize("name", ["means", "quaternions", "scales", "opacities", "colors"])
-def test_splats_that_are_not_finite_are_named(name):
-    splats = [tensor.detach() for tensor in random_splats(0, 4, torch.float32)]
-    position = ["means", "quaternions", "scales", "opacities", "colors"].index(name)
-    splats[position][2] = float("nan")
-    with pytest.raises(InputError, match=rf"splats, {name}.*finite.*1 of 4"):
-        rasterize(*splats, small_view())
-
-
-def test_wrong_shapes_are_named():
+def test_splats_that_are_not_finite_or_of_a_wrong_shape_are_named():
+    for position, name in enumerate(("means", "quaternions", "scales", "opacities", "colors")):
+        splats = [tensor.detach() for tensor in random_splats(0, 4, torch.float32)]
+        splats[position][2] = float("nan")
+        with pytest.raises(InputError, match=rf"splats, {name}.*finite.*1 of 4"):
+            rasterize(*splats, small_view())
     splats = [tensor.detach() for tensor in random_splats(0, 4, torch.float32)]
     with pytest.raises(InputError, match=r"splats, scales.*\[4, 3\].*\(4, 1\)"):
         rasterize(*splats[:2], splats[2][:, :1], *splats[3:], small_view())

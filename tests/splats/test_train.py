@@ -1,7 +1,6 @@
 """Training: known splats are recovered, density adapts, losses are what they say, bad views are named."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
@@ -52,26 +51,25 @@ def shot_of(splats: Splats, view: View, name: str = "0", hands: np.ndarray | Non
     return Shot.of(name, view, color, mask & ~covered, covered, rendered.depth.numpy(), 0.0)
 
 
+def shots_of(splats: Splats) -> list[Shot]:
+    return [shot_of(splats, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+
+
 def quality(splats: Splats, shot: Shot) -> float:
     with torch.no_grad():
         rendered = Gaussians.of(splats).draw(shot.view)
     return float(psnr((rendered.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.color.permute(2, 0, 1)))
 
 
-@functools.cache
-def recovered() -> tuple[Splats, list[Shot], Shot]:
+def test_known_splats_are_recovered_from_three_views():
     truth = known_splats()
-    shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    shots, held_out = shots_of(truth), shot_of(truth, view_from(HELD_OUT))
     rng = np.random.default_rng(1)
     points = truth.means + rng.normal(0, 0.002, truth.means.shape)
     start = first_splats(points, rng.uniform(0.3, 0.7, (len(points), 3)), FAST, 0.002)
     # No part of the loss may ask for hard edges, which the truth does not have.
     settings = dataclasses.replace(FAST, mask=0.0, position_rate=1e-3, scale_rate=0.01, opacity_rate=0.05, color_rate=0.02)
-    return train(start, shots, settings, 0, "warp").splats, shots, shot_of(truth, view_from(HELD_OUT))
-
-
-def test_known_splats_are_recovered_from_three_views():
-    splats, shots, held_out = recovered()
+    splats = train(start, shots, settings, 0, "warp").splats
     assert min(quality(splats, shot) for shot in shots) > 35
     # Three views leave freedom; the fourth must still look alike.
     assert quality(splats, held_out) > 25
@@ -79,7 +77,7 @@ def test_known_splats_are_recovered_from_three_views():
 
 def test_training_is_deterministic_and_follows_its_seed():
     truth = known_splats(40)
-    shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    shots = shots_of(truth)
     settings = dataclasses.replace(FAST, iterations=40, densify_from=5, densify_every=10, densify_gradient=1e-5, degree=1)
     start = first_splats(truth.means, np.full((40, 3), 0.5), settings, 0.002)
     one, same, other = (train(start, shots, settings, seed, "warp").splats for seed in (0, 0, 1))
@@ -90,7 +88,7 @@ def test_training_is_deterministic_and_follows_its_seed():
 
 def test_the_number_of_splats_grows_where_they_are_too_coarse():
     truth = known_splats()
-    shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    shots = shots_of(truth)
     settings = dataclasses.replace(FAST, iterations=160, densify_from=40, densify_every=40, position_rate=1e-3)
     start = first_splats(truth.means[::10], np.full((20, 3), 0.5), settings, 0.002)
     grown = train(start, shots, settings, 0, "warp")
@@ -146,41 +144,23 @@ def test_hands_hide_and_are_not_compared():
         assert float(loss(wrong, shot, settings)) > float(loss(right, shot, settings)) + 0.001
 
 
-def test_the_margin_of_hands_grows_by_pixels():
-    view = view_from(EYES[0])
-    mask, hands = np.ones((SIZE[1], SIZE[0]), bool), np.zeros((SIZE[1], SIZE[0]), bool)
+def test_hands_hide_pixels_around_them_and_wrong_sizes_are_named():
+    size, view = (SIZE[1], SIZE[0]), view_from(EYES[0])
+    color, mask, hands, depth = np.zeros((*size, 3), np.uint8), np.ones(size, bool), np.zeros(size, bool), np.ones(size)
     hands[30, 40] = True
-    shot = Shot.of("0", view, np.zeros((*mask.shape, 3), np.uint8), mask & ~hands, hands, np.ones(mask.shape), 4.0)
+    shot = Shot.of("0", view, color, mask & ~hands, hands, depth, 4.0)
     assert float((1 - shot.known).sum()) == 16
-
-
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("color", r"camera 0, image of frame 0.*\(64, 96\).*\(10, 96\)"),
-        ("mask", r"camera 0, mask of frame 0.*\(64, 96\).*\(10, 96\)"),
-    ],
-)
-def test_bad_views_are_named(what, message):
-    size = (SIZE[1], SIZE[0])
-    arrays = {"color": np.zeros((*size, 3), np.uint8), "mask": np.ones(size, bool)}
-    arrays[what] = arrays[what][:10]
-    with pytest.raises(InputError, match=message):
-        Shot.of("0", view_from(EYES[0]), arrays["color"], arrays["mask"], np.zeros(size, bool), np.ones(size), 4.0)
-
-
-def test_a_view_without_the_object_or_only_beside_a_hand_is_none():
-    size = (SIZE[1], SIZE[0])
-    mask, hands = np.zeros(size, bool), np.zeros(size, bool)
-    arguments = (np.zeros((*size, 3), np.uint8), mask, hands, np.ones(size), 8.0)
-    assert Shot.of("0", view_from(EYES[0]), *arguments) is None
-    mask[30, 40] = hands[30, 42] = True
-    assert Shot.of("0", view_from(EYES[0]), *arguments) is None
+    only = np.zeros(size, bool)
+    only[30, 42] = True
+    for unseen in (np.zeros(size, bool), only):
+        assert Shot.of("0", view, color, unseen, hands, depth, 8.0) is None
+    with pytest.raises(InputError, match=r"camera 0, image of frame 0.*\(64, 96\).*\(10, 96\)"):
+        Shot.of("0", view, color[:10], mask, hands, depth, 4.0)
 
 
 def test_training_that_breaks_is_a_numerical_failure():
     truth = known_splats(40)
-    shots = [shot_of(truth, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    shots = shots_of(truth)
     start = first_splats(truth.means, np.full((40, 3), 0.5), FAST, 0.002)
     with pytest.raises(NumericalFailure, match="splats are not finite"):
         train(start, shots, dataclasses.replace(FAST, scale_rate=1e4), 0, "warp")
@@ -204,7 +184,7 @@ def test_the_first_splats_follow_the_points():
 
 
 def test_a_fixed_radius_stays_whatever_is_trained():
-    shots = [shot_of(known_splats(), view_from(eye), str(k)) for k, eye in enumerate(EYES)]
+    shots = shots_of(known_splats())
     settings = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004, densify_from=10, densify_every=10, densify_until=60)
     settings = dataclasses.replace(settings, densify_gradient=1e-6, split_size=1e-4)
     start = first_splats(known_splats().means, np.full((200, 3), 0.5), settings, 0.01)
