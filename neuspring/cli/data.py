@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from neuspring.cli import options as shared
 
 if TYPE_CHECKING:
-    from neuspring.data.departure import Departure
+    from neuspring.core.findings import Finding
 
 
 def fetch_options(parser: ArgumentParser) -> None:
@@ -28,8 +28,8 @@ def fetch(a: Namespace) -> int:
     from neuspring.data import fetch
     from neuspring.scores.released.check_data import check
 
-    departures = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)
-    return 0 if a.dry_run else _tell(departures)
+    findings = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)
+    return 0 if a.dry_run else _tell(findings)
 
 
 def check_data_options(parser: ArgumentParser) -> None:
@@ -44,12 +44,12 @@ def check_data(a: Namespace) -> int:
     return _tell(check(a.folder))
 
 
-def _tell(departures: list[Departure]) -> int:
-    """Print departures; returns 2 where the data cannot be used."""
+def _tell(findings: list[Finding]) -> int:
+    """Print findings; returns 2 where the data cannot be used."""
     from neuspring.data.check import render
 
-    print(render(departures))
-    return 2 if any(departure.level == "error" for departure in departures) else 0
+    print(render(findings))
+    return 2 if any(finding.level == "error" for finding in findings) else 0
 
 
 def verify_released_options(parser: ArgumentParser) -> None:

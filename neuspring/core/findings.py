@@ -1,4 +1,7 @@
-"""What a step noticed about its own result: implausible, but no reason to stop. It is kept in the record, printed, and reported."""
+"""What was noticed: about a data set, or by a step about its own result.
+
+The latter is implausible, but no reason to stop: it is kept in the record, printed, and reported.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +22,69 @@ RECORDS = ("perception/*/masks.json", "perception/*/tracks.json", "perception/li
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One finding. `note`: worth knowing. `warning`: results are probably worse for it. `error`: no method can work with this."""
+    """One finding.
+
+    `error`: a reader refuses it, numbers would be wrong, or no method can work with it. `warning`: readable, but not as released,
+    or results are probably worse for it. `note`: a measurement, a check that was skipped, worth knowing.
+    """
 
     name: str
-    """What it is about, in a few words; the same for every occurrence."""
+    """What it is about, in a few words, the same for every occurrence; of a file of data, the key, or empty."""
     level: Level
     where: str
-    """The camera, or what else was looked at."""
+    """The file, the camera, or what else was looked at."""
     text: str
     """The value, the rule that it departs from, and the next move."""
 
+    @property
+    def message(self) -> str:
+        """All but level and place."""
+        return f"{self.name}: {self.text}" if self.name else self.text
+
     def __str__(self) -> str:
-        return f"{self.level}: {self.where}: {self.name}: {self.text}"
+        return f"{self.level}: {self.where}: {self.message}"
 
 
 def finding(name: str, level: Level, where: str, value: str, rule: str, remedy: str = "") -> Finding:
     """A finding whose text is `value` (what was received), the `rule`, and the next move."""
     return Finding(name=name, level=level, where=where, text=f"{value}; {rule}. {remedy}".rstrip())
+
+
+def broken(file: Path, key: str, rule: str, value: object = None) -> Finding:
+    """An error: `key` of `file` breaks `rule`; `value` was received."""
+    return _of_file(file, "error", key, rule, value)
+
+
+def unusual(file: Path, key: str, rule: str, value: object = None) -> Finding:
+    """A warning: `key` of `file` departs from `rule`; `value` was received."""
+    return _of_file(file, "warning", key, rule, value)
+
+
+def note(file: Path, message: str) -> Finding:
+    """A measurement or a skipped check."""
+    return _of_file(file, "note", "", message, None)
+
+
+def _of_file(file: Path, level: Level, key: str, rule: str, value: object) -> Finding:
+    return Finding(name=key, level=level, where=str(file), text=rule if value is None else f"{rule}; received {value}")
+
+
+def refusal(error: InputError | str) -> Finding:
+    """The error of a reader, or its text, which begins with the file."""
+    file, _, message = str(error).partition(": ")
+    return Finding(name="", level="error", where=file, text=message)
+
+
+def refuse(findings: Iterable[Finding]) -> None:
+    """Raise the first error among findings about a data set as InputError, naming file and key; else print warnings."""
+    listed = list(findings)
+    errors = [one for one in listed if one.level == "error"]
+    if errors:
+        more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
+        raise InputError(errors[0].where, errors[0].message, remedy=f"{more}`neuspring check-data` lists every finding.")
+    for one in listed:
+        if one.level == "warning":
+            print(one)
 
 
 def told(findings: Sequence[Finding]) -> dict[str, Any]:

@@ -32,15 +32,15 @@ from neuspring.config.types import STRICT, Finite, Name, Positive
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
+from neuspring.core.findings import Finding, broken, refuse
 from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
-from neuspring.data.departure import Departure, broken, refuse
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
 TEXT_TOLERANCE = 1e-4
-"""Allowed departure from R^T R = 1 in JSON, where matrices may have five digits."""
+"""Allowed finding from R^T R = 1 in JSON, where matrices may have five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 
@@ -151,7 +151,7 @@ class Capture:
         folder = Path(folder)
         path = folder / CAPTURE
         description = read_description(path)
-        refuse(description_departures(path, description))
+        refuse(description_findings(path, description))
         return cls(folder, description)
 
     @cached_property
@@ -331,34 +331,34 @@ def read_description(path: Path) -> Description:
     return parse(Description, values, str(path))
 
 
-def description_departures(path: Path, description: Description) -> list[Departure]:
+def description_findings(path: Path, description: Description) -> list[Finding]:
     """Rules that types cannot express: calibration, frame numbers, the split."""
-    departures = []
+    findings = []
     names = [camera.name for camera in description.cameras]
     if len(set(names)) < len(names):
-        departures.append(broken(path, "cameras", "names must differ", names))
+        findings.append(broken(path, "cameras", "names must differ", names))
     if description.train_end is not None and description.train_end > description.frame_count:
         rule = f"must be at most frame_count = {description.frame_count}"
-        departures.append(broken(path, "train_end", rule, description.train_end))
+        findings.append(broken(path, "train_end", rule, description.train_end))
     if description.depth == "none" and len(names) > 1:
-        departures.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
+        findings.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
     for number, obstacle in enumerate(description.obstacles):
         if wrong := obstacle.wrong():
-            departures.append(broken(path, f"obstacles[{number}].{wrong[0]}", wrong[1], wrong[2]))
+            findings.append(broken(path, f"obstacles[{number}].{wrong[0]}", wrong[1], wrong[2]))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
         size = (camera.width, camera.height)
-        departures += intrinsics_departures(path, f"{where}.intrinsics", np.array(camera.intrinsics), size)
-        departures += pose_departures(path, f"{where}.camera_to_world", np.array(camera.camera_to_world), TEXT_TOLERANCE)
+        findings += intrinsics_findings(path, f"{where}.intrinsics", np.array(camera.intrinsics), size)
+        findings += pose_findings(path, f"{where}.camera_to_world", np.array(camera.camera_to_world), TEXT_TOLERANCE)
         beyond = [frame for frame in camera.missing if frame >= description.frame_count]
         if beyond:
-            departures.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
+            findings.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
         if 0 in camera.missing:
-            departures.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
-    return departures
+            findings.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+    return findings
 
 
-def intrinsics_departures(file: Path, key: str, matrix: np.ndarray, size: tuple[int, int] | None) -> list[Departure]:
+def intrinsics_findings(file: Path, key: str, matrix: np.ndarray, size: tuple[int, int] | None) -> list[Finding]:
     """K [3, 3], pixels: its form, and (cx, cy) within the image of `size` (width, height), where that is known."""
     fixed = matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.array_equal(fixed, [0, 0, 0, 0, 1])):
@@ -368,17 +368,17 @@ def intrinsics_departures(file: Path, key: str, matrix: np.ndarray, size: tuple[
     return []
 
 
-def pose_departures(file: Path, key: str, pose: np.ndarray, tolerance: float) -> list[Departure]:
+def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> list[Finding]:
     """Camera to world [4, 4], m: a rotation and a translation."""
-    departures = []
+    findings = []
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if not error <= tolerance or np.linalg.det(rotation) < 0 or not np.isfinite(pose).all():
         rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
-        departures.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1, or a mirror image"))
+        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1, or a mirror image"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
-        departures.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
-    return departures
+        findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
+    return findings
 
 
 def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:

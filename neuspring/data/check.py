@@ -7,36 +7,39 @@ the comparison with the released results: `neuspring.scores.released.check_data`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
+from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin
-from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_departures, read_description
-from neuspring.data.departure import Departure, Inspection, broken, note, unusual
+from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
-from neuspring.data.phystwin import CALIBRATION, metadata_departures, poses_departures
+from neuspring.data.phystwin import CALIBRATION, metadata_findings, poses_findings
 from neuspring.data.plausible_masks import Shown, mask_findings
 from neuspring.data.plausible_world import (
     Sample,
-    alone_departures,
+    color_alone_findings,
     depth_findings,
     hand_findings,
-    horizon_departures,
+    horizon_findings,
     lifted,
     object_on_table,
     place_findings,
     reach_findings,
     sampled,
     size_findings,
-    table_departures,
-    view_departures,
+    table_findings,
+    view_findings,
 )
-from neuspring.data.released import Released, parameter_departures, prediction_departures, read_checkpoint
+from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
 from neuspring.data.unpickle import load_pickle
 
 INSIDE, INSIDE_SHARE = 0.01, 0.05
@@ -45,36 +48,64 @@ LEAST_AROUND = 0.1
 """Share of the image that must have depth, beside object and hands, before the table is looked for."""
 
 
+@dataclass
+class Inspection:
+    """A folder under inspection and its findings so far."""
+
+    folder: Path
+    findings: list[Finding] = field(default_factory=list)
+
+    def load(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        """The content of `path`, or None (with a finding) if it is missing or damaged."""
+        try:
+            return reader(path)
+        except InputError as error:
+            self.findings.append(Finding(name="", level="error", where=str(path), text=str(error).removeprefix(f"{path}: ")))
+            return None
+
+    def load_optional(self, path: Path, reader: Callable[[Path], Any], skipped: str) -> Any:
+        """As `load`, with a note if `path` is missing: what is therefore `skipped`, with its verb ("the check is")."""
+        if path.exists():
+            return self.load(path, reader)
+        self.findings.append(note(path, f"not found: {skipped} skipped"))
+        return None
+
+
 def is_capture(folder: Path) -> bool:
     """Whether the folder holds a capture."""
     return (folder / CAPTURE).exists()
 
 
-def check_capture(folder: Path) -> list[Departure]:
+def check_capture(folder: Path) -> list[Finding]:
     """Description, calibration, every image, masks of frame 0, tracks, marked points."""
     case, path = Inspection(folder), folder / CAPTURE
     description = case.load(path, read_description)
     if description is None:
-        return case.departures
-    case.departures += description_departures(path, description)
-    case.departures += rate_departures(path, description.frame_rate)
+        return case.findings
+    case.findings += description_findings(path, description)
+    case.findings += rate_findings(path, description.frame_rate)
     capture = Capture(folder, description)
-    calibrated = not any(d.level == "error" for d in case.departures)
+    calibrated = not any(d.level == "error" for d in case.findings)
     samples = {name: _check_camera(case, capture, name, calibrated) for name in capture.cameras}
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
-        case.departures += view_departures(path, capture.cameras, first, description.up)
+        case.findings += view_findings(path, capture.cameras, first, description.up)
     case.load(folder / TRACKS, lambda _: capture.tracks())
     for name in capture.cameras:
         case.load(folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
     if not description.masks:
         message = f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"
-        case.departures.append(note(path, message))
-    return case.departures
+        case.findings.append(note(path, message))
+    return case.findings
 
 
-def rate_departures(path: Path, rate: float) -> list[Departure]:
-    """A departure of a frame rate that no depth camera has. Speeds and forces of the twin scale with it."""
+def _at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
+    """Findings about the content of `file`."""
+    return [replace(one, where=str(file), name=f"{one.where}: {one.name}") for one in findings]
+
+
+def rate_findings(path: Path, rate: float) -> list[Finding]:
+    """A finding of a frame rate that no depth camera has. Speeds and forces of the twin scale with it."""
     if SLOWEST <= rate <= FASTEST:
         return []
     rule = f"frames per second at which it was filmed are required, {SLOWEST:g} to {FASTEST:g}"
@@ -102,19 +133,19 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
             if frame in wanted:
                 samples[frame] = Sample(depth, mask)
         except InputError as error:
-            case.departures.append(Departure.of_error(error))
-    wrong = depth_departures(capture, name, depths)
-    case.departures += wrong
+            case.findings.append(refusal(error))
+    wrong = median_depth_findings(capture, name, depths)
+    case.findings += wrong
     if calibrated and not capture.has_depth:
-        case.departures += _alone_departures(capture, name, samples)
+        case.findings += _color_alone_findings(capture, name, samples)
     elif calibrated and not wrong:
-        case.departures += _world_departures(capture, name, samples)
+        case.findings += _world_findings(capture, name, samples)
     masks = capture.folder / "mask" / name
-    case.departures += [Departure.of_finding(masks, one) for one in mask_findings(name, shown)]
+    case.findings += _at(masks, mask_findings(name, shown))
     return samples
 
 
-def _world_departures(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Departure]:
+def _world_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
     """The table, and object and hands in the masks, of one camera."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
     is_counted = capture.description.depth_format == "png"
@@ -123,35 +154,35 @@ def _world_departures(capture: Capture, name: str, samples: dict[int, Sample]) -
     around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
     enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
     found = planes(cloud(around, camera.intrinsics)) if enough else []
-    departures = table_departures(path, name, found, camera.camera_to_world, up, unit)
+    findings = table_findings(path, name, found, camera.camera_to_world, up, unit)
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
-    findings = [
+    things = [
         *depth_findings(camera, samples),
         *place_findings(f"camera {name}, object", list(bodies.values()), up_sign(up)),
         *hand_findings(camera, samples),
         *reach_findings(camera, samples),
     ]
-    departures += [Departure.of_finding(path, one) for one in findings]
+    findings += _at(path, things)
     if 0 in bodies:
-        departures += obstacle_departures(path, capture.description, bodies[0])
-    return departures
+        findings += obstacle_findings(path, capture.description, bodies[0])
+    return findings
 
 
-def _alone_departures(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Departure]:
+def _color_alone_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
     """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
-    departures = alone_departures(path, camera, up)
-    if any(d.level == "error" for d in departures) or 0 not in samples:
-        return departures
+    findings = color_alone_findings(path, camera, up)
+    if any(d.level == "error" for d in findings) or 0 not in samples:
+        return findings
     mask = samples[0].mask
-    departures += horizon_departures(path, camera, mask)
-    departures += [Departure.of_finding(path, one) for one in size_findings(camera, mask)]
+    findings += horizon_findings(path, camera, mask)
+    findings += _at(path, size_findings(camera, mask))
     # Obstacles stand on the table: what lies beneath one is met above it.
     on_table = object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
-    return departures + obstacle_departures(path, capture.description, on_table[np.isfinite(on_table[:, 0])])
+    return findings + obstacle_findings(path, capture.description, on_table[np.isfinite(on_table[:, 0])])
 
 
-def obstacle_departures(path: Path, description: Description, points: np.ndarray) -> list[Departure]:
+def obstacle_findings(path: Path, description: Description, points: np.ndarray) -> list[Finding]:
     """Departures of obstacles in which points [n, 3], m, of the object lie in frame 0: nodes there would be thrown out."""
     found = []
     for number, obstacle in enumerate(description.obstacles):
@@ -165,7 +196,7 @@ def obstacle_departures(path: Path, description: Description, points: np.ndarray
     return found
 
 
-def depth_departures(capture: Capture, name: str, medians: list[float]) -> list[Departure]:
+def median_depth_findings(capture: Capture, name: str, medians: list[float]) -> list[Finding]:
     """Departures of a camera whose median depths, m, are not those of a scene on a table."""
     path, depths = capture.folder / CAPTURE, np.array([m for m in medians if np.isfinite(m)])
     if medians and not len(depths):
@@ -183,9 +214,9 @@ CAMERAS = 3
 """Cameras of every released case."""
 
 
-def check_layout(folder: Path) -> list[Departure]:
+def check_layout(folder: Path) -> list[Finding]:
     """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, or cable
-    recordings (folder or .pkl file). Returns every departure.
+    recordings (folder or .pkl file). Returns every finding.
 
     Raises InputError only if `folder` does not exist or holds no data of a known layout.
     """
@@ -195,9 +226,9 @@ def check_layout(folder: Path) -> list[Departure]:
     if not folder.is_dir():
         raise InputError(folder, "a folder or file to check is required", "nothing there")
     if captures := _captures(folder):
-        return [departure for path in captures for departure in check_capture(path)]
+        return [finding for path in captures for finding in check_capture(path)]
     if cases := find_cases(folder):
-        return [departure for case in cases for departure in _check_case(case)]
+        return [finding for case in cases for finding in _check_case(case)]
     return _check_recordings(folder)
 
 
@@ -232,14 +263,14 @@ def is_case(folder: Path) -> bool:
     return (folder / phystwin.FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
 
 
-def render(departures: list[Departure]) -> str:
+def render(findings: list[Finding]) -> str:
     """Departures as text, grouped by file, ending in 'N errors, N warnings'."""
-    ordered = sorted(departures, key=lambda d: str(d.file))
+    ordered = sorted(findings, key=lambda d: d.where)
     lines = []
-    for file, group in groupby(ordered, key=lambda d: d.file):
-        lines.append(str(file))
+    for file, group in groupby(ordered, key=lambda d: d.where):
+        lines.append(file)
         lines += [f"  {d.level:8} {d.message}" for d in group]
-    counts = [sum(d.level == level for d in departures) for level in ("error", "warning")]
+    counts = [sum(d.level == level for d in findings) for level in ("error", "warning")]
     total = ", ".join(f"{n} {word}{'' if n == 1 else 's'}" for n, word in zip(counts, ("error", "warning"), strict=True))
     return "\n".join([*lines, total])
 
@@ -252,15 +283,15 @@ def _subfolders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
-def _check_recordings(folder: Path) -> list[Departure]:
+def _check_recordings(folder: Path) -> list[Finding]:
     files = sorted(folder.rglob("*.pkl"))
     if not files:
         rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
         raise InputError(folder, rule, "none of them")
-    return [departure for file in files for departure in mocap.check_mocap(file)]
+    return [finding for file in files for finding in mocap.check_mocap(file)]
 
 
-def _check_case(case: Released) -> list[Departure]:
+def _check_case(case: Released) -> list[Finding]:
     inspection = Inspection(case.folder)
     data = _check_final_data(inspection)
     frames = None if data is None else len(data["object_points"])
@@ -270,7 +301,7 @@ def _check_case(case: Released) -> list[Departure]:
     _check_metadata(inspection, frames)
     if case.loose is None:
         _check_results(inspection, case, data)
-    return inspection.departures
+    return inspection.findings
 
 
 # --- the processed case, file by file -------------------------------------------------------------------------------------
@@ -282,64 +313,64 @@ def _check_final_data(case: Inspection) -> dict[str, np.ndarray] | None:
     data = case.load(path, load_pickle)
     if data is None:
         return None
-    case.departures += phystwin.final_data_departures(path, data)
-    if any(d.level == "error" for d in phystwin.structure_departures(path, data)) or not data["object_visibilities"].size:
+    case.findings += phystwin.final_data_findings(path, data)
+    if any(d.level == "error" for d in phystwin.structure_findings(path, data)) or not data["object_visibilities"].size:
         return None
-    case.departures += _invisible_departures(path, data)
-    case.departures += _motion_departures(path, data)
-    case.departures += _rest_state_departures(path, data)
+    case.findings += _invisible_findings(path, data)
+    case.findings += _motion_findings(path, data)
+    case.findings += _rest_state_findings(path, data)
     controllers = data["controller_points"].shape[1]
     if controllers != CONTROLLERS:
-        case.departures.append(unusual(path, "controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
+        case.findings.append(unusual(path, "controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
     return dict(data)
 
 
-def _invisible_departures(path: Path, data: dict[str, np.ndarray]) -> list[Departure]:
+def _invisible_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
     points, visible = data["object_points"], data["object_visibilities"]
-    departures = []
+    findings = []
     moved = np.argwhere(~visible & (points != 0).any(axis=2))
     if len(moved):
-        departures.append(unusual(path, "object_points", "(0, 0, 0) is expected where a point is invisible", _place(moved)))
+        findings.append(unusual(path, "object_points", "(0, 0, 0) is expected where a point is invisible", _place(moved)))
     below = np.argwhere(points[..., 2] > 0)
     if len(below):
         depth = float(np.nanmax(points[..., 2]))
-        departures.append(
+        findings.append(
             unusual(path, "object_points", "z <= 0 (on or above the table) is expected", f"z up to {depth:.4g} m, {_place(below)}")
         )
     empty = np.flatnonzero(~visible.any(axis=1))
     if len(empty):
-        departures.append(
+        findings.append(
             unusual(path, "object_visibilities", "a visible point in every frame is expected", f"none in frames {_list(empty)}")
         )
-    return departures
+    return findings
 
 
-def _motion_departures(path: Path, data: dict[str, np.ndarray]) -> list[Departure]:
+def _motion_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
     visible, valid = data["object_visibilities"], data["object_motions_valid"]
-    key, departures = "object_motions_valid", []
+    key, findings = "object_motions_valid", []
     if valid[-1].any():
         rule = "the last row has no next frame and must be all False"
-        departures.append(unusual(path, key, rule, f"{int(valid[-1].sum())} True"))
+        findings.append(unusual(path, key, rule, f"{int(valid[-1].sum())} True"))
     unseen = np.argwhere(valid[:-1] & ~(visible[:-1] & visible[1:]))
     if len(unseen):
         rule = "a valid motion from t to t+1 requires the point to be visible in both frames"
-        departures.append(broken(path, key, rule, _place(unseen)))
-    return departures
+        findings.append(broken(path, key, rule, _place(unseen)))
+    return findings
 
 
-def _rest_state_departures(path: Path, data: dict[str, np.ndarray]) -> list[Departure]:
+def _rest_state_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
     """Duplicates and order of the frame-0 points. Duplicates would make springs without length."""
     rest = data["object_points"][0]
-    key, departures = "object_points", []
+    key, findings = "object_points", []
     duplicates = len(rest) - len(np.unique(rest, axis=0))
     if duplicates:
-        departures.append(unusual(path, key, "the points of frame 0 are expected to differ", f"{duplicates} duplicates"))
+        findings.append(unusual(path, key, "the points of frame 0 are expected to differ", f"{duplicates} duplicates"))
     order = np.lexsort(rest.T[::-1])
     if not np.array_equal(rest[order], rest, equal_nan=True):
-        departures.append(
+        findings.append(
             unusual(path, key, "columns are expected in lexicographic order of their frame-0 coordinates", "another order")
         )
-    return departures
+    return findings
 
 
 def _place(rows: np.ndarray) -> str:
@@ -356,23 +387,23 @@ def _check_split(case: Inspection, frames: int | None) -> None:
     if split is None:
         return
     if frames is None:
-        case.departures.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
+        case.findings.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
     else:
-        case.departures += phystwin.split_departures(path, split, frames)
+        case.findings += phystwin.split_findings(path, split, frames)
 
 
 def _check_tracks(case: Inspection, frames: int | None) -> None:
     path = case.folder / phystwin.TRACKS
     tracks = case.load_optional(path, load_pickle, "annotated tracks and the track error are")
     if tracks is not None:
-        case.departures += phystwin.tracks_departures(path, tracks, frames)
+        case.findings += phystwin.tracks_findings(path, tracks, frames)
 
 
 def _check_calibration(case: Inspection) -> None:
     path = case.folder / CALIBRATION
     poses = case.load_optional(path, load_pickle, "the calibration check is")
     if poses is not None:
-        case.departures += poses_departures(path, poses, CAMERAS)
+        case.findings += poses_findings(path, poses, CAMERAS)
 
 
 def _check_metadata(case: Inspection, frames: int | None) -> None:
@@ -380,20 +411,20 @@ def _check_metadata(case: Inspection, frames: int | None) -> None:
     metadata = case.load_optional(path, load_json, "the check of intrinsics and frame rate is")
     if metadata is None:
         return
-    case.departures += phystwin.frame_rate_departures(path, metadata)
+    case.findings += phystwin.frame_rate_findings(path, metadata)
     if not isinstance(metadata, dict):
         return
     if "fps" not in metadata:
-        case.departures.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
+        case.findings.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
     if frames is not None and metadata.get("frame_num", frames) != frames:
-        case.departures.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
-    case.departures += metadata_departures(path, metadata, CAMERAS)
+        case.findings.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
+    case.findings += metadata_findings(path, metadata, CAMERAS)
 
 
 def _check_results(inspection: Inspection, case: Released, data: dict[str, np.ndarray] | None) -> None:
     """Searched parameters, checkpoint and prediction, where they are there; a missing file skips the checks that need it."""
     if case.parameters.exists() and (parameters := inspection.load(case.parameters, load_pickle)) is not None:
-        inspection.departures += parameter_departures(case.parameters, parameters)
+        inspection.findings += parameter_findings(case.parameters, parameters)
     if case.checkpoint.exists():
         inspection.load(case.checkpoint, read_checkpoint)
     if data is None or not case.prediction.exists():
@@ -402,4 +433,4 @@ def _check_results(inspection: Inspection, case: Released, data: dict[str, np.nd
     if positions is not None:
         frames, points = data["object_visibilities"].shape
         nodes = points + len(data["surface_points"]) + len(data["interior_points"])
-        inspection.departures += prediction_departures(case.prediction, positions, frames, nodes)
+        inspection.findings += prediction_findings(case.prediction, positions, frames, nodes)

@@ -28,11 +28,11 @@ from pathlib import Path
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.findings import Finding, broken
 from neuspring.core.records import now, read_json
 from neuspring.core.text import Progress
 from neuspring.data import phystwin
 from neuspring.data.check import check_layout, is_case
-from neuspring.data.departure import Departure, broken
 from neuspring.data.hub import Hub, HubFile, RemoteFile
 from neuspring.data.phystwin import released_cases
 
@@ -261,8 +261,8 @@ def fetch(
     dry_run: bool = False,
     endpoint: str | None = None,
     say: Callable[[str], None] = print,
-    check: Callable[[Path], list[Departure]] = check_layout,
-) -> list[Departure]:
+    check: Callable[[Path], list[Finding]] = check_layout,
+) -> list[Finding]:
     """Fetch `parts` of `scenarios` (default: all 22) below `data_root`, and check every scenario whose processed data are there.
 
     `parts` are of PARTS; "all" stands for every one of these, "extra" for the additional clothes. What will be fetched and the
@@ -397,11 +397,11 @@ def _record(path: Path, hub: Hub, plan: FetchPlan, cases: list[str], parts: set[
     write_text(path, json.dumps({"format": RECORD_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
 
 
-def _check(data_root: Path, cases: list[str], required: bool, check: Callable[[Path], list[Departure]]) -> list[Departure]:
+def _check(data_root: Path, cases: list[str], required: bool, check: Callable[[Path], list[Finding]]) -> list[Finding]:
     """Check the cases that have processed data; an error for others if these are `required`."""
     folders = [data_root / CASES / case for case in cases]
     present = [folder for folder in folders if is_case(folder)]
     absent = [broken(folder, "", "processed data are required") for folder in folders if required and folder not in present]
     if len(present) == len(released_cases()):
         return check(data_root)  # also compares means over all cases
-    return absent + [departure for folder in present for departure in check(folder)]
+    return absent + [finding for folder in present for finding in check(folder)]

@@ -28,8 +28,8 @@ from scipy.spatial import cKDTree
 from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
+from neuspring.core.findings import Finding, broken, refusal, refuse, unusual
 from neuspring.core.records import digest_file
-from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.unpickle import load_pickle
 
 
@@ -103,7 +103,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     """
     file = Path(file)
     raw = load_pickle(file)
-    refuse(recording_departures(file, raw))
+    refuse(recording_findings(file, raw))
     samples = np.asarray(raw)[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape
@@ -231,7 +231,7 @@ def _transported_normals(tangents: np.ndarray) -> np.ndarray:
     return normals
 
 
-def recording_departures(file: Path, raw: Any) -> list[Departure]:
+def recording_findings(file: Path, raw: Any) -> list[Finding]:
     """Departures of one recording: what the reader refuses (errors) and what is not as released (warnings)."""
     if not isinstance(raw, (np.ndarray, list, tuple)):
         return [broken(file, "", "positions [T, 3, n] are required", type(raw).__name__)]
@@ -243,48 +243,46 @@ def recording_departures(file: Path, raw: Any) -> list[Departure]:
         return [broken(file, "", "the shape must be [T, 3, n]", data.shape)]
     if data.dtype.kind != "f":
         return [broken(file, "", "the dtype must be floating point", data.dtype)]
-    departures = []
+    findings = []
     if data.shape[2] < MIN_MARKERS:
-        departures.append(
-            broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are controllers)", data.shape[2])
-        )
+        findings.append(broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are controllers)", data.shape[2]))
     if len(data) < MIN_FRAMES:
-        departures.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
+        findings.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
     bad = np.argwhere(~np.isfinite(data))
     if len(bad):
         frame, axis, marker = (int(i) for i in bad[0])
         place = f"{data[frame, axis, marker]} at frame {frame}, marker {marker} ({len(bad)} in all)"
-        departures.append(broken(file, "", "every coordinate must be finite", place))
-    return departures or _marker_departures(file, data)
+        findings.append(broken(file, "", "every coordinate must be finite", place))
+    return findings or _marker_findings(file, data)
 
 
-def _marker_departures(file: Path, data: np.ndarray) -> list[Departure]:
-    departures = []
+def _marker_findings(file: Path, data: np.ndarray) -> list[Finding]:
+    findings = []
     if data.dtype != np.float64:
-        departures.append(unusual(file, "", "the released dtype is float64", data.dtype))
+        findings.append(unusual(file, "", "the released dtype is float64", data.dtype))
     if len(data) != RELEASED_SAMPLES:
-        departures.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
+        findings.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
     length = np.linalg.norm(np.diff(data, axis=2), axis=1)
     short = np.argwhere(length[0] < MIN_DISTANCE)
     if len(short):
         i = int(short[0, 0])
-        departures.append(
+        findings.append(
             broken(file, "", f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0", f"markers {i} and {i + 1}")
         )
-        return departures
+        return findings
     stretch = np.abs(length / np.median(length, axis=0) - 1)
     frame, segment = np.unravel_index(int(stretch.argmax()), stretch.shape)
     if stretch[frame, segment] > MAX_STRETCH:
         place = f"{length[frame, segment]:.3f} m between markers {segment} and {segment + 1} in frame {frame}"
         rule = f"marker distances usually stay within {MAX_STRETCH:.0%} of their median {np.median(length[:, segment]):.3f} m"
-        departures.append(unusual(file, "", rule, place))
-    return departures
+        findings.append(unusual(file, "", rule, place))
+    return findings
 
 
-def check_mocap(file: Path) -> list[Departure]:
-    """Every departure of one recording; nothing is raised for bad content."""
+def check_mocap(file: Path) -> list[Finding]:
+    """Every finding of one recording; nothing is raised for bad content."""
     try:
         raw = load_pickle(file)
     except InputError as error:
-        return [Departure(Path(file), "error", str(error))]
-    return recording_departures(Path(file), raw)
+        return [refusal(error)]
+    return recording_findings(Path(file), raw)

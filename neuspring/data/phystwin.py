@@ -24,6 +24,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
+from neuspring.core.findings import Finding, broken, refuse, unusual
 from neuspring.core.records import digest_file
 from neuspring.data.capture import (
     HANDS,
@@ -32,12 +33,11 @@ from neuspring.data.capture import (
     Capture,
     Description,
     Writer,
-    intrinsics_departures,
+    intrinsics_findings,
     make_way,
-    pose_departures,
+    pose_findings,
     read_image,
 )
-from neuspring.data.departure import Departure, broken, refuse, unusual
 from neuspring.data.unpickle import load_pickle
 
 
@@ -58,7 +58,7 @@ RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 MAX_FRAME_RATE = 1e6
 BINARY_TOLERANCE = 1e-5
-"""Allowed departure from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
+"""Allowed finding from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +106,21 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     folder = Path(folder)
     data_path, split_path = folder / FINAL_DATA, folder / SPLIT
     data = load_pickle(data_path)
-    refuse(final_data_departures(data_path, data))
+    refuse(final_data_findings(data_path, data))
     frames = len(data["object_points"])
     split = load_json(split_path)
-    refuse(split_departures(split_path, split, frames))
+    refuse(split_findings(split_path, split, frames))
     used = [data_path, split_path]
 
     tracks = np.zeros((frames, 0, 3))
     if (folder / TRACKS).exists():
         tracks = load_pickle(folder / TRACKS)
-        refuse(tracks_departures(folder / TRACKS, tracks, frames))
+        refuse(tracks_findings(folder / TRACKS, tracks, frames))
         used.append(folder / TRACKS)
     frame_rate = RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
         metadata = load_json(folder / METADATA)
-        refuse(frame_rate_departures(folder / METADATA, metadata))
+        refuse(frame_rate_findings(folder / METADATA, metadata))
         frame_rate = float(metadata.get("fps", RELEASED_FRAME_RATE))
         used.append(folder / METADATA)
 
@@ -147,36 +147,36 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     )
 
 
-def final_data_departures(path: Path, data: Any) -> list[Departure]:
+def final_data_findings(path: Path, data: Any) -> list[Finding]:
     """Keys, shapes, dtypes and finiteness of final_data.pkl, and the rules without which nothing can be simulated."""
-    departures = structure_departures(path, data)
+    findings = structure_findings(path, data)
     if not isinstance(data, dict):
-        return departures
+        return findings
     for rule in ARRAYS:
         value = data.get(rule.key)
         if isinstance(value, np.ndarray) and value.dtype.kind == "f" == rule.kind and value.ndim == len(rule.shape):
-            departures += _number_departures(path, rule, value)
-    if not any(d.level == "error" for d in departures):
-        departures += _content_departures(path, data)
-    return departures
+            findings += _number_findings(path, rule, value)
+    if not any(d.level == "error" for d in findings):
+        findings += _content_findings(path, data)
+    return findings
 
 
-def structure_departures(path: Path, data: Any) -> list[Departure]:
+def structure_findings(path: Path, data: Any) -> list[Finding]:
     """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
         return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
     keys = {rule.key for rule in ARRAYS} | set(IGNORED)
-    departures = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
+    findings = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
     sizes: dict[str, int] = {}
     for rule in ARRAYS:
         if rule.key in data:
-            departures += _array_departures(path, rule, data[rule.key], sizes)
+            findings += _array_findings(path, rule, data[rule.key], sizes)
         else:
-            departures.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
-    return departures
+            findings.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
+    return findings
 
 
-def _array_departures(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Departure]:
+def _array_findings(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Finding]:
     """Type, shape and dtype of one array. `sizes` collects the symbolic dimensions of the file."""
     shape = f"[{', '.join(rule.shape)}]"
     severity = broken if rule.required else unusual
@@ -184,26 +184,26 @@ def _array_departures(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, 
         return [severity(path, rule.key, f"an array {shape} is required", type(value).__name__)]
     if value.ndim != len(rule.shape):
         return [severity(path, rule.key, f"the shape must be {shape}", value.shape)]
-    departures = []
+    findings = []
     for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
         wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
         if size != wanted:
             message = f"the shape must be {shape} with {wanted} entries along axis {axis}"
-            departures.append(severity(path, rule.key, message, value.shape))
+            findings.append(severity(path, rule.key, message, value.shape))
     if value.dtype.kind != rule.kind:
-        departures.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
-    return departures
+        findings.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
+    return findings
 
 
-def _number_departures(path: Path, rule: ArrayRule, value: np.ndarray) -> list[Departure]:
-    departures = []
+def _number_findings(path: Path, rule: ArrayRule, value: np.ndarray) -> list[Finding]:
+    findings = []
     if value.dtype != np.float64:
-        departures.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
+        findings.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
     bad = np.argwhere(~np.isfinite(value))
     if len(bad):
         severity = broken if rule.required else unusual
-        departures.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
-    return departures
+        findings.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
+    return findings
 
 
 def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
@@ -213,54 +213,54 @@ def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
     return f"{value[first]} at {place} ({len(bad)} in all)"
 
 
-def _content_departures(path: Path, data: dict[str, Any]) -> list[Departure]:
-    departures = []
+def _content_findings(path: Path, data: dict[str, Any]) -> list[Finding]:
+    findings = []
     frames, points = data["object_visibilities"].shape
     if points == 0:
-        departures.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
+        findings.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
     if data["controller_points"].shape[1] == 0:
-        departures.append(broken(path, "controller_points", "at least one controller point is required", "none"))
+        findings.append(broken(path, "controller_points", "at least one controller point is required", "none"))
     if frames < 2:
-        departures.append(broken(path, "object_points", "at least 2 frames are required", frames))
+        findings.append(broken(path, "object_points", "at least 2 frames are required", frames))
     hidden = np.flatnonzero(~data["object_visibilities"][0]) if frames else np.zeros(0, int)
     if len(hidden):
         rule = "every tracked point must be visible in frame 0, which is the rest state"
-        departures.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
-    return departures
+        findings.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
+    return findings
 
 
-def split_departures(path: Path, split: Any, frames: int) -> list[Departure]:
+def split_findings(path: Path, split: Any, frames: int) -> list[Finding]:
     """split.json against the number of frames: half-open ranges [start, end) inside [0, frames]."""
     if not isinstance(split, dict):
         return [broken(path, "", "a JSON object with train and test is required", type(split).__name__)]
-    departures = []
+    findings = []
     for key in ("train", "test"):
         value = split.get(key)
         if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)):
             received = value if key in split else "nothing"
-            departures.append(broken(path, key, "two whole numbers [start, end) are required", received))
+            findings.append(broken(path, key, "two whole numbers [start, end) are required", received))
         elif not 0 <= value[0] <= value[1] <= frames:
-            departures.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
+            findings.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
         elif key == "train" and value[1] < 2:
-            departures.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
-    if not departures:
-        departures += _split_warnings(path, split, frames)
-    return departures
+            findings.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
+    if not findings:
+        findings += _split_warnings(path, split, frames)
+    return findings
 
 
-def _split_warnings(path: Path, split: dict[str, Any], frames: int) -> list[Departure]:
+def _split_warnings(path: Path, split: dict[str, Any], frames: int) -> list[Finding]:
     end = int(0.7 * frames)
-    departures = []
+    findings = []
     for key, wanted in (("train", [0, end]), ("test", [end, frames])):
         if split[key] != wanted:
             meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
-            departures.append(unusual(path, key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
+            findings.append(unusual(path, key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
     if split.get("frame_len") != frames:
-        departures.append(unusual(path, "frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
-    return departures
+        findings.append(unusual(path, "frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
+    return findings
 
 
-def tracks_departures(path: Path, tracks: Any, frames: int | None) -> list[Departure]:
+def tracks_findings(path: Path, tracks: Any, frames: int | None) -> list[Finding]:
     """gt_track_3d.pkl: floating point [T, K, 3], NaN rows where not annotated. `frames` None skips the comparison of T."""
     if not isinstance(tracks, np.ndarray):
         return [broken(path, "", "an array [T, K, 3] is required", type(tracks).__name__)]
@@ -268,25 +268,23 @@ def tracks_departures(path: Path, tracks: Any, frames: int | None) -> list[Depar
         return [broken(path, "", "the shape must be [T, K, 3]", tracks.shape)]
     if tracks.dtype.kind != "f":
         return [broken(path, "", "the dtype must be floating point", tracks.dtype)]
-    departures = []
+    findings = []
     if frames is not None and len(tracks) != frames:
-        departures.append(broken(path, "", f"{FINAL_DATA} has {frames} frames", tracks.shape))
+        findings.append(broken(path, "", f"{FINAL_DATA} has {frames} frames", tracks.shape))
     if tracks.dtype != np.float64:
-        departures.append(unusual(path, "", "the released dtype is float64", tracks.dtype))
+        findings.append(unusual(path, "", "the released dtype is float64", tracks.dtype))
     infinite = np.argwhere(np.isinf(tracks))
     if len(infinite):
-        departures.append(
-            broken(path, "", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite))
-        )
+        findings.append(broken(path, "", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite)))
     missing = np.isnan(tracks)
     partial = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
     if len(partial):
         place = f"frame {partial[0][0]}, point {partial[0][1]} ({len(partial)} in all)"
-        departures.append(unusual(path, "", "a point is NaN in all three coordinates or in none", place))
-    return departures
+        findings.append(unusual(path, "", "a point is NaN in all three coordinates or in none", place))
+    return findings
 
 
-def frame_rate_departures(path: Path, metadata: Any) -> list[Departure]:
+def frame_rate_findings(path: Path, metadata: Any) -> list[Finding]:
     """The only field of metadata.json that the reader uses: fps, a positive number; 30 where absent."""
     if not isinstance(metadata, dict):
         return [broken(path, "", "a JSON object is required", type(metadata).__name__)]
@@ -312,7 +310,7 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     """Write `case` as a capture folder. Raises InputError naming file and key."""
     case = Path(case)
     metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    refuse(raw_departures(case, metadata, poses))
+    refuse(raw_findings(case, metadata, poses))
     frames = int(metadata["frame_num"])
     has_masks = (case / "mask").is_dir()
     description = Description(
@@ -351,26 +349,26 @@ def camera_count(case: Path) -> int:
     return len(intrinsics)
 
 
-def raw_departures(case: Path, metadata: Any, poses: Any) -> list[Departure]:
+def raw_findings(case: Path, metadata: Any, poses: Any) -> list[Finding]:
     """Frame rate, frame count and calibration in metadata.json and calibrate.pkl."""
     path = case / METADATA
-    departures = frame_rate_departures(path, metadata)
+    findings = frame_rate_findings(path, metadata)
     if not isinstance(metadata, dict):
-        return departures
+        return findings
     count, intrinsics = metadata.get("frame_num"), metadata.get("intrinsics")
     if type(count) is not int or count < 5:
-        departures.append(broken(path, "frame_num", "at least 5 frames are required", count))
-    departures += metadata_departures(path, metadata)
-    return departures + poses_departures(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
+        findings.append(broken(path, "frame_num", "at least 5 frames are required", count))
+    findings += metadata_findings(path, metadata)
+    return findings + poses_findings(case / CALIBRATION, poses, len(intrinsics) if isinstance(intrinsics, list) else None)
 
 
-def metadata_departures(file: Path, metadata: dict[str, Any], cameras: int | None = None) -> list[Departure]:
+def metadata_findings(file: Path, metadata: dict[str, Any], cameras: int | None = None) -> list[Finding]:
     """Image size and intrinsics of metadata.json. `cameras` is the required number of cameras; None allows any but zero."""
-    departures = []
+    findings = []
     size: Any = metadata.get("WH")
     has_size = isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)
     if not has_size:
-        departures.append(broken(file, "WH", "two positive whole numbers [width, height] are required", size))
+        findings.append(broken(file, "WH", "two positive whole numbers [width, height] are required", size))
     try:
         intrinsics = np.asarray(metadata.get("intrinsics"), dtype=np.float64)
     except (TypeError, ValueError):
@@ -378,33 +376,33 @@ def metadata_departures(file: Path, metadata: dict[str, Any], cameras: int | Non
     count = cameras or max(len(intrinsics) if intrinsics.ndim else 0, 1)
     if intrinsics.shape != (count, 3, 3) or not np.isfinite(intrinsics).all():
         rule = f"{cameras or 'one or more'} finite 3 x 3 matrices are required"
-        return [*departures, broken(file, "intrinsics", rule, f"shape {intrinsics.shape}")]
+        return [*findings, broken(file, "intrinsics", rule, f"shape {intrinsics.shape}")]
     for index, matrix in enumerate(intrinsics):
         key = f"intrinsics, camera {index}"
-        departures += intrinsics_departures(file, key, matrix, (size[0], size[1]) if has_size else None)
-    return departures
+        findings += intrinsics_findings(file, key, matrix, (size[0], size[1]) if has_size else None)
+    return findings
 
 
-def poses_departures(file: Path, poses: Any, cameras: int | None) -> list[Departure]:
+def poses_findings(file: Path, poses: Any, cameras: int | None) -> list[Finding]:
     """The matrices of calibrate.pkl. `cameras` is the required number of cameras; None skips the comparison."""
     if not isinstance(poses, (list, tuple)) or (cameras is not None and len(poses) != cameras):
         received = f"{type(poses).__name__} of {len(poses)}" if isinstance(poses, (list, tuple)) else type(poses).__name__
         return [broken(file, "", f"a list of {cameras or ''} camera-to-world matrices is required".replace("  ", " "), received)]
-    departures = []
+    findings = []
     for index, pose in enumerate(poses):
         key = f"camera {index}"
         if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or pose.dtype.kind != "f":
             received = f"{pose.shape} {pose.dtype}" if isinstance(pose, np.ndarray) else type(pose).__name__
-            departures.append(broken(file, key, "a (4, 4) floating point matrix is required", received))
+            findings.append(broken(file, key, "a (4, 4) floating point matrix is required", received))
             continue
         if pose.dtype != np.float64:
-            departures.append(unusual(file, key, "the released dtype is float64", pose.dtype))
-        departures += pose_departures(file, key, pose, BINARY_TOLERANCE)
-    return departures
+            findings.append(unusual(file, key, "the released dtype is float64", pose.dtype))
+        findings += pose_findings(file, key, pose, BINARY_TOLERANCE)
+    return findings
 
 
 def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera]:
-    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_departures` must have no errors."""
+    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_findings` must have no errors."""
     width, height = metadata["WH"]
     intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
     return [
@@ -442,7 +440,7 @@ def annotated(case: Path, frames: int) -> np.ndarray | None:
     if not path.exists():
         return None
     tracks = load_pickle(path)
-    refuse(tracks_departures(path, tracks, frames))
+    refuse(tracks_findings(path, tracks, frames))
     return np.asarray(tracks, dtype=float)
 
 
@@ -452,7 +450,7 @@ def train_end_of(case: Path, frames: int) -> int | None:
     if not path.exists():
         return None
     split = load_json(path)
-    refuse(split_departures(path, split, frames))
+    refuse(split_findings(path, split, frames))
     return int(split["train"][1])
 
 

@@ -1,6 +1,6 @@
 """A capture against the world, before any cost.
 
-- The table that each camera sees against z = 0 and `up`, and what explains a departure.
+- The table that each camera sees against z = 0 and `up`, and what explains a finding.
 - Object and hands of one camera, by masks and depth: size, height above the table, depth, and whether they meet.
 - Color alone: the table is z = 0 as the camera's pose says, and what lies on it is measured there.
 - Cameras against each other: a point that camera A measured is projected into camera B. Where B measured more depth there, B looked
@@ -20,9 +20,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from neuspring.core.artifacts import up_sign
-from neuspring.core.findings import Finding, finding
+from neuspring.core.findings import Finding, broken, finding, note, unusual
 from neuspring.data.capture import HANDS, OBJECT, Camera
-from neuspring.data.departure import Departure, broken, note, unusual
 from neuspring.data.intake.depth import FAR, NEAR, Plane
 from neuspring.data.intake.lenses import rigid_inverse
 
@@ -33,7 +32,7 @@ TILT, OFF = 2.0, 0.01
 TILTED, FAR_OFF = 15.0, 0.15
 """Degrees and m beyond which the table is elsewhere, and no twin can rest on it."""
 EXPLAINED = (4.0, 0.03)
-"""Degrees and m within which the table lies after a change that explains a departure; m also as a part of the camera's height."""
+"""Degrees and m within which the table lies after a change that explains a finding; m also as a part of the camera's height."""
 FACTORS = (0.1, 10.0, 0.001, 1000.0)
 """Wrong units of depth make the scene so many times as large."""
 HIGHEST = 3.0
@@ -68,9 +67,7 @@ def stand(plane: Plane, pose: np.ndarray, up: float, factor: float = 1.0) -> Sta
     return Stand(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), float(up * z))
 
 
-def table_departures(
-    path: Path, name: str, planes: Sequence[Plane], pose: np.ndarray, up: str, unit: float | None
-) -> list[Departure]:
+def table_findings(path: Path, name: str, planes: Sequence[Plane], pose: np.ndarray, up: str, unit: float | None) -> list[Finding]:
     """Departures of one camera's table from z = 0. `unit`, m per count, is None where depth is in meters by its type."""
     sign = up_sign(up)
     where = f"cameras.{name}.camera_to_world"
@@ -107,7 +104,7 @@ def _text(standing: Stand) -> str:
     return f"{1e3 * abs(standing.off):.0f} mm {side} z = 0 and tilted by {standing.tilt:.1f} degrees"
 
 
-def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Departure | None:
+def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Finding | None:
     """The one change that puts the table at z = 0, as an error; None if there is none."""
     sign = up_sign(up)
     where = f"cameras.{name}.camera_to_world"
@@ -285,7 +282,7 @@ def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(eye + np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[:, None] * rays)
 
 
-def alone_departures(path: Path, camera: Camera, up: str) -> list[Departure]:
+def color_alone_findings(path: Path, camera: Camera, up: str) -> list[Finding]:
     """Departures of a camera that is not above the table z = 0, or does not look at it; else a note on how far it is."""
     where, height = f"cameras.{camera.name}.camera_to_world", float(camera.camera_to_world[2, 3])
     if height * up_sign(up) <= 0:
@@ -305,8 +302,8 @@ def alone_departures(path: Path, camera: Camera, up: str) -> list[Departure]:
     return found
 
 
-def horizon_departures(path: Path, camera: Camera, mask: np.ndarray) -> list[Departure]:
-    """A departure of the object's mask [H, W] of frame 0 that reaches beyond the horizon, where no table is."""
+def horizon_findings(path: Path, camera: Camera, mask: np.ndarray) -> list[Finding]:
+    """A finding of the object's mask [H, W] of frame 0 that reaches beyond the horizon, where no table is."""
     own = object_on_table(camera, mask)
     beyond = int(np.isnan(own[:, 0]).sum())
     if not beyond:
@@ -357,7 +354,7 @@ FEWEST = 150
 STRIDE = 2
 
 
-def view_departures(path: Path, cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], up: str) -> list[Departure]:
+def view_findings(path: Path, cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], up: str) -> list[Finding]:
     """Departures of pairs of cameras by their depth images [H, W], m, of one frame."""
     found = []
     for one, two in combinations(depths, 2):

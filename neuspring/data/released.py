@@ -17,10 +17,10 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
+from neuspring.core.findings import Finding, broken, refuse, unusual
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera, read_array, read_image
-from neuspring.data.departure import Departure, broken, refuse, unusual
-from neuspring.data.phystwin import CALIBRATION, cameras_of, raw_departures
+from neuspring.data.phystwin import CALIBRATION, cameras_of, raw_findings
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
@@ -130,29 +130,29 @@ def _epoch(checkpoint: Path) -> int:
     return int(checkpoint.stem.removeprefix("best_"))
 
 
-def parameter_departures(path: Path, parameters: Any) -> list[Departure]:
+def parameter_findings(path: Path, parameters: Any) -> list[Finding]:
     """Keys and values of optimal_params.pkl."""
     if not isinstance(parameters, dict):
         return [broken(path, "", "a dict of 12 numbers is required", type(parameters).__name__)]
-    departures = []
+    findings = []
     for key in OPTIMAL_KEYS:
         value = parameters.get(key)
         if key not in parameters:
-            departures.append(broken(path, key, "this key is missing"))
+            findings.append(broken(path, key, "this key is missing"))
         elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
-            departures.append(broken(path, key, "a finite number is required", value))
+            findings.append(broken(path, key, "a finite number is required", value))
         elif key.endswith("neighbours") and value != int(value):
-            departures.append(broken(path, key, "a whole number is required", value))
+            findings.append(broken(path, key, "a whole number is required", value))
         elif key.endswith(("neighbours", "radius")) and value <= 0:
-            departures.append(broken(path, key, "a positive number is required", value))
-    departures += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
-    return departures
+            findings.append(broken(path, key, "a positive number is required", value))
+    findings += [unusual(path, str(key), "unknown key, not read") for key in parameters if key not in OPTIMAL_KEYS]
+    return findings
 
 
 def read_parameters(path: Path) -> dict[str, float]:
     """The numbers of optimal_params.pkl under their own names (`OPTIMAL_KEYS`): m, N, N s/m, 1/s, counts."""
     parameters = load_pickle(path)
-    refuse(parameter_departures(path, parameters))
+    refuse(parameter_findings(path, parameters))
     return {key: float(parameters[key]) for key in OPTIMAL_KEYS}
 
 
@@ -190,31 +190,31 @@ def read_checkpoint(path: Path) -> ReleasedCheckpoint:
     return ReleasedCheckpoint(object_springs=springs, stiffness=stiffness, contact=contact)
 
 
-def prediction_departures(path: Path, positions: Any, frames: int, nodes: int) -> list[Departure]:
+def prediction_findings(path: Path, positions: Any, frames: int, nodes: int) -> list[Finding]:
     """Shape, dtype and finiteness of inference.pkl."""
     shape = (frames, nodes, 3)
     if not isinstance(positions, np.ndarray) or positions.dtype.kind != "f" or positions.shape != shape:
         received = f"{positions.shape} {positions.dtype}" if isinstance(positions, np.ndarray) else type(positions).__name__
         return [broken(path, "", f"floating point positions of shape {shape} are required", received)]
-    departures = []
+    findings = []
     if positions.dtype != np.float32:
-        departures.append(unusual(path, "", "the released dtype is float32", positions.dtype))
+        findings.append(unusual(path, "", "the released dtype is float32", positions.dtype))
     if not np.isfinite(positions).all():
-        departures.append(broken(path, "", "every coordinate must be finite"))
-    return departures
+        findings.append(broken(path, "", "every coordinate must be finite"))
+    return findings
 
 
 def read_prediction(path: Path, frames: int, nodes: int) -> np.ndarray:
     """Node positions [T, N, 3], m, float32, of inference.pkl."""
     positions = load_pickle(path)
-    refuse(prediction_departures(path, positions, frames, nodes))
+    refuse(prediction_findings(path, positions, frames, nodes))
     return np.asarray(positions, dtype=np.float32)
 
 
 def read_cameras(folder: Path) -> list[Camera]:
     """The calibrated cameras of a case, from metadata.json and calibrate.pkl."""
     metadata, poses = load_json(folder / phystwin.METADATA), load_pickle(folder / CALIBRATION)
-    refuse(raw_departures(folder, metadata, poses))
+    refuse(raw_findings(folder, metadata, poses))
     return cameras_of(metadata, poses)
 
 

@@ -7,7 +7,7 @@ from neuspring.data.check import check_layout
 from neuspring.perception.marks.marks import MARKS, Marks
 from tests.benchmarks.footage import Points, film
 from tests.benchmarks.footage_captures import cases_of, category_of, points_of, write_capture
-from tests.support.departures import of_level
+from tests.support.findings import of_level
 from tests.support.real import FOOTAGE
 
 FRAMES = 5

@@ -1,4 +1,4 @@
-"""The layout check: a conforming data set has no errors or warnings; every departure is reported at once, with its level."""
+"""The layout check: a conforming data set has no errors or warnings; every finding is reported at once, with its level."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
+from neuspring.core.findings import broken, note, unusual
 from neuspring.data.check import check_layout, render
-from neuspring.data.departure import Departure
-from tests.support.departures import holds, of_level, serious
+from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 
 
 def test_a_conforming_case_has_only_notes(tmp_path: Path) -> None:
-    departures = check_layout(write_case(tmp_path))
-    assert serious(departures) == []
-    assert render(departures).endswith("0 errors, 0 warnings")
+    findings = check_layout(write_case(tmp_path))
+    assert serious(findings) == []
+    assert render(findings).endswith("0 errors, 0 warnings")
 
 
 @pytest.mark.parametrize("missing", ["gt_track_3d.pkl", "calibrate.pkl", "metadata.json"])
 def test_missing_optional_files_are_notes(tmp_path: Path, missing: str) -> None:
     folder = write_case(tmp_path)
     (folder / missing).unlink()
-    departures = check_layout(folder)
-    assert serious(departures) == []
-    assert holds(departures, "note", missing, "skipped")
+    findings = check_layout(folder)
+    assert serious(findings) == []
+    assert holds(findings, "note", missing, "skipped")
 
 
 def set_entry(key: str, index: Any, value: Any) -> Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]:
@@ -156,9 +156,9 @@ def test_departures_of_the_tracks(tmp_path: Path) -> None:
     tracks = np.zeros((9, 2, 3))
     tracks[1, 1, 0] = np.nan
     dump(folder / "gt_track_3d.pkl", tracks)
-    departures = check_layout(folder)
-    assert holds(departures, "error", "gt_track_3d.pkl", "10 frames")
-    assert holds(departures, "warning", "gt_track_3d.pkl", "frame 1, point 1")
+    findings = check_layout(folder)
+    assert holds(findings, "error", "gt_track_3d.pkl", "10 frames")
+    assert holds(findings, "warning", "gt_track_3d.pkl", "frame 1, point 1")
 
 
 def test_all_departures_are_reported_at_once(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:
     assert of_level(check_layout(first), "error") == []
     for folder in (first.parent, tmp_path):
         errors = [d for d in check_layout(folder) if d.level == "error"]
-        assert [d.file for d in errors] == [second / "final_data.pkl"]
+        assert [d.where for d in errors] == [str(second / "final_data.pkl")]
 
 
 def test_folders_without_data_are_refused(tmp_path: Path) -> None:
@@ -204,6 +204,6 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
 
 def test_render_groups_by_file() -> None:
     one, two = Path("b.pkl"), Path("a.pkl")
-    text = render([Departure(one, "error", "x"), Departure(two, "note", "y"), Departure(one, "warning", "z")])
+    text = render([broken(one, "", "x"), note(two, "y"), unusual(one, "", "z")])
     assert text == "a.pkl\n  note     y\nb.pkl\n  error    x\n  warning  z\n1 error, 1 warning"
     assert render([]) == "0 errors, 0 warnings"

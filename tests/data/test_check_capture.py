@@ -1,4 +1,4 @@
-"""check-data on capture folders: a good one has no errors; each departure names file, rule and value."""
+"""check-data on capture folders: a good one has no errors; each finding names file, rule and value."""
 
 import json
 
@@ -8,8 +8,8 @@ import pytest
 
 from neuspring.data.capture import CAPTURE
 from neuspring.data.check import check_layout
-from tests.support.departures import of_level, serious
 from tests.support.filmed import film
+from tests.support.findings import of_level, serious
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from neuspring.perception.backends import BACKENDS
 from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.marks.store import film_of, save_masks
 from tests.support.board import BOARD, LENS, board_image
-from tests.support.departures import holds, of_level, serious
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses, write_video
+from tests.support.findings import holds, of_level, serious
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From a world with z up to one with z down."""

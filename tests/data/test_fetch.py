@@ -232,7 +232,7 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
     server: StandIn, released: dict[str, bytes], tmp_path: Path
 ) -> None:
     lines, say = said()
-    departures = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say, check=check)
+    findings = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say, check=check)
     expected = {}
     for content in released.values():
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -240,7 +240,7 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
     assert files(tmp_path) == expected
     row = ScenarioRow(scenario=CASE, source="phystwin", category="rope", path=CASE, self_collision=False, ground=True)
     assert phystwin.read(row, tmp_path / "data" / "different_types" / CASE).object_points.shape == (50, 1630, 3)
-    refused = {d.file.name for d in departures if d.level == "error" and CASE in str(d.file)}
+    refused = {Path(d.where).name for d in findings if d.level == "error" and CASE in d.where}
     assert refused == {"inference.pkl", "optimal_params.pkl"}  # random bytes here: check-data has looked at them
     record = json.loads((tmp_path / RECORD).read_text())["fetched"]
     assert {entry["archive"]: entry["sha256"] for entry in record} == {
@@ -251,9 +251,9 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
 
 
 def test_a_fetched_case_passes_check_data(server: StandIn, tmp_path: Path) -> None:
-    departures = fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint, check=check)
-    assert {d.level for d in departures} == {"note"}
-    assert not [d for d in departures if "not one of the 22" in d.message]
+    findings = fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint, check=check)
+    assert {d.level for d in findings} == {"note"}
+    assert not [d for d in findings if "not one of the 22" in d.message]
 
 
 def test_one_scenario_costs_neither_the_other_nor_the_other_archives(server: StandIn, tmp_path: Path) -> None:
@@ -416,9 +416,9 @@ def test_other_folders_around_the_cases_are_found_out(server: StandIn, tmp_path:
 
 def test_what_an_archive_lacks_is_said(server: StandIn, tmp_path: Path) -> None:
     lines, say = said()
-    departures = fetch(tmp_path, [CASE, "single_push_rope"], ["data"], endpoint=server.endpoint, say=say)
+    findings = fetch(tmp_path, [CASE, "single_push_rope"], ["data"], endpoint=server.endpoint, say=say)
     assert any("has no data (data/different_types) of single_push_rope" in line for line in lines)
-    assert [d.file.name for d in departures if "processed data are required" in d.message] == ["single_push_rope"]
+    assert [Path(d.where).name for d in findings if "processed data are required" in d.message] == ["single_push_rope"]
     with pytest.raises(InputError, match="First paths in the archive: data/different_types/"):
         fetch(tmp_path, ["single_push_rope"], ["data"], endpoint=server.endpoint)
 

@@ -198,9 +198,9 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
     data[30, :, [4, 5]] = data[30, :, [5, 4]]
     path = write(tmp_path, data.tolist())
     for target in (path, tmp_path):
-        departures = check_layout(target)
-        assert [d.level for d in departures] == ["warning"]
-        assert "in frame 30" in departures[0].message
+        findings = check_layout(target)
+        assert [d.level for d in findings] == ["warning"]
+        assert "in frame 30" in findings[0].message
     assert [d.message for d in mocap.check_mocap(write(tmp_path, recording(samples=400)))] == [
         "released recordings have 500 samples; received 400"
     ]

@@ -23,8 +23,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
-from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_departures, pose_departures
-from neuspring.data.departure import refuse
+from neuspring.core.findings import refuse
+from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_findings, pose_findings
 from neuspring.data.intake.images import Lens
 
 MATRIX = ("K", "intrinsics", "camera_matrix")
@@ -61,7 +61,7 @@ def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
         key = f"{keys[0]}, camera {name}"
         matrix = _numbers(path, key, listed, ((4, 4), (3, 4)))
         matrix = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]]) if len(matrix) == 3 else matrix
-        refuse(pose_departures(path, key, matrix, TEXT_TOLERANCE))
+        refuse(pose_findings(path, key, matrix, TEXT_TOLERANCE))
         poses[name] = matrix if keys[0] == DIRECTIONS[0] else rigid_inverse(matrix)
         distance = float(np.linalg.norm(matrix[:3, 3]))
         if distance > FARTHEST:
@@ -85,7 +85,7 @@ def require_lens(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> N
         remedy = f"Scale fx and cx by {factor:.4g}, fy and cy by {size[1] / lens.size[1]:.4g}, if the images were only resized."
         rule = f"camera {name}: width and height must be those of its images, {size[0]} x {size[1]}"
         raise InputError(where, rule, f"{lens.size[0]} x {lens.size[1]}", remedy)
-    refuse(intrinsics_departures(where, f"intrinsics of camera {name}", lens.matrix, size))
+    refuse(intrinsics_findings(where, f"intrinsics of camera {name}", lens.matrix, size))
     for side, pixels, focal in zip(("width", "height"), size, np.diag(lens.matrix)[:2], strict=True):
         view = float(np.degrees(2 * np.arctan(0.5 * pixels / focal)))
         if not NARROWEST < view < WIDEST:

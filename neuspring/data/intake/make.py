@@ -16,10 +16,10 @@ from pydantic import TypeAdapter
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
+from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
-from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, Capture, Description, Writer, description_departures
-from neuspring.data.departure import refuse
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, Capture, Description, Writer, description_findings
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.images import CameraFeed, Paired
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
@@ -119,7 +119,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         }
     }
     made = parse(Description, description, "make-capture")
-    refuse(description_departures(Path("make-capture"), made))
+    refuse(description_findings(Path("make-capture"), made))
     _write(intake, made, choice, unit, seen, placed)
     jumps = [f"warning: time jumps at {choice.jumps} places, where frame numbers are left out"] if choice.jumps else []
     remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]

@@ -14,8 +14,8 @@ import numpy as np
 
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
+from neuspring.core.findings import refuse
 from neuspring.data.capture import Camera
-from neuspring.data.departure import refuse
 from neuspring.data.intake.depth import (
     Plane,
     Unit,
@@ -30,7 +30,7 @@ from neuspring.data.intake.depth import (
 )
 from neuspring.data.intake.images import CameraFeed, Lens, Pair, open_images
 from neuspring.data.intake.lenses import Board, Sighting, Straightener, depth_ratio, require_lens, sight
-from neuspring.data.plausible_world import alone_departures, table_departures
+from neuspring.data.plausible_world import color_alone_findings, table_findings
 
 FEWEST = 5
 """Frames of a capture."""
@@ -280,9 +280,7 @@ def stand(
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     found = {name: planes(points) for name, points in clouds.items()}
     judged = {
-        side: [
-            d for name, view in seen.items() for d in table_departures(view.path, name, found[name], moved[name], side, view.unit)
-        ]
+        side: [d for name, view in seen.items() for d in table_findings(view.path, name, found[name], moved[name], side, view.unit)]
         for side in ([up] if up else ["+z", "-z"])
     }
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
@@ -299,7 +297,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = alone_departures(where, Camera(name, *view.size, view.lens.matrix, pose), up)
+    judged = color_alone_findings(where, Camera(name, *view.size, view.lens.matrix, pose), up)
     refuse([d for d in judged if d.level == "error"])
     lines = tuple(f"{'warning: ' if d.level == 'warning' else ''}{d.message}" for d in judged)
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=lines)

@@ -18,11 +18,11 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
+from neuspring.core.findings import refuse
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera
-from neuspring.data.departure import refuse
 from neuspring.data.intake.images import CameraFeed, Lens, Paired, open_images
-from neuspring.data.phystwin import CALIBRATION, annotated, cameras_of, detections, labels_of, raw_departures, train_end_of
+from neuspring.data.phystwin import CALIBRATION, annotated, cameras_of, detections, labels_of, raw_findings, train_end_of
 from neuspring.data.unpickle import load_pickle
 
 MODULE = "pyrealsense2"
@@ -174,7 +174,7 @@ class Raw:
     def open(cls, case: Path) -> Raw:
         """Read its calibration. Raises InputError."""
         metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / CALIBRATION)
-        refuse(raw_departures(case, metadata, poses))
+        refuse(raw_findings(case, metadata, poses))
         cameras = {camera.name: camera for camera in cameras_of(metadata, poses)}
         views: list[CameraFeed] = [
             Paired(

@@ -43,7 +43,7 @@ def require(root: Path, *paths: Path) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class Comparison:
     """One line of a check."""
 
     check: int
@@ -70,7 +70,7 @@ class Finding:
         """Ours minus the published number."""
         return None if self.ours is None or self.published is None else self.ours - self.published
 
-    def against(self, published: float, tolerance: float) -> Finding:
+    def against(self, published: float, tolerance: float) -> Comparison:
         """The finding with its verdict: passed or failed, by the tolerance."""
         assert self.ours is not None
         good = abs(self.ours - published) <= tolerance  # false for NaN
@@ -130,8 +130,8 @@ class Tools:
 
 
 def of_scores(
-    base: Finding, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
-) -> list[Finding]:
+    base: Comparison, scores: pd.DataFrame, metrics: Sequence[str], published: Published, missing: Mapping[str, str]
+) -> list[Comparison]:
     """Findings for tidy scores of one scenario, with check, scenario and file of `base`.
 
     `missing`: metric -> the reason why it has no score.
@@ -153,13 +153,13 @@ def of_scores(
     return findings
 
 
-def _judged(score: Finding, reference: Reference | None) -> Finding:
+def _judged(score: Comparison, reference: Reference | None) -> Comparison:
     if reference is None:
         return score
     return score.against(reference.value, max(METRICS[score.quantity].tolerance, reference.half_digit))
 
 
-def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]:
+def of_means(findings: Iterable[Comparison], published: Published) -> list[Comparison]:
     """Findings about means over scenarios. Only means over the complete set are compared with the published ones."""
     rows = [
         {"check": f.check, "scenario": f.scenario, "seed": 0, "task": f.task, "metric": f.quantity, "value": f.ours}
@@ -177,7 +177,7 @@ def of_means(findings: Iterable[Finding], published: Published) -> list[Finding]
     return means
 
 
-def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) -> Finding:
+def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) -> Comparison:
     """The mean of one metric in one task; `row` is its average, `scores` are the scores of the scenarios."""
     weighted = METRICS[row["metric"]].average == "frames"
     references = published.means(row["task"], row["metric"])
@@ -187,7 +187,7 @@ def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) ->
         note += f"; published {references[0].value:g} over {len(published.scenarios)}"
     elif len(references) > 1:
         note += f"; paper: {references[1].value:g}"
-    mean = Finding(
+    mean = Comparison(
         check=row["check"],
         scenario=MEAN,
         quantity=row["metric"],

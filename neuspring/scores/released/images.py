@@ -28,7 +28,7 @@ from neuspring.data.released import (
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.pictures import Pair, picture_scores
-from neuspring.scores.released.findings import Absent, Finding, Tools, of_scores, require
+from neuspring.scores.released.findings import Absent, Comparison, Tools, of_scores, require
 from neuspring.splats.draw import COVERED, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
 
@@ -46,7 +46,7 @@ LIFTED = 1e-4
 TRUE, MIRRORED = "c_x", "W - c_x"
 
 
-def deprojection(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+def deprojection(case: Released, observations: Observations, _: Tools) -> list[Comparison]:
     """Check 4: lifting the tracked pixels of frame 0 with one of two principal points must give the released points.
 
     Every released point of frame 0 must have a lifted one close to it, over all cameras. The converse would not hold: the released
@@ -69,7 +69,7 @@ def deprojection(case: Released, observations: Observations, _: Tools) -> list[F
     for convention, residual in residuals.items():
         quantity = f"distance to the points lifted with {convention}"
         file = case.pixel_tracks(cameras[0].name)
-        finding = Finding(check=4, scenario=case.name, quantity=quantity, unit="m", ours=residual, file=file)
+        finding = Comparison(check=4, scenario=case.name, quantity=quantity, unit="m", ours=residual, file=file)
         if convention == better:
             note = f"the data follow {convention}" if residual <= LIFTED else "neither fits"
             finding = replace(finding, note=note).against(0.0, LIFTED)
@@ -77,14 +77,14 @@ def deprojection(case: Released, observations: Observations, _: Tools) -> list[F
     return findings
 
 
-def renderer(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
+def renderer(case: Released, observations: Observations, tools: Tools) -> list[Comparison]:
     """Check 5: the released splats, moved by the released prediction, drawn and scored as released."""
     calibration = (case.folder / phystwin.METADATA, case.folder / CALIBRATION)
     require(case.root, case.splats, case.prediction, case.object_masks, case.human_masks, case.colors, *calibration)
     rows = frame_scores(case, observations, tools.lpips, tools.device)
     scores = metrics.score_images(rows, observations.scenario, observations.scenario.frame_count, "released", 0)
     missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
-    return of_scores(Finding(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
+    return of_scores(Comparison(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
 
 
 def frame_scores(

@@ -14,7 +14,7 @@ from neuspring.data import phystwin
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released, ReleasedCheckpoint, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
-from neuspring.scores.released.findings import Finding, Tools, of_scores, require
+from neuspring.scores.released.findings import Tools, of_scores, require
 from neuspring.twin.candidates import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.rollout import simulate
 from neuspring.twin.topology import uniform_topology
@@ -27,7 +27,7 @@ SPREAD = 10.0
 not defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
 
 
-def sizes(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+def sizes(case: Released, observations: Observations, _: Tools) -> list[Comparison]:
     """Check 1: sizes of the case against the table of released cases."""
     row = released_cases().get(case.name)
     quantities = {
@@ -38,7 +38,7 @@ def sizes(case: Released, observations: Observations, _: Tools) -> list[Finding]
     }
     findings = []
     for name, count in quantities.items():
-        finding = Finding(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / phystwin.FINAL_DATA)
+        finding = Comparison(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / phystwin.FINAL_DATA)
         if row is None:
             finding = replace(finding, note="not one of the 22 released cases")
         elif row[name]:
@@ -47,7 +47,7 @@ def sizes(case: Released, observations: Observations, _: Tools) -> list[Finding]
     return findings
 
 
-def first_frame(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+def first_frame(case: Released, observations: Observations, _: Tools) -> list[Comparison]:
     """Check 1: frame 0 of the released prediction is [object_points[0] | surface_points | interior_points] in float32."""
     positions = _prediction(case, observations)
     different = np.flatnonzero((positions[0] != observations.nodes).any(axis=1))
@@ -55,11 +55,11 @@ def first_frame(case: Released, observations: Observations, _: Tools) -> list[Fi
     if len(different):
         largest = float(np.abs(positions[0] - observations.nodes).max())
         note += f"; first other node {different[0]}, largest difference {largest:.3g} m"
-    finding = Finding(check=1, scenario=case.name, quantity="other nodes in frame 0", note=note, file=case.prediction)
+    finding = Comparison(check=1, scenario=case.name, quantity="other nodes in frame 0", note=note, file=case.prediction)
     return [replace(finding, ours=len(different)).against(0, 0)]
 
 
-def topology(case: Released, observations: Observations, _: Tools) -> list[Finding]:
+def topology(case: Released, observations: Observations, _: Tools) -> list[Comparison]:
     """Check 2: the rebuilt springs against the checkpoint and the table of released cases, which also knows the best epoch."""
     require(case.root, case.parameters, case.checkpoint)
     parameters, checkpoint = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
@@ -73,24 +73,24 @@ def topology(case: Released, observations: Observations, _: Tools) -> list[Findi
         counts.append(("springs", len(rebuilt.springs), int(row["springs"]), "the table of released cases"))
         counts.append(("best epoch", case.epoch, int(row["best_epoch"]), "the table of released cases"))
     return [
-        Finding(check=2, scenario=case.name, quantity=name, ours=ours, note=f"against {source}", file=case.checkpoint).against(
+        Comparison(check=2, scenario=case.name, quantity=name, ours=ours, note=f"against {source}", file=case.checkpoint).against(
             theirs, 0
         )
         for name, ours, theirs, source in counts
     ]
 
 
-def evaluator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
+def evaluator(case: Released, observations: Observations, tools: Tools) -> list[Comparison]:
     """Check 3: our metrics of the released prediction."""
     positions = _prediction(case, observations)
     trajectory = Trajectory(positions=positions, frame_count=len(positions))
     scores = metrics.score(trajectory, observations, "released", 0)
     missing = {} if observations.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
-    base = Finding(check=3, scenario=case.name, quantity="", file=case.prediction)
+    base = Comparison(check=3, scenario=case.name, quantity="", file=case.prediction)
     return of_scores(base, scores, DISTANCES, tools.published, missing)
 
 
-def simulator(case: Released, observations: Observations, tools: Tools) -> list[Finding]:
+def simulator(case: Released, observations: Observations, tools: Tools) -> list[Comparison]:
     """Check 6: replays of the checkpoint against the released prediction.
 
     One replay truncates the dampings to whole numbers, as the released code does; one does not. A third with the nodes in another
@@ -191,7 +191,7 @@ def _distances(label: str, apart: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, order: np.ndarray) -> list[Finding]:
+def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, order: np.ndarray) -> list[Comparison]:
     """The mean distance, judged in its worst frame relative to the allowance there, and the largest distance, measured."""
     (name, mean), (other, largest) = _distances(label, _apart(own.positions, released)).items()
     # Until the next frame: which of two replays flips a contact first is chance.
@@ -206,12 +206,12 @@ def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, 
     return [judged, _largest(scenario, other, largest, overflow)]
 
 
-def _largest(scenario: str, quantity: str, per_frame: np.ndarray, note: str = "") -> Finding:
+def _largest(scenario: str, quantity: str, per_frame: np.ndarray, note: str = "") -> Comparison:
     return _at(scenario, quantity, per_frame, int(np.argmax(per_frame)), note)
 
 
-def _at(scenario: str, quantity: str, per_frame: np.ndarray, frame: int, note: str) -> Finding:
+def _at(scenario: str, quantity: str, per_frame: np.ndarray, frame: int, note: str) -> Comparison:
     """A distance in one frame, measured."""
     note = "; ".join(filter(None, (f"frame {frame}", note)))
     value = float(per_frame[frame])
-    return Finding(check=6, scenario=scenario, quantity=quantity, unit="m", ours=value, note=note, per_frame=per_frame)
+    return Comparison(check=6, scenario=scenario, quantity=quantity, unit="m", ours=value, note=note, per_frame=per_frame)

@@ -22,7 +22,7 @@ from neuspring.data.released import Released
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
 from neuspring.scores.released import images, physics
-from neuspring.scores.released.findings import MEAN, Absent, Finding, Outcome, Published, Tools, of_means, require
+from neuspring.scores.released.findings import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
 
 CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",
@@ -46,7 +46,7 @@ SELF_COLLIDING = ("cloth", "package")
 class Report:
     """All findings, and the report as text."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Comparison, ...]
     text: str
 
     @property
@@ -80,7 +80,7 @@ def verify_released(
     device = resolve_device(device)
     metric = _metric(lpips or LpipsWeights(), device) if 5 in checks else ""
     tools = Tools(published=published or Published.load(), device=device, lpips=metric)
-    names, findings = list(dict.fromkeys(scenarios)) or present, list[Finding]()
+    names, findings = list(dict.fromkeys(scenarios)) or present, list[Comparison]()
     progress = Progress("verify", len(names), every=0.0)
     for done, name in enumerate(names, start=1):
         case = Released(root=root, name=name)
@@ -97,7 +97,7 @@ def verify_released(
     return report
 
 
-def _report(findings: Sequence[Finding], names: Sequence[str], tools: Tools) -> Report:
+def _report(findings: Sequence[Comparison], names: Sequence[str], tools: Tools) -> Report:
     complete = (*findings, *of_means(findings, tools.published))
     return Report(findings=complete, text=_text(complete, names, tools.published, tools.device))
 
@@ -118,12 +118,12 @@ def _present(root: Path) -> list[str]:
     return names
 
 
-def check_case(case: Released, observations: Observations | Exception, checks: Sequence[int], tools: Tools) -> list[Finding]:
+def check_case(case: Released, observations: Observations | Exception, checks: Sequence[int], tools: Tools) -> list[Comparison]:
     """The findings of `checks` for one case. A check that cannot be carried out has one finding, skipped or failed.
 
     `observations`: the processed case, or the exception of `read_observations`.
     """
-    findings = list[Finding]()
+    findings = list[Comparison]()
     for check in checks:
         for function in _FUNCTIONS[check]:
             findings += _guarded(function, check, case, observations, tools)
@@ -144,7 +144,7 @@ def read_observations(case: Released) -> Observations:
     return phystwin.read(row, case.folder)
 
 
-_Check = Callable[[Released, Observations, Tools], list[Finding]]
+_Check = Callable[[Released, Observations, Tools], list[Comparison]]
 _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
     1: (physics.sizes, physics.first_frame),
     2: (physics.topology,),
@@ -155,8 +155,10 @@ _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
 }
 
 
-def _guarded(function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools) -> list[Finding]:
-    blank = Finding(check=check, scenario=case.name, quantity=CHECKS[check])
+def _guarded(
+    function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools
+) -> list[Comparison]:
+    blank = Comparison(check=check, scenario=case.name, quantity=CHECKS[check])
     try:
         if isinstance(observations, Exception):
             raise observations
@@ -181,7 +183,7 @@ def _write(report: Report, output: Path) -> None:
     write_text(output / "verify.md", report.text)
 
 
-def _text(findings: Sequence[Finding], names: Sequence[str], published: Published, device: str) -> str:
+def _text(findings: Sequence[Comparison], names: Sequence[str], published: Published, device: str) -> str:
     """The report in Markdown: counts, means, every check, and what was skipped and why."""
     there, missing = published.scenarios & set(names), sorted(published.scenarios - set(names))
     of = f"{len(there)} of the {len(published.scenarios)} that means were published over"
@@ -206,7 +208,7 @@ def _text(findings: Sequence[Finding], names: Sequence[str], published: Publishe
     return "\n".join([*lines, "", _verdict(findings), ""])
 
 
-def _counts(findings: Sequence[Finding]) -> list[str]:
+def _counts(findings: Sequence[Comparison]) -> list[str]:
     rows = []
     for check, title in CHECKS.items():
         outcomes = Counter(finding.outcome for finding in findings if finding.check == check)
@@ -215,7 +217,7 @@ def _counts(findings: Sequence[Finding]) -> list[str]:
     return markdown(["Check", *(name.capitalize() for name in OUTCOMES)], rows)
 
 
-def _table(findings: Sequence[Finding]) -> list[str]:
+def _table(findings: Sequence[Comparison]) -> list[str]:
     header = ["Scenario", "Quantity", "Ours", "Published", "Difference", "Tolerance", "Unit", "Outcome", "Note"]
     rows = []
     for f in findings:
@@ -225,7 +227,7 @@ def _table(findings: Sequence[Finding]) -> list[str]:
     return markdown(header, rows)
 
 
-def _conventions(findings: Sequence[Finding]) -> list[str]:
+def _conventions(findings: Sequence[Comparison]) -> list[str]:
     """How many scenarios follow which convention."""
     counts = Counter(finding.note for finding in findings if finding.note)
     return ["", *(f"- {note}: {count} of {counts.total()} scenarios" for note, count in sorted(counts.items()))]
@@ -235,7 +237,7 @@ def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:d}" if isinstance(value, int) else f"{value:.6g}"
 
 
-def _reasons(findings: Sequence[Finding]) -> list[str]:
+def _reasons(findings: Sequence[Comparison]) -> list[str]:
     """One line per check and reason, with the scenarios that it holds for."""
     groups: dict[tuple[int, str], list[str]] = {}
     for f in findings:
@@ -245,7 +247,7 @@ def _reasons(findings: Sequence[Finding]) -> list[str]:
     return [f"- {check}: {reason} ({len(names)}: {', '.join(names)})" for (check, reason), names in sorted(groups.items())]
 
 
-def _verdict(findings: Sequence[Finding]) -> str:
+def _verdict(findings: Sequence[Comparison]) -> str:
     outcomes = Counter(finding.outcome for finding in findings)
     counts = ", ".join(f"{outcomes[name]} {name}" for name in OUTCOMES)
     failed = sorted({f"{f.scenario} ({f.check})" for f in findings if f.outcome == "failed"})

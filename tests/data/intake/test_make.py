@@ -17,8 +17,8 @@ from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import RECIPE, Intake, make_capture
 from tests.support import realsense
 from tests.support.board import BOARD, LENS, board_image, depth_of_table
-from tests.support.departures import serious
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
+from tests.support.findings import serious
 
 ABOUT = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "ppx": 39.5, "ppy": 29.5, "coeffs": [0.0] * 5}
 

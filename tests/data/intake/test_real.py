@@ -8,7 +8,7 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.data.capture import Capture
 from neuspring.data.check import check_layout
-from tests.support.departures import serious
+from tests.support.findings import serious
 from tests.support.real import PLUSH
 
 

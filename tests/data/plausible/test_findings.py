@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake.lenses import rigid_inverse
-from tests.support.departures import of_level, serious
 from tests.support.filmed import film
+from tests.support.findings import of_level, serious
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -26,7 +26,7 @@ from neuspring.data.released import (
 )
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
-from neuspring.scores.released.findings import MEAN, Finding, Published, of_means
+from neuspring.scores.released.findings import MEAN, Comparison, Published, of_means
 from neuspring.scores.released.images import RELEASED, frame_scores
 from neuspring.scores.released.run import CHECKS, Report, read_observations, verify_released
 from tests.support.phystwin_case import dump, edit, stored
@@ -390,7 +390,7 @@ def test_means_over_some_scenarios_are_not_held_against_those_over_all(case, pub
 
 def test_means_weigh_scenarios_for_distances_and_frames_for_pictures(published):
     findings = [
-        Finding(check=check, scenario=name, quantity=metric, task="future", ours=value, frames=frames)
+        Comparison(check=check, scenario=name, quantity=metric, task="future", ours=value, frames=frames)
         for name, value, frames in (("a", 1.0, 10), ("b", 4.0, 20))
         for check, metric in ((3, "chamfer"), (5, "psnr"))
     ]
