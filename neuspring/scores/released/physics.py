@@ -14,7 +14,7 @@ from neuspring.data import phystwin
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released, ReleasedCheckpoint, read_checkpoint, read_parameters, read_prediction
 from neuspring.scores import metrics
-from neuspring.scores.released.findings import Tools, of_scores, require
+from neuspring.scores.released.findings import Comparison, Tools, of_scores, require
 from neuspring.twin.candidates import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.rollout import simulate
 from neuspring.twin.topology import uniform_topology
