@@ -16,7 +16,7 @@ from neuspring.perception.controllers import choose_controllers, fill_rigidly, h
 from neuspring.perception.results import Masks, PixelTracks
 from tests.support.captures import FRAMES, describe, entry
 
-SETTINGS = Lift(neighborhood=0.03, outlier_neighbors=460.0, least_controllers=3, controllers=4)
+SETTINGS = Lift(neighborhood=0.045, outlier_neighbors=460.0, least_controllers=3, controllers=4)
 
 NEAR = np.zeros((1, 3))
 """An object's cloud, for hands whose distance from it does not matter."""
