@@ -51,9 +51,9 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, op
     return field(metadata=metadata, default_factory=lambda: np.zeros(empty, dtype))
 
 
-def number(unit: str, doc: str) -> Any:
-    """Declare a number: unit, meaning."""
-    return field(metadata={"unit": unit, "doc": doc})
+def number(unit: str, doc: str, **default: float) -> Any:
+    """Declare a number: unit, meaning, and a `default` where it may be left out."""
+    return field(metadata={"unit": unit, "doc": doc}, **default)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ RELEASED_CHECKPOINT_EPOCHS = 20
 
 
 _Motion = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]
-"""x [N, 3] m, v [N, 3] m/s, and rest lengths of grips that have begun (grips.py)."""
+"""x [N, 3] m, v [N, 3] m/s, and rest lengths of grips that have begun (controllers.py)."""
 
 
 class NonFinite(ArithmeticError):
