@@ -3,7 +3,7 @@
     settings                       the whole configuration (`Config`)
     simulation, search, twin       integration; the zero-order search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
-    baselines, spring_gaus, gs_dynamics
+    baselines                      Spring-Gaus, GS-Dynamics
     gpus, tuning                   sharing GPUs; sweeps over settings
     rows                           rows of the scenario, method and search tables
     parse                          YAML to settings and back

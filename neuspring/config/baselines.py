@@ -1,12 +1,119 @@
-"""Settings of the baseline models, which learn or need no spring-mass twin: `model` of a method row names one."""
+"""Settings of the baseline models, which learn or need no spring-mass twin: `model` of a method row names one.
+
+Both are adapted to captures with hands. The defaults are those of the public code where it says anything.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-from neuspring.config.gs_dynamics import GsDynamics
-from neuspring.config.spring_gaus import SpringGaus
-from neuspring.config.types import Section
+from pydantic import Field
+
+from neuspring.config.types import Count, NonNegative, Positive, Section
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringGaus(Section):
+    """Anchors with directed springs, trained on masks, or, as a variant, on points."""
+
+    supervision: Literal["masks", "points"] = "masks"
+    """masks: silhouettes of the splats, as published. points: the Chamfer and track losses of the other methods, with anchors drawn
+    from the structure points; this needs no images."""
+    anchors: Count = 1024
+    """Number N of anchors, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are too few cells."""
+    neighbors: Count = 20
+    """Number K of nearest anchors that an anchor feels."""
+    full_neighbors: Count = 16
+    """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
+    bound_anchors: Count = 16
+    """Number of nearest anchors that a splat or a structure point follows."""
+    link_stiffness: NonNegative = 3e4
+    """Stiffness of the links, N per unit strain at 1 kg; it is not trained."""
+    stiffness: Positive = 2000.0
+    """Stiffness 10^kappa at the start, N at 1 kg."""
+    damping: Positive = 0.2
+    """Damping zeta at the start, N s at 1 kg."""
+    substeps: Count = 50
+    """Substeps per frame at the start."""
+    substeps_added: Count = 50
+    """Substeps that are added at each of `substeps_raised`, and whenever a frame fails."""
+    substeps_raised: tuple[Count, ...] = (25, 50)
+    """Iterations from which there are more substeps."""
+    max_substeps: Count = 1000
+    """Largest number of substeps; if a frame fails with so many, training ends as a failure of the run."""
+    iterations: Count = 100
+    """Passes over the training frames, with an optimizer step per frame."""
+    stiffness_rate: Positive = 1e-3
+    """Adam's learning rate of kappa."""
+    damping_rate: Positive = 1e-4
+    """Adam's learning rate of exp(zeta)."""
+    velocity_rate: Positive = 2.5e-4
+    """Adam's learning rate of the initial velocity, which all anchors share, m/s."""
+    vgg16: str | None = None
+    """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
+    downloaded."""
+    checkpoint_every: Annotated[int, Field(ge=1)] = 5
+    """Iterations between checkpoints from which a killed job continues."""
+
+    def __post_init__(self) -> None:
+        if self.full_neighbors > self.neighbors:
+            raise ValueError(f"full_neighbors: at most neighbors ({self.neighbors}), received {self.full_neighbors}")
+        if self.max_substeps < self.substeps:
+            raise ValueError(f"max_substeps: at least substeps ({self.substeps}), received {self.max_substeps}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GsDynamics(Section):
+    """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion."""
+
+    preset: Literal["auto", "rope", "animals", "cloth"] = "auto"
+    """Public configuration from which keys that are null take their values. auto: by the scenario's category: rope and DLO cables
+    take rope, cloth and package take cloth, all others take animals."""
+    radius: Positive | None = None
+    """Distance below which nodes feel each other, m. rope 0.08, animals 0.08, cloth 0.075."""
+    neighbors: Count | None = None
+    """Number k of nearest particles that a particle feels, itself included. rope 5, animals 6, cloth 6."""
+    particles: Count | None = None
+    """Largest number of particles of a graph. rope 100, animals 100, cloth 150."""
+    noise: NonNegative | None = None
+    """Half width of the uniform noise that training adds to positions in the history, m. rope 0.003, animals 0.003, cloth 0.002."""
+    length_weight: NonNegative | None = None
+    """Weight lambda of the length loss. rope 0.1, animals 0.05, cloth 0.1."""
+    batch: Count | None = None
+    """Windows per update. rope 16, animals 64, cloth 64."""
+    width: Count = 512
+    """Units of all hidden layers."""
+    future: Count = 5
+    """Steps that training predicts in a row."""
+    step: Positive = 0.01
+    """Motion of the tools that makes a step, m."""
+    coverage: NonNegative = 0.03
+    """Distance, m: no more particles are added once every point lies within it of a particle."""
+    dense_points: Count = 1000
+    """Largest number of tracks from which particles are drawn."""
+    smoothing_passes: Annotated[int, Field(ge=0)] = 10
+    """Passes of a moving average over three frames on the visible part of tracks, within the training frames."""
+    outlier_deviations: NonNegative = 3.0
+    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
+    drops none."""
+    min_visible: Count = 20
+    """Smallest number of tracks that must be seen in all frames of a window. Where fewer are, the window takes the tracks seen in
+    its history, and the losses leave out what is not seen."""
+    yaw: bool = True
+    """Turn each training window by a random angle about the vertical."""
+    epochs: Count = 50
+    """Passes of training. The released predictions are of 50; the public code trains 500 to 1000."""
+    updates_per_epoch: Count = 100
+    """Optimizer steps per epoch, each on windows drawn at random."""
+    learning_rate: Positive = 1e-3
+    """Adam's learning rate."""
+    checkpoint_every: Count = 5
+    """Epochs between checkpoints from which a killed job continues."""
+
+    def __post_init__(self) -> None:
+        if self.min_visible > self.dense_points:
+            raise ValueError(f"min_visible: at most dense_points ({self.dense_points}), received {self.min_visible}")
 
 
 @dataclass(frozen=True, kw_only=True)

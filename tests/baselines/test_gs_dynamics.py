@@ -22,7 +22,7 @@ from neuspring.baselines.gs_dynamics.model import (
 )
 from neuspring.baselines.gs_dynamics.train import draw, length_loss, pick, position_loss
 from neuspring.baselines.gs_dynamics.windows import Tracks, Windows, ahead, ordinary, past, smoothed, window_frames
-from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.baselines import GsDynamics
 from neuspring.core.errors import InputError
 
 RULES, RECIPE = resolve(GsDynamics(width=16), "sloth")

@@ -14,8 +14,7 @@ from neuspring.baselines.gs_dynamics.predict import carry, predict, turns
 from neuspring.baselines.gs_dynamics.windows import upright
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.config import Config
-from neuspring.config.baselines import Baselines
-from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.baselines import Baselines, GsDynamics
 from neuspring.core.artifacts import Observations, Scenario
 
 PLAIN = GsDynamics(

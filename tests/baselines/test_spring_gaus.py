@@ -19,7 +19,7 @@ from neuspring.baselines.spring_gaus.model import (
 from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
 from neuspring.baselines.spring_gaus.predict import contraction, roll_out
 from neuspring.baselines.spring_gaus.train import Problem, Training, run
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.baselines import SpringGaus
 from neuspring.core.errors import NumericalFailure
 
 FRAME = 1 / 30

@@ -13,7 +13,7 @@ import torch
 
 from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
 from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5

@@ -24,7 +24,7 @@ from neuspring import config
 from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
 from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.baselines.spring_gaus.predict import roll_out as roll_out_anchors
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import simulate_frame, solver_for

@@ -12,10 +12,8 @@ from neuspring.baselines import BASELINES
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.predict import predict as predicted
 from neuspring.baselines.spring_gaus.model import SpringGausModel
-from neuspring.config.baselines import Baselines
-from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.baselines import Baselines, GsDynamics, SpringGaus
 from neuspring.config.images import Appearance, Images
-from neuspring.config.spring_gaus import SpringGaus
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord

@@ -19,7 +19,7 @@ import torch
 from torch.nn.functional import linear, relu
 from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
-from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from neuspring.baselines.gs_dynamics.model import HISTORY
-from neuspring.config.gs_dynamics import GsDynamics
+from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Observations, Up
 from neuspring.core.geometry import farthest
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.baselines import SpringGaus
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError, NumericalFailure
 

@@ -23,7 +23,7 @@ from neuspring.baselines.spring_gaus.losses import Points, Silhouettes
 from neuspring.baselines.spring_gaus.model import AnchorGraph, Follower, SpringGausModel, choose_anchors
 from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.config import Config
-from neuspring.config.spring_gaus import SpringGaus
+from neuspring.config.baselines import SpringGaus
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, Capture
