@@ -22,7 +22,10 @@ from typing import Any, Literal
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 
-RECORD_FORMAT = 1
+RECORD_FORMAT = 2
+REMEDY = "The commit that made older results reads them. Delete this folder, or use another: --config results=..."
+MOST_BYTES = 50_000_000
+"""What a record may have: it is read whole."""
 COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
 """Packages on whose versions results depend."""
 Status = Literal["ok", "failed"]
@@ -124,13 +127,15 @@ class Before:
 def read_json(path: Path, version: int) -> dict[str, Any]:
     """A JSON record of the given format version, without its `format` key. Raises InputError."""
     try:
+        if (size := Path(path).stat().st_size) > MOST_BYTES:
+            raise InputError(path, f"a record has at most {MOST_BYTES} bytes", size, "Delete it and run again.")
         values = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
     except ValueError as error:
         raise InputError(path, "this record must be JSON", str(error), "Delete it and run again.") from error
     if not isinstance(values, dict) or values.pop("format", None) != version:
-        raise InputError(path, f"this version reads records of format {version}", None, "Delete it and run again.")
+        raise InputError(path, f"this version reads records of format {version}", "another format", REMEDY)
     return values
 
 

@@ -6,7 +6,7 @@ methods share them: a record names its inputs by digest, and `RunFolder.of` foll
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,20 +30,27 @@ class RunFolder:
     stages: Mapping[str, Before]
 
     @classmethod
-    def of(cls, folder: Path) -> RunFolder:
-        """The run in a folder: its own records, and those that they were made from. Raises InputError for damaged ones."""
-        folder = Path(folder).resolve()
-        found = {name: Before.load(path) for name in ("rollout", "render") if (path := folder / f"{name}.json").is_file()}
-        if "rollout" in found:
-            found |= _behind(folder, found["rollout"].record)
-        else:
-            found |= {name: Before.load(path) for name in LEARNING if (path := folder / f"{name}.json").is_file()}
-        if "fit" in found:
-            found |= _behind(folder, found["fit"].record)
-        if splats := _splats(folder, found.get("render")):
-            found["appearance"] = splats
-        order = (*LEARNING, "rollout", "appearance", "render")
-        return cls(folder, {name: found[name] for name in order if name in found})
+    def of(cls, folder: Path, damaged: list[str] | None = None) -> RunFolder:
+        """The run in a folder: its own records, and those that they were made from.
+
+        What cannot be read raises InputError; with a list `damaged` the message goes there, and the rest is read.
+        """
+        folder, found = Path(folder).resolve(), dict[str, Before]()
+
+        def add(find: Callable[[], Mapping[str, Before]]) -> None:
+            try:
+                found.update(find())
+            except InputError as error:
+                if damaged is None:
+                    raise
+                damaged.append(str(error))
+
+        add(lambda: _own(folder, "rollout"))
+        add(lambda: _behind(folder, found["rollout"].record) if "rollout" in found else _own(folder, *LEARNING))
+        add(lambda: _behind(folder, found["fit"].record) if "fit" in found else {})
+        add(lambda: _own(folder, "render"))
+        add(lambda: _splats(folder, found.get("render")))
+        return cls(folder, {name: found[name] for name in (*LEARNING, "rollout", "appearance", "render") if name in found})
 
     @property
     def scenario_folder(self) -> Path:
@@ -80,6 +87,11 @@ class RunFolder:
         """The run's twin; None if it has none."""
         return self.file("fit" if "fit" in self.stages else "search", "twin")
 
+    @property
+    def splats_file(self) -> Path | None:
+        """The splats that pictures of the run show, in frame 0."""
+        return self.file("appearance", "splats")
+
     @cached_property
     def twin(self) -> Twin | None:
         """The twin, where the method has one."""
@@ -105,6 +117,11 @@ class RunFolder:
         return Observations.load(path)
 
 
+def _own(folder: Path, *names: str) -> dict[str, Before]:
+    """The stages of these names whose records lie in the run's own folder."""
+    return {name: Before.load(path) for name in names if (path := folder / f"{name}.json").is_file()}
+
+
 def _behind(folder: Path, record: StageRecord) -> dict[str, Before]:
     """The learning stages that a record names as inputs, wherever in the scenario's folder they lie."""
     wanted = {record.inputs[role] for role in ("learned", *LEARNING) if role in record.inputs}
@@ -119,11 +136,12 @@ def _behind(folder: Path, record: StageRecord) -> dict[str, Before]:
     return found
 
 
-def _splats(folder: Path, render: Before | None) -> Before | None:
-    """The splats of the run's pictures, else those of its seed; None: there are none."""
+def _splats(folder: Path, render: Before | None) -> dict[str, Before]:
+    """The splats of the run's pictures, else those of its seed, if there are any."""
     records = sorted(folder.parents[1].glob("appearance*/*/appearance.json"))
     if render:
         records = [path for path in records if digest_file(path) == render.record.inputs.get("appearance")]
     else:
         records = [path for path in records if path.parts[-3:-1] == ("appearance", folder.name)]
-    return next((before for before in map(Before.load, records) if before.record.status == "ok"), None)
+    usable = [before for before in map(Before.load, records) if before.record.status == "ok"]
+    return {"appearance": usable[0]} if usable else {}

@@ -17,12 +17,12 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import META, DamagedFile, read_head
-from neuspring.core.records import StageRecord, digest_file
-from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.core.records import digest_file
+from neuspring.core.run_folder import RunFolder
+from neuspring.core.run_record import RUN_RECORD
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.model import Splats
-from neuspring.splats.of_run import APPEARANCE, RENDER, splats_file
 
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
@@ -159,55 +159,24 @@ def _first(runs: Sequence[Run]) -> tuple[str, ...]:
 def _run(folder: Path, scenario_folder: Path) -> Run:
     """A run with what can be used of it; a record that cannot be read is a note."""
     notes: list[str] = []
-    twin = trajectory = splats = centers = None
-    rollout = folder / ROLLOUT
-    try:
-        require_small(rollout)
-        record = StageRecord.load(rollout)
-        if record.status == "failed":
-            notes.append(f"failed: {record.reason}")
-        for role in {"trajectory", "centers"} & set(record.files):
-            # The digest is checked by `file`; a name that leads elsewhere is refused before it is read.
-            inside(scenario_folder, folder / str(record.files[role][0]))
-        trajectory, centers = (record.file(role, rollout) if role in record.files else None for role in ("trajectory", "centers"))
-    except (InputError, TypeError, ValueError, IndexError) as error:
-        notes.append(f"no prediction: {error}")
-    try:
-        twin = _twin_of(folder, scenario_folder)
-    except InputError as error:
-        notes.append(f"no twin: {error}")
-    try:
-        splats = _splats_of(folder, scenario_folder)
-    except (InputError, TypeError, ValueError, IndexError) as error:
-        notes.append(f"no splats: {error}")
-    if trajectory is None and not notes:
-        notes.append("no prediction in its record")
-    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, trajectory, splats, centers)
+    run = RunFolder.of(folder, notes)
 
-
-def _splats_of(folder: Path, scenario_folder: Path) -> Path | None:
-    """The splats of its pictures; records are small, and name files of the scenario."""
-    for record in (folder / RENDER, *scenario_folder.glob(f"appearance*/*/{APPEARANCE}")):
-        if record.is_file():
-            require_small(record)
-            for entry in StageRecord.load(record).files.values():
-                inside(scenario_folder, record.parent / str(entry[0]))
-    return splats_file(folder)
-
-
-def _twin_of(folder: Path, scenario_folder: Path) -> Path | None:
-    """The twin that run.json names, or the one beside it."""
-    path = folder / RUN_RECORD
-    if path.is_file():
-        require_small(path)
-        named = RunRecord.load(path).artifacts.get("twin") or []
-        # The mean of several seeds has several twins, and none of them moves as it does.
-        if len(named) == 1:
-            return inside(scenario_folder, folder / named[0])
-        if named:
+    def path(stage: str, role: str) -> Path | None:
+        try:
+            found = run.file(stage, role)
+            return None if found is None else inside(scenario_folder, found)
+        except (InputError, TypeError, ValueError, IndexError) as error:
+            notes.append(f"no {role}: {error}")
             return None
-    beside = folder / "twin.npz"
-    return inside(scenario_folder, beside) if beside.is_file() else None
+
+    if "rollout" in run.stages and run.records["rollout"].status == "failed":
+        notes.append(f"failed: {run.records['rollout'].reason}")
+    roles = {"trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
+    paths = {f"{role}_path": path(stage, role) for role, stage in roles.items()}
+    twin = path("fit" if "fit" in run.stages else "search", "twin")
+    if paths["trajectory_path"] is None and not notes:
+        notes.append("no prediction in its record")
+    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, **paths)
 
 
 def _capture(folder: Path, notes: list[str]) -> Capture | None:

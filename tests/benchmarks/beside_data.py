@@ -15,12 +15,12 @@ from neuspring.config.parse import parse, read_yaml
 from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import StageRecord, digest_file
+from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.scores.images import iou
 from neuspring.scores.pictures import Scored
 from neuspring.splats.draw import picture
-from neuspring.splats.of_run import APPEARANCE, RENDER, splats_file
 from neuspring.stages.render import posed
 from tests.benchmarks.footage import Points, truths
 
@@ -204,15 +204,14 @@ class Run:
 
         Nothing where the run has no splats or no trajectory. After a divergence its last frame stands for the others.
         """
-        rollout, splats = self.folder / "rollout.json", splats_file(self.folder)
-        file = self.stage("rollout", "trajectory")
-        if splats is None or file is None or not frames:
+        run = RunFolder.of(self.folder)
+        if not {"appearance", "render"} <= set(run.stages) or run.trajectory is None or not frames:
             return
-        images = parse(Images, StageRecord.load(self.folder / RENDER).settings, str(self.folder / RENDER))
+        images = parse(Images, run.records["render"].settings["images"], str(run.stages["render"].path))
         scored = Scored.of(capture, {}, images, "cpu")
         name, last = next(iter(scored.views)), None
         try:
-            _, moved = posed(splats.with_name(APPEARANCE), rollout, Trajectory.load(file), images, "cpu")
+            _, moved = posed(run.stages["appearance"], run.stages["rollout"], run.trajectory, images, "cpu")
             for frame in range(max(frames) + 1):
                 last = next(moved, last)
                 if frame in frames and last is not None:

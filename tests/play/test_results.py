@@ -9,7 +9,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.play.results import find
-from tests.support.played import results, spoil
+from tests.support.played import record, results, spoil
 
 
 def test_a_scenarios_folder_shows_one_run_of_each_of_two_methods(scenario):
@@ -43,15 +43,15 @@ def test_an_incomplete_run_says_what_it_lacks(scenario):
 
 
 def test_a_record_of_an_older_format_is_a_note(scenario):
-    spoil(scenario / "baseline" / "0" / "rollout.json", '"format": 1', '"format": 0')
-    assert "reads records of format 1" in find([scenario]).runs[1].notes[0]
+    spoil(scenario / "baseline" / "0" / "rollout.json", '"format": 2', '"format": 1')
+    assert "reads records of format 2" in find([scenario]).runs[1].notes[0]
 
 
 def test_a_record_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
     secret = tmp_path / "secret.npz"
     secret.write_bytes(b"secret")
     spoil(scenario / "baseline" / "0" / "rollout.json", '"trajectory.npz"', json.dumps("../../../secret.npz"))
-    assert "must lie inside" in find([scenario]).runs[1].notes[0]
+    assert "must lie beside" in find([scenario]).runs[1].notes[0]
 
 
 def test_a_link_out_of_the_folder_is_not_followed(scenario, tmp_path):
@@ -72,6 +72,7 @@ def test_a_header_that_promises_more_than_the_file_is_refused_before_memory_is_t
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in members.items():
             archive.writestr(name, header.getvalue() if name == "material.stiffness.npy" else content)
+    record(path.parent)
     with pytest.raises(InputError, match=r"header of material\.stiffness must agree"):
         _ = find([scenario]).runs[0].twin
 
@@ -79,5 +80,6 @@ def test_a_header_that_promises_more_than_the_file_is_refused_before_memory_is_t
 def test_a_pickle_is_refused(scenario):
     path = scenario / "neuspring" / "0" / "twin.npz"
     np.savez(path, meta=np.array([{"kind": "twin"}], dtype=object))
+    record(path.parent)
     with pytest.raises(InputError, match="must be readable"):
         _ = find([scenario]).runs[0].twin

@@ -9,7 +9,7 @@ import numpy as np
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
-from neuspring.core.records import Recorder, StageRecord, digest_file
+from neuspring.core.records import Recorder
 from neuspring.splats.model import Splats
 from neuspring.twin.rollout import roll_out
 from tests.support import small
@@ -26,9 +26,15 @@ def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) 
         twin.save(place / "twin.npz")
         trajectory = roll_out(twin, seen.controller_points)
         trajectory.save(place / "trajectory.npz")
-        files = {"trajectory": ["trajectory.npz", digest_file(place / "trajectory.npz")]}
-        StageRecord(stage="rollout", status="ok", files=files).save(place / "rollout.json")
+        record(place)
     return scenario
+
+
+def record(run: Path) -> None:
+    """Write the records of a run's twin and trajectory as they lie there."""
+    Recorder("fit", run / "fit.json").save({"twin": run / "twin.npz"})
+    rollout = Recorder("rollout", run / "rollout.json", inputs={"learned": run / "fit.json"})
+    rollout.save({"trajectory": run / "trajectory.npz"})
 
 
 def softer(twin: Twin, factor: float) -> Twin:
