@@ -186,11 +186,3 @@ def test_own_yaml_lets_methods_that_learn_nothing_stand_beside(project):
     jobs = jobs_in(output)
     assert (jobs["segment"], jobs["lift"], jobs["predict"], jobs["fit"], jobs["score"]) == (1, 1, 2, 2, 5)
     assert f"Expected: {sum(jobs.values()) - 1} jobs" in output
-
-
-def test_a_capture_that_is_not_there_is_named_before_any_job(project):
-    add_scenario(project, "film", "capture")
-    changes = {"scenarios": ["film"], "methods": ["search_only"], "data_root": str(project)}
-    output = run(project, changes, "--dry-run", fails=True)
-    assert "film" in output
-    assert "Traceback" not in output

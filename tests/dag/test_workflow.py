@@ -15,15 +15,12 @@ import yaml
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
-from neuspring.core.errors import InputError
-from neuspring.experiments.benchmark import Benchmark, read_scenarios
 from neuspring.experiments.tracking import log as tracking
 from neuspring.scores.metrics import TASKS
 from tests.support.project import (
     ROOT,
     SCENE,
     arguments,
-    config_with,
     copy_project,
     copy_workflow,
     environment,
@@ -75,14 +72,6 @@ def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run)
     assert both_seeds == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
 
 
-def test_methods_share_searches_and_fits(project):
-    names = ["search_only", "baseline", "model_a", "model_b", "neuspring", "pt_only", "neuspring_plus", "oracle_neuspring"]
-    jobs = plan(project, {"methods": names, "seeds": [0, 1]})
-    # Uniform and five regions; all but search_only and pt_only have a fit; two seeds each.
-    assert (jobs["search"], jobs["fit"]) == (2 * 2, 6 * 2)
-    assert jobs["rollout"] == jobs["score"] == len(names) * 2
-
-
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_run, tmp_path):
     changes = {"methods": ["baseline"], "fit": {"epochs": 30}, "tracking": {"enabled": False}}
     target = f"results/{SCENE}/baseline/0/fit.json"
@@ -129,53 +118,14 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
     assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"fitt": {"epochs": 3}}, "fitt: unknown key"),
-        ({"results": "/proc/nowhere"}, "this folder must be writable"),
-        ({"scenarios": ["a;touch hacked"]}, "scenarios.0: string should match pattern"),
-    ],
-)
-def test_bad_configuration_is_explained_before_any_job(project, changes, message):
-    output = run(project, changes, "--dry-run", fails=True)
-    assert message in output
+def test_bad_configuration_is_explained_before_any_job(project):
+    output = run(project, {"fitt": {"epochs": 3}, "scenarios": ["a;touch hacked"]}, "--dry-run", fails=True)
+    assert "fitt: unknown key" in output and "scenarios.0: string should match pattern" in output
     assert "Traceback" not in output
     assert not list(project.rglob("hacked"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
-        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
-        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
-        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
-        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
-        ({"scenarios": ["DLO1_train_48"], "data_root": "/nowhere"}, "its data must exist; received /nowhere/DLO1/train/48.pkl"),
-        ({"seeds": []}, "seeds: at least one entry is required"),
-        ({"seeds": [0, 0]}, "seeds: entries must differ"),
-        ({"results": "a{b}"}, "results: string should match pattern"),
-        ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
-        ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
-        ({"search": {"variables": {"stiffness": {"high": 2e5}}}}, "must hold the search's range of 10.0 to 200000.0"),
-    ],
-)
-def test_what_the_workflow_checks_first(changes, message):
-    with pytest.raises(InputError) as error:
-        Benchmark.of(config_with(changes), ROOT)
-    assert message in str(error.value)
 
 
 def test_the_pinned_conda_environment_has_the_versions_of_the_constraints():
     pins = dict(line.strip().split("==") for line in (ROOT / "workflow/envs/constraints.txt").open() if "==" in line)
     listed = yaml.safe_load((ROOT / "workflow/envs/neuspring.yaml").read_text())["dependencies"][-1]["pip"]
     assert {name: pins[name] for name, _ in (item.split("==") for item in listed)} == dict(item.split("==") for item in listed)
-
-
-def test_the_benchmark_of_22_scenarios_is_known_to_the_table():
-    rows = read_scenarios(ROOT / "config" / "scenarios.tsv")
-    released = [row for row in rows.values() if row.source == "phystwin"]
-    assert len(released) == 22
-    assert {row.category for row in released} == {"cloth", "rope", "package", "zebra", "sloth", "dinosaur"}
-    assert sum(row.self_collision for row in released) == 9

@@ -684,3 +684,34 @@ def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
 def test_a_part_that_is_not_there_is_explained(only, message):
     with pytest.raises(InputError, match=message):
         Benchmark.of(config_with({"only": only}), ROOT)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
+        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
+        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
+        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
+        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
+        ({"scenarios": ["DLO1_train_48"], "data_root": "/nowhere"}, "its data must exist; received /nowhere/DLO1/train/48.pkl"),
+        ({"seeds": []}, "seeds: at least one entry is required"),
+        ({"seeds": [0, 0]}, "seeds: entries must differ"),
+        ({"results": "a{b}"}, "results: string should match pattern"),
+        ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
+        ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
+        ({"search": {"variables": {"stiffness": {"high": 2e5}}}}, "must hold the search's range of 10.0 to 200000.0"),
+    ],
+)
+def test_what_the_workflow_checks_first(changes, message):
+    with pytest.raises(InputError) as error:
+        Benchmark.of(config_with(changes), ROOT)
+    assert message in str(error.value)
+
+
+def test_the_benchmark_of_22_scenarios_is_known_to_the_table():
+    rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv")
+    released = [row for row in rows.values() if row.source == "phystwin"]
+    assert len(released) == 22
+    assert {row.category for row in released} == {"cloth", "rope", "package", "zebra", "sloth", "dinosaur"}
+    assert sum(row.self_collision for row in released) == 9

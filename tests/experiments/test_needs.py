@@ -126,3 +126,8 @@ def test_resources_set_for_a_rule_beyond_the_gpus_there_are_are_refused():
     needs.check_gpus(wishes, ("0", "1", "2"))
     with pytest.raises(InputError, match=r"--set-resources fit:gpu: .* there are 2 \(0, 1\); received 3"):
         needs.check_gpus(wishes, ("0", "1"))
+
+
+def test_a_results_folder_that_cannot_be_written_ends_the_run_before_it_begins():
+    with pytest.raises(InputError, match="this folder must be writable"):
+        needs.checked(config_with({"results": "/proc/nowhere"}), ROOT, cluster=False)

@@ -73,16 +73,6 @@ def test_a_password_in_the_storage_is_refused():
     assert sweep(storage="postgresql://me@host:5432/studies").storage
 
 
-def test_a_method_without_a_first_order_stage_has_no_fit_settings_to_vary(finished):
-    with pytest.raises(InputError, match="no first-order stage"):
-        plan(finished[0], sweep(method="search_only"))
-
-
-def test_an_unknown_method_is_refused(finished):
-    with pytest.raises(InputError, match=r"Did you mean baseline\?"):
-        plan(finished[0], sweep(method="basline"))
-
-
 def test_a_sweep_does_not_go_on_with_other_settings(finished):
     folder, tune = finished
     other, space = settings(fit={"epochs": 4}), tune.space | sweep(space={"fit.horizon": {"choices": [1, 3]}}).space
@@ -92,18 +82,6 @@ def test_a_sweep_does_not_go_on_with_other_settings(finished):
         report(folder, tune, other)
     with pytest.raises(InputError, match=r"another space\.fit\.horizon\.choices"):
         work(folder, dataclasses.replace(tune, space=space))
-
-
-def test_a_sweep_that_was_not_begun_has_no_report(folder):
-    with pytest.raises(InputError, match="must have been begun"):
-        report(folder, sweep())
-
-
-def test_observations_of_other_scenarios_and_workers_without_a_number_are_refused(folder):
-    with pytest.raises(InputError, match="those of other are required"):
-        work(folder, sweep(scenarios=["other"]))
-    with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
-        work(folder, sweep(), 1)
 
 
 def test_settings_that_exclude_each_other_only_inside_their_ranges_fail_the_trial(folder, monkeypatch):
@@ -132,3 +110,15 @@ def test_a_factor_varies_the_adaptive_resolution():
     assert SpringField(points, config.SpringField(), 1, 0).resolution == adaptive_resolution(400) == 17
     assert SpringField(points, config.SpringField(adaptive_factor=1.7), 1, 0).resolution == 34
     assert SpringField(points, config.SpringField(adaptive_factor=1.7, resolution=9), 1, 0).resolution == 9
+
+
+def test_what_a_sweep_cannot_be_begun_with_is_refused(folder):
+    for method, words in (("search_only", "no first-order stage"), ("basline", r"Did you mean baseline\?")):
+        with pytest.raises(InputError, match=words):
+            plan(folder, sweep(method=method))
+    with pytest.raises(InputError, match="must have been begun"):
+        report(folder, sweep())
+    with pytest.raises(InputError, match="those of other are required"):
+        work(folder, sweep(scenarios=["other"]))
+    with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
+        work(folder, sweep(), 1)

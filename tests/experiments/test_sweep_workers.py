@@ -13,12 +13,6 @@ from tests.support import stores
 from tests.support.sweeps import furnish, report, results_of, slots, sweep, work
 
 
-def test_more_trials_continue_a_sweep(folder):
-    assert work(folder, sweep(trials=2)) == [0, 1]
-    assert work(folder, sweep(trials=3)) == [2]
-    assert list(slots(folder, sweep())) == [0, 1, 2]
-
-
 def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_path, finished, monkeypatch):
     whole, tune = finished
     folder = furnish(tmp_path)
@@ -60,6 +54,7 @@ def test_a_kill_between_asking_for_a_trial_and_taking_it_costs_nothing(folder, m
                 work(folder, tune)
     assert work(folder, tune) == [0, 1]
     assert [len(slot.trials) for slot in slots(folder, tune).values()] == [2, 1]
+    assert work(folder, sweep(trials=3)) == [2], "more trials continue a sweep"
 
 
 def counting(calls: Path) -> None:
