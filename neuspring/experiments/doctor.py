@@ -73,9 +73,8 @@ def text(findings: list[Finding]) -> str:
 
 def _libraries(settings: Config) -> Iterator[Finding]:
     yield Finding("Python", "ok", sys.version.split()[0])
-    yield Finding(
-        "torch", "ok", f"{torch.__version__}, {f'CUDA {torch.version.cuda}' if torch.version.cuda else 'build for the CPU'}"
-    )
+    cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "build for the CPU"
+    yield Finding("torch", "ok", f"{torch.__version__}, {cuda}")
     for package in ("warp-lang", "snakemake", "mlflow", "optuna"):
         try:
             yield Finding(package, "ok", version(package))
@@ -92,8 +91,7 @@ def _libraries(settings: Config) -> Iterator[Finding]:
         if importlib.util.find_spec(module):
             yield Finding(module, "ok", f"extra {extra}")
         else:
-            state = "broken" if wanted.get(module) else "absent"
-            yield Finding(module, state, f"extra {extra} is not installed", install(extra))
+            yield Finding(module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra))
     if importlib.util.find_spec("av"):
         import av
 

@@ -133,7 +133,7 @@ def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
     command += ["--configfile", "config/data/phystwin.yaml", "--config", f"data_root={tmp_path}"]
     output = output_of(start(command, project, **{gpus.VISIBLE: ""}))
     # Of the baselines' models Spring-Gaus needs images, which these folders do not have.
-    twins, models = 22 * 22 * 3, 22 * 3 * 3
+    twins, models = 22 * 19 * 3, 22 * 3 * 3
     runs = twins + models
     expected = {"observe": 22, "track_init": 1, "search": 22 * 8 * 3, "fit": 22 * 17 * 3, "rollout": twins}
     expected |= {"train": 22 * 3, "predict": models, "score": runs, "log_run": runs}
