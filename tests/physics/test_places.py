@@ -26,8 +26,8 @@ VALUES = {
     "export/newton_twin.py": "drag in Newton",
 }
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
-OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py"}
-"""Drag of another simulator."""
+OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "play/page.py"}
+"""Drag of another simulator; dragging with a mouse."""
 
 
 def words(text: str) -> set[str]:
