@@ -1,12 +1,12 @@
 """Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
 
-    settings                       the whole configuration (`Config`)
+    settings                       the whole configuration (`Config`), GPUs, a part of it for one step
     simulation, search, twin       integration; the zero-order search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
     baselines                      Spring-Gaus, GS-Dynamics
     gpus, tuning                   sharing GPUs; sweeps over settings
     rows                           rows of the scenario, method and search tables
-    parse                          YAML to settings and back
+    parse                          the types of settings, YAML to settings and back
     page                           writes config/README.md from all of these
 
 Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.

@@ -14,7 +14,7 @@ from typing import Any, get_args, get_type_hints
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
-from neuspring.config.types import Section
+from neuspring.config.parse import Section
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"

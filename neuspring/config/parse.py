@@ -1,4 +1,8 @@
-"""Plain YAML values to settings and back. Unknown keys raise, values are never cast, every problem is listed with its path."""
+"""The types of which settings are made (strict: no casts, no unknown keys; and bounded), and plain YAML values to settings and
+back.
+
+Unknown keys raise, values are never cast, every problem is listed with its path.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,29 @@ import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
 from neuspring.core.errors import InputError
 from neuspring.core.text import masked
+
+STRICT = ConfigDict(extra="forbid", strict=True)
+"""No unknown keys, no casts."""
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+
+
+class Section:
+    """Base of the dataclasses of settings."""
+
+    __pydantic_config__ = STRICT
+
 
 T = TypeVar("T")
 REMOVED = "removed; commit 7308a7b is the last that has it"

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import REMOVED
-from neuspring.config.types import Count, Name, Section
+from neuspring.config.parse import REMOVED, Count, Name, Section
 
 Kind = Literal["springs", "field"]
 """What a first-order stage trains: each spring by itself, or the neural spring field."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.types import STRICT, Count, Finite, NonNegative, Positive, Section
+from neuspring.config.parse import STRICT, Count, Finite, NonNegative, Positive, Section
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -10,15 +11,30 @@ from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 from neuspring.config.baselines import Baselines
 from neuspring.config.data import Mocap, Synthetic, Toy
-from neuspring.config.gpus import Gpus
 from neuspring.config.images import Images
+from neuspring.config.parse import Count, Name, Section, plain
 from neuspring.config.perception import Perception
 from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses
-from neuspring.config.types import Count, Name, Section
 from neuspring.core.text import refuse_password
+
+Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9/._-]*$")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gpus(Section):
+    """GPUs of this machine that jobs lease. On a cluster these are not read: its scheduler chooses."""
+
+    devices: Literal["all"] | tuple[Device, ...] = "all"
+    """Indices or UUIDs of the GPUs; all: those of CUDA_VISIBLE_DEVICES, or all of the machine where it is not set."""
+    jobs_per_gpu: Count = 1
+    """Number of jobs that share a GPU; use 1 for timings that can be compared."""
+
+    def __post_init__(self) -> None:
+        if self.devices != "all" and (not self.devices or len(set(map(str, self.devices))) != len(self.devices)):
+            raise ValueError(f"devices: at least one, each once, is required, received {list(self.devices)}")
 
 
 def _seed_list(value: Any) -> Any:
@@ -158,3 +174,16 @@ class Config(Section):
             if not targets or len(set(targets)) != len(targets) or source in targets:
                 rule = "at least one other scenario is required, each once; leave the entry out for no transfer"
                 raise ValueError(f"transfers.{source}: {rule}, received {list(targets)}")
+
+
+def select(config: Config, keys: Iterable[str]) -> dict[str, Any]:
+    """The values under dotted keys (`images.backend`), nested as in a configuration file, as plain values."""
+    values = plain(config)
+    part: dict[str, Any] = {}
+    for key in keys:
+        *sections, last = key.split(".")
+        source, target = values, part
+        for section in sections:
+            source, target = source[section], target.setdefault(section, {})
+        target[last] = source[last]
+    return part

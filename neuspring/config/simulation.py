@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import Count, Finite, Section
+from neuspring.config.parse import Count, Finite, Section
 
 
 @dataclass(frozen=True, kw_only=True)

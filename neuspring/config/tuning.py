@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.types import Count, Name, Section
+from neuspring.config.parse import Count, Name, Section
 from neuspring.core.text import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]

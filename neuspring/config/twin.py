@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.types import Count, NonNegative, Positive, Range, Section
+from neuspring.config.parse import Count, NonNegative, Positive, Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)

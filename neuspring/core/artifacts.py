@@ -22,7 +22,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import DamagedFile, read_npz, write_npz
 from neuspring.core.geometry import Obstacle, obstacles_of
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Of the files of all artifacts; files of another version are refused."""
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
@@ -165,7 +166,7 @@ class Artifact:
                 continue
             has_default = spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
             if spec.name not in plain and has_default:
-                continue  # a file of an older version, which did not know this field
+                continue  # left out where it is empty
             kind, value = hints[spec.name], plain[spec.name]
             if isinstance(kind, UnionType):
                 # An artifact or none; a file that has it has an artifact.

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     import torch
 
 
+CHECKPOINT_FORMAT = 2
+"""Raise it where what checkpoints hold changes: those of another version are refused by name."""
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """What a stage needs to go on."""
@@ -39,7 +43,7 @@ class Checkpoint:
     def save(self, path: Path, key: str) -> None:
         """Write `path` (.npz) atomically."""
         arrays = {f"{group}.{name}": array for group, members in self.arrays.items() for name, array in members.items()}
-        write_npz(path, arrays, json.dumps({"key": key, "values": self.values}), compress=False)
+        write_npz(path, arrays, json.dumps({"format": CHECKPOINT_FORMAT, "key": key, "values": self.values}), compress=False)
 
     @classmethod
     def load(cls, path: Path | None, key: str, what: str) -> Checkpoint | None:
@@ -50,6 +54,9 @@ class Checkpoint:
             stored, meta = read_npz(path)
         except DamagedFile as error:
             print(f"{path}: unreadable ({error}); {what} starts afresh")
+            return None
+        if (version := meta.get("format")) != CHECKPOINT_FORMAT:
+            print(f"{path}: a checkpoint of format {version}, this version reads {CHECKPOINT_FORMAT}; {what} starts afresh")
             return None
         if meta.get("key") != key:
             print(f"{path}: made with other inputs or settings; {what} starts afresh")

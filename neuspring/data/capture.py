@@ -28,7 +28,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
-from neuspring.config.types import STRICT, Finite, Name, Positive
+from neuspring.config.parse import STRICT, Finite, Name, Positive
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from neuspring.config import plain
-from neuspring.config.select import select
+from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neuspring.config import Config
-from neuspring.config.gpus import Gpus
+from neuspring.config.settings import Gpus
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs

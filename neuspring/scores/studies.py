@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 from neuspring.config import parse, read_yaml
-from neuspring.config.types import STRICT, Name
+from neuspring.config.parse import STRICT, Name
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
 from neuspring.scores import paper

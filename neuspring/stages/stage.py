@@ -32,7 +32,7 @@ from typing import Annotated, Any, Literal
 
 from neuspring import config
 from neuspring.config import Config, ScenarioRow
-from neuspring.config.select import select
+from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import Before, Recorder

@@ -239,7 +239,7 @@ def test_another_kind_or_version(tmp_path: Path) -> None:
     twin().save(path)
     refuses(Trajectory, path, "must be of kind trajectory; received twin")
     rewrite(path, format=99)
-    refuses(Twin, path, r"reads format 1; received 99\. Re-run")
+    refuses(Twin, path, r"reads format 2; received 99\. Re-run")
 
 
 def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:

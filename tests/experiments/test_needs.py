@@ -6,7 +6,7 @@ import pytest
 from snakemake.resources import Resource
 
 from neuspring import config
-from neuspring.config.gpus import Gpus
+from neuspring.config.settings import Gpus
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.experiments import needs

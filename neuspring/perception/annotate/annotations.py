@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints
 
 from neuspring.config import parse, plain
-from neuspring.config.types import STRICT, Finite
+from neuspring.config.parse import STRICT, Finite
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.data.capture import Capture

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import Field
 
 from neuspring.config import parse, plain
-from neuspring.config.types import STRICT, Finite, Name
+from neuspring.config.parse import STRICT, Finite, Name
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture

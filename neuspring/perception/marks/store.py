@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from neuspring.config import parse, plain
+from neuspring.config.parse import STRICT, Name
 from neuspring.config.perception import MarksSegmentation
-from neuspring.config.types import STRICT, Name
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_atomically, write_text
 from neuspring.core.records import canonical, digest_file

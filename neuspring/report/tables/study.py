@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.config import parse
-from neuspring.config.types import STRICT, Name
+from neuspring.config.parse import STRICT, Name
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.core.text import markdown
