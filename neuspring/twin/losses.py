@@ -1,6 +1,6 @@
 """The training loss, in one place: a term is a function that says a frame's errors, and search, fit and polish sum their squares.
 
-A term's loss is weight / count times the sum of s(e)^2 over its errors e, m, with the weight of `config.Losses` that has its name:
+A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; `config.Losses` has the weight under its name:
 
     chamfer       e from each visible observed point to its nearest surface node (assignment fixed), s(e) = e
     track         e from track i to node i where the motion is valid, s(e)^2 smooth-L1 (beta = 1 m)
@@ -65,12 +65,12 @@ IMAGE_SMOOTH_L1 = Penalty(lambda e: _smooth_root(e, BETA))
 
 
 class Errors(NamedTuple):
-    """Errors of a term in a frame: weight / count times the sum of s(e)^2 over `values`."""
+    """Errors of a term in a frame: weight / divisor times the sum of s(e)^2 over `values`."""
 
     values: torch.Tensor
     """[k, d]."""
     weight: float
-    count: int | torch.Tensor
+    divisor: int | torch.Tensor
     """At least 1."""
     penalty: Penalty
     rows: torch.Tensor | None = None
@@ -82,18 +82,18 @@ class Errors(NamedTuple):
         """The sum."""
         if self.penalty.total is None:
             return self.residuals().square().sum()
-        return self.weight * (self.penalty.total(self.values) / self.count)
+        return self.weight * (self.penalty.total(self.values) / self.divisor)
 
     def residuals(self, frames: int = 1) -> torch.Tensor:
         """[P, d]: their squares sum up to the loss over `frames`; 0 where there is no error."""
         result = self.penalty.root(self.values)
         if self.penalty.total is None:
-            result = result * _root(self.weight / self.count)
+            result = result * _root(self.weight / self.divisor)
             result = result / frames**0.5 if frames > 1 else result
         elif self.single:
-            result = result * (torch.tensor(self.weight / self.count) / frames).sqrt()
+            result = result * (torch.tensor(self.weight / self.divisor) / frames).sqrt()
         else:
-            result = result * _root(self.weight / self.count / frames)
+            result = result * _root(self.weight / self.divisor / frames)
         if self.rows is None:
             return result
         everywhere = result.new_zeros(len(self.rows), result.shape[1])

@@ -79,16 +79,6 @@ def test_one_that_fails_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None
         assert_equal(results[k], fit(problems[k]))
 
 
-def test_growing_substeps_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fit that stiffens beyond its substeps takes more, and the others go on as they would."""
-    problems = several()[:2]
-    fast = replace(problems[0], fit=replace(problems[0].fit, learning_rate=1.0, epochs=3))
-    results = in_a_batch([fast, problems[1]])
-    assert results[0].twin.simulation.substeps >= fast.twin.simulation.substeps
-    for got, problem in zip(results, (fast, problems[1]), strict=True):
-        assert_equal(got, fit(problem))
-
-
 def test_an_error_in_the_shared_launch_reaches_everyone(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no memory")

@@ -35,7 +35,7 @@ def true_problem(**settings) -> FitProblem:
     return small.fit_problem(twin=start, fit=config.Fit(**({"epochs": 12, "learning_rate": 3e-2} | settings)))
 
 
-@pytest.mark.parametrize("horizon", [1, 3, 0])
+@pytest.mark.parametrize("horizon", [1, 3])
 def test_training_lowers_the_loss_on_exact_data(horizon):
     result = fit(true_problem(horizon=horizon))
     losses = result.history["loss"]
@@ -113,15 +113,13 @@ LIMITED = {
     ("changes", "killed_in"),
     [
         ({}, 3),
-        (GROWING, 8),
         (GROWING, 10),
         (REGULARIZED, 3),
-        (EVERYTHING, 2),
         (EVERYTHING, 4),
         (LIMITED, 3),
         (SHAPE, 3),
     ],
-    ids=["springs", "growing-8", "growing-10", "field", "everything-2", "everything-4", "limited", "shape"],
+    ids=["springs", "growing", "field", "everything", "limited", "shape"],
 )
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
     whole = fit(small.fit_problem(**changes))
@@ -165,13 +163,6 @@ def test_the_seed_decides_the_first_weights_of_a_field():
     assert not np.array_equal(runs[0].twin.material.stiffness, runs[2].twin.material.stiffness)
 
 
-def test_a_checkpoint_of_another_problem_is_ignored(tmp_path, capsys):
-    partial = tmp_path / "fit.npz"
-    fit(small.fit_problem(), partial=partial, key="one")
-    assert fit(small.fit_problem(), partial=partial, key="two").attempts == 1
-    assert "other inputs or settings" in capsys.readouterr().out
-
-
 def test_a_non_finite_gradient_rolls_back_and_is_reported(monkeypatch):
     problem = small.fit_problem()
     calls = 0
@@ -198,20 +189,6 @@ def test_a_fit_that_never_completes_an_epoch_is_a_named_failure(monkeypatch, set
     monkeypatch.setattr(module, "simulate_frame", lambda s, p, x, v, b, e: (x * float("nan"), v))
     with pytest.raises(NumericalFailure, match=r"no epoch could be completed: epoch 0: the loss is not finite"):
         fit(small.fit_problem(fit=config.Fit(epochs=10, **settings)))
-
-
-def test_stiffness_stays_within_its_clamp():
-    limit = (0.0, 7e3)
-    result = fit(small.fit_problem(fit=config.Fit(epochs=4, learning_rate=0.3, stiffness_range=limit)))
-    assert result.twin.material.stiffness.max() <= 7e3
-
-
-def test_stiffening_springs_get_more_substeps():
-    problem = small.fit_problem(**GROWING)
-    result = fit(problem)
-    assert result.twin.material.stiffness.max() > 2 * problem.twin.material.stiffness.max()
-    assert result.twin.simulation.substeps > problem.twin.simulation.substeps
-    stability.check(result.twin)
 
 
 def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
@@ -367,13 +344,6 @@ def test_the_loss_of_a_one_step_epoch_belongs_to_the_values_before_the_step():
     assert thrice.best_epoch == 1  # the loss seen in epoch 2 is that of the values at the end of epoch 1
     assert thrice.best_loss == thrice.history["loss"].iloc[2] == thrice.history["loss"].min()
     assert thrice.best_loss == pytest.approx(loss_of(thrice.twin, small.observations(), range(1, 5)), rel=MEAN)
-
-
-def test_several_steps_per_epoch_pair_the_loss_with_the_values_after_them():
-    """As released: the loss is summed while parameters change."""
-    result = fit(small.fit_problem(fit=config.Fit(epochs=1, learning_rate=5e-2)))
-    assert result.best_epoch == 0
-    assert not np.array_equal(result.twin.material.stiffness, small.fit_problem().twin.material.stiffness)
 
 
 # Learning rates -------------------------------------------------------------------------------------------------------

@@ -12,7 +12,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from neuspring.twin.field import in_cube, midpoints
-from neuspring.twin.parameters import CONTACT_SCALARS, TwinParameters, bounded, inward_clamp
+from neuspring.twin.fit import TwinFit, fit
+from neuspring.twin.parameters import TwinParameters, bounded, inward_clamp, movement
+from tests.support import small
 from tests.support.scenes import random_scene, twin_of
 
 STEP = 1e-6
@@ -236,13 +238,6 @@ def test_a_damping_of_zero_has_no_factor():
     assert set(parameters(start=still, damping="homogeneous").factors) == {"dashpot"}
 
 
-def test_fixed_damping_does_not_move():
-    trained = disturb(parameters())
-    assert "drag" not in dict(trained.named_parameters())
-    for name in ("drag", "dashpot", "rest_lengths", "contact_distance"):
-        assert torch.equal(trained.physical()[name], trained.start[name])
-
-
 def test_rest_lengths_are_free_per_spring_beside_a_field():
     free = parameters(**ALL)
     assert free.field().shape[1] == 1
@@ -300,11 +295,6 @@ def test_factors_and_the_unloaded_shape_have_rates_of_their_own():
     assert rates[trained.offsets] == 0.1
 
 
-def test_unset_learning_rates_are_the_common_one():
-    for kind in ("springs", "field"):
-        assert {group["lr"] for group in parameters(kind, learning_rate=0.1, rest_length_bound=0.1).groups()} == {0.1}
-
-
 def test_the_penalty_is_the_weighted_roughness():
     trained = disturb(parameters(field={"plane_smoothness": 0.5}))
     assert trained.penalty().item() == pytest.approx(0.5 * trained.field.roughness().item(), rel=SINGLE)
@@ -356,9 +346,65 @@ def test_the_twin_is_what_is_simulated(kind):
     assert result.simulation == start.simulation
 
 
-def test_a_fixed_rest_length_is_not_rewritten():
-    start = twin()
-    result = disturb(parameters("springs", start)).as_twin(start)
-    assert result.topology is start.topology
-    assert result.material.contact_distance == start.material.contact_distance
-    assert set(CONTACT_SCALARS) <= set(twin_tensors(result, "cpu"))
+# What moved -----------------------------------------------------------------------------------------------------------
+
+OF_TEXELS = config.SpringField(channels=4, hidden=8, bands=2, texel_scale=0.02)
+
+
+def of_scene(kind: str, **settings: object) -> TwinParameters:
+    return TwinParameters(small.fit_problem().twin, config.Fit(field=OF_TEXELS, **settings), kind, "cpu")
+
+
+def test_shares_count_springs_at_the_bound_and_at_the_range():
+    trained = of_scene("springs", output_bound=1.0, stiffness_range=(0.0, 6100.0))
+    assert movement(trained) == {"at_bound": 0.0, "at_stiffness_range": 0.0}
+    count = len(trained.start["stiffness"])
+    with torch.no_grad():
+        trained.offsets[:10] = 3.0  # tanh 3 = 0.995: at the bound, and above the range
+        trained.offsets[10:30] = -3.0  # at the bound, within the range
+        trained.offsets[30:70] = 0.5  # above the range, not at the bound
+    assert movement(trained) == pytest.approx({"at_bound": 30 / count, "at_stiffness_range": 50 / count})
+
+
+def test_a_texel_has_moved_by_a_tenth_of_the_scale_at_the_start():
+    trained = of_scene("field")
+    texels = trained.field.planes.texels
+    assert texels.detach().std() == pytest.approx(0.02, rel=0.1), "the scale is a setting"
+    assert movement(trained)["texels_moved"] == 0
+    with torch.no_grad():
+        texels[0] += 0.0021
+        texels[1] += 0.0019
+    assert movement(trained)["texels_moved"] == pytest.approx(1 / len(texels))
+    assert "at_bound" not in movement(trained), "no bound"
+
+
+def test_common_factors_and_strains_are_reported():
+    trained = of_scene("springs", global_stiffness=True, rest_length_bound=0.1)
+    with torch.no_grad():
+        trained.factors["stiffness"].fill_(math.log(3.0))
+        trained.offsets[:, 1] = math.inf
+    figures = movement(trained)
+    assert figures["factors"] == pytest.approx({"stiffness": 3.0})
+    assert figures["rest_strain"] == pytest.approx(math.exp(0.1) - 1, rel=1e-5)
+
+
+def gradient_over_epsilon(kind: str, epsilon: float, rate: float) -> float:
+    settings = config.Fit(epochs=1, epsilon=epsilon, learning_rate=rate, scalar_learning_rate=1e-12, field=OF_TEXELS)
+    return fit(small.fit_problem(kind=kind, fit=settings)).figures["gradient_over_epsilon"]
+
+
+def test_gradients_are_compared_with_epsilon():
+    medians = {epsilon: gradient_over_epsilon("springs", epsilon, 1e-12) for epsilon in (1e-15, 1e-3)}
+    assert medians[1e-15] == pytest.approx(1e12 * medians[1e-3], rel=1e-2)
+    assert medians[1e-15] > 1
+    run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0)))
+    run.gradients = []
+    run.epoch()
+    assert run.gradients == [float(run.parameters.offsets.grad.abs().median())]
+
+
+def test_gradients_of_texels_go_with_the_last_layer():
+    """It is zero at the first step and of the order of the rate after it. The epoch's median leaves the first step behind."""
+    slow, fast = (gradient_over_epsilon("field", 1e-15, rate) for rate in (1e-12, 1e-9))
+    assert slow > 0
+    assert fast == pytest.approx(1e3 * slow, rel=1e-2)

@@ -17,7 +17,7 @@ from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, damped_step, pr
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
-from tests.support.searches import assert_same_trace, budget
+from tests.support.searches import assert_same_trace
 
 RATES = {"stiffness": "log", "dashpot": "log", "drag": "log"}
 RANGES = {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]}
@@ -59,15 +59,6 @@ def test_the_sum_of_squares_is_the_cost(quirks, weights):
     x, v, loss, start = rollouts_of(problem, twins)
     for k, outcome in enumerate(small.judge(problem, twins, loss)):
         assert squares(loss, start, x[:, k], v[:, k]) == pytest.approx(outcome.cost, rel=FLOAT32)
-
-
-def test_residuals_beyond_a_meter_are_those_of_smooth_l1():
-    seen = small.observations()
-    away = np.linspace(0, 3, len(seen.object_points))[:, None, None]
-    problem = small.search_problem(replace(seen, object_points=seen.object_points + away))
-    twin = candidate(small.search_problem(), small.start_values())
-    x, v, loss, start = rollouts_of(problem, [twin])
-    assert squares(loss, start, x[:, 0], v[:, 0]) == pytest.approx(small.judge(problem, [twin], loss)[0].cost, rel=FLOAT32)
 
 
 def test_slopes_are_those_of_the_cost():
@@ -221,7 +212,7 @@ def test_the_polish_is_the_same_however_candidates_are_simulated(how):
     assert_same_trace(search(polished(30, rounds=2, **how), seed=1).trace, search(polished(30, rounds=2), seed=1).trace)
 
 
-@pytest.mark.parametrize("generations", [1, 2, 3])
+@pytest.mark.parametrize("generations", [1, 2])
 def test_a_killed_polish_is_replayed(tmp_path, monkeypatch, generations):
     """Killed after some of its generations: slopes, or steps."""
     record, problem = tmp_path / "trace.parquet", polished(35, rounds=3)
@@ -268,13 +259,3 @@ def test_nothing_is_polished_where_no_candidate_could_be_simulated():
 def test_the_polish_never_reads_the_future():
     first, second = (search(polished(22, rounds=1, seen=seen), seed=0) for seen in (small.observations(), small.spoiled_future()))
     assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
-
-
-def test_tied_regions_are_polished_together():
-    result = search(polished(30, rounds=1, clusters=3), seed=0)
-    assert result.trace["stage"].iloc[-1] == POLISH
-
-
-def test_the_released_row_has_no_polish():
-    assert small.released().polish_rounds == 0
-    assert set(search(budget(11), seed=0).trace["stage"]) == {CMAES}

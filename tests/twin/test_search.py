@@ -22,7 +22,6 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import candidates
-from neuspring.twin import search as module
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import search
@@ -96,26 +95,6 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     start = dict(zip(problem.variables, problem.encode(), strict=True))
     assert start == pytest.approx({name: RELEASED[name.partition(".")[0]] for name in start}, rel=CODING)
     assert np.unique(problem.labels).tolist() == list(range(clusters))
-
-
-@pytest.mark.parametrize("changes", [{}, {"scales": {"stiffness": "log"}, "ranges": {"stiffness": [1e2, 1e5]}}])
-def test_the_start_is_decoded_to_itself(changes):
-    problem = plain(clusters=3, **changes)
-    start = {name: one["start"] for name, one in config.plain(problem.search.variables).items()}
-    for name, value in problem.decode(problem.encode()).items():
-        # Counts are truncated, and 30 may come back as 29.999...
-        slack = {"abs": 1} if name.partition(".")[0] in candidates.INTEGERS else {"rel": CODING}
-        assert value == pytest.approx(start[name.partition(".")[0]], **slack)
-
-
-def test_the_logarithmic_scale_of_stiffness():
-    ranges = {"stiffness": [1e1, 1e5]}
-    middle = np.full(12, 0.5)
-    logarithmic = plain(scales={"stiffness": "log"}, ranges=ranges).decode(middle)
-    linear = plain(ranges=ranges).decode(middle)
-    assert (logarithmic["stiffness"], linear["stiffness"]) == (pytest.approx(1e3), pytest.approx(50005))
-    # No other variable is touched.
-    assert logarithmic | {"stiffness": 0} == linear | {"stiffness": 0}
 
 
 @given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
@@ -291,16 +270,6 @@ def test_allow_is_the_released_topology():
 # The search -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_truth_costs_less_than_its_neighbors():
-    problem = small.search_problem()
-    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    values = small.start_values() | {"object_radius": 0.05, "controller_radius": 0.03, "controller_neighbors": 12.0}
-    values |= {"ground_elasticity": 0.2, "ground_friction": 0.5, "stiffness": 1.2e4}
-    twins = [candidate(problem, values | {"stiffness": s}) for s in (2e3, 1.2e4, 9e4)]
-    by_stiffness = [outcome.cost for outcome in small.judge(problem, twins, loss)]
-    assert by_stiffness[1] == min(by_stiffness)
-
-
 def test_the_best_evaluated_candidate_wins_within_the_budget():
     problem = small.search_problem()
     result = search(problem, seed=0)
@@ -372,18 +341,6 @@ def test_a_larger_budget_continues_as_if_it_had_been_there_from_the_start(tmp_pa
     assert_same_trace(first.trace, whole.trace[:15])
 
 
-def test_a_smaller_budget_is_a_prefix_of_the_record_and_leaves_it(tmp_path, monkeypatch):
-    record = tmp_path / "trace.parquet"
-    whole = search(budget(24), seed=2, record=record, key="k")
-    before = record.read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "evaluate", lambda *_: pytest.fail("everything is recorded"))
-        less = search(budget(13), seed=2, record=record, key="k")
-    assert_same_trace(less.trace, whole.trace[:13])
-    assert less.cost == whole.trace["cost"][:13].min()
-    assert record.read_bytes() == before
-
-
 def tied(rollouts: int, clusters: int = 3, tied_rollouts: int = 15) -> SearchProblem:
     """A search whose regions share their values in its first rollouts; 15 end in the middle of a generation of 11."""
     problem = small.search_problem(clusters=clusters)
@@ -415,9 +372,9 @@ def test_one_region_has_nothing_to_tie():
     assert_same_trace(search(tied(22, clusters=1), seed=0).trace, search(budget(22), seed=0).trace)
 
 
-@pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15), (29, 27)])
+@pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15)])
 def test_a_search_with_tied_regions_continues_exactly(tmp_path, monkeypatch, evaluated, kept):
-    """Killed while the regions are tied, in the first generation after it, and in the second."""
+    """Killed while the regions are tied, and in the first generation after it."""
     record = tmp_path / "trace.parquet"
     die_after(evaluated, tied(30), 1, record, monkeypatch)
     assert len(pd.read_parquet(record)) == kept
@@ -476,7 +433,7 @@ def test_bad_input_is_not_mistaken_for_a_bad_candidate():
         search(small.search_problem(replace(seen, controller_points=hands)), seed=0)
 
 
-@pytest.mark.parametrize("changes", [{}, {"clusters": 3}, {"simulation": config.Simulation(initial_velocity="observed")}])
+@pytest.mark.parametrize("changes", [{"clusters": 3}, {"simulation": config.Simulation(initial_velocity="observed")}])
 def test_the_future_is_never_read(changes):
     seen = (small.observations(), small.spoiled_future())
     first, second = (search(small.search_problem(o, **changes), seed=0) for o in seen)
@@ -523,13 +480,12 @@ def crowded(**changes: object) -> SearchProblem:
     return small.search_problem(replace(seen, scenario=replace(seen.scenario, self_collision=True)), **changes)
 
 
-@pytest.mark.parametrize("make", [small.search_problem, crowded], ids=["free", "self-collision"])
-@pytest.mark.parametrize("clusters", [1, 3])
+@pytest.mark.parametrize(("make", "clusters"), [(small.search_problem, 3), (crowded, 1)], ids=["regions", "self-collision"])
 def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(make, clusters):
     """The slow path, one candidate after the other, is the specification."""
     slow = search(make(clusters=clusters, together=1), seed=3)
     assert slow.trace["substeps"].nunique() > 10
-    for how in ({}, {"together": 4}, {"together": 16}, {"threads": 2}, {"together": 1, "threads": 3}):
+    for how in ({}, {"together": 4}, {"together": 1, "threads": 3}):
         fast = search(make(clusters=clusters, **how), seed=3)
         assert_same_trace(fast.trace, slow.trace)
         assert (fast.values, fast.cost) == (slow.values, slow.cost)
@@ -545,21 +501,20 @@ def test_the_search_is_the_same_where_lists_of_partners_are_full():
 
 
 def test_threads_that_simulate_at_the_same_time_do_not_meet():
-    """Many short simulations by more threads than there are cores, again and again."""
+    """Many short simulations by more threads than there are cores, again."""
     slow = search(crowded(together=1), seed=0).trace
-    for _ in range(5):
+    for _ in range(2):
         assert_same_trace(search(crowded(together=1, threads=6), seed=0).trace, slow)
 
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [({"together": 1}, {"together": 16}), ({"threads": 2}, {"together": 1}), ({}, {"together": 4, "threads": 2})],
+    [({"threads": 2}, {"together": 1}), ({}, {"together": 4, "threads": 2})],
 )
-@pytest.mark.parametrize("where", ["made", "outcomes"])
-def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch, first, second, where):
-    """Killed in the second generation, while its candidates are made or simulated."""
+def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch, first, second):
+    """Killed in the second generation, while its candidates are simulated."""
     record = tmp_path / "trace.parquet"
-    function, calls = getattr(candidates, where), 0
+    function, calls = candidates.outcomes, 0
 
     def dying(*arguments):
         nonlocal calls
@@ -569,7 +524,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch, first
         return function(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(candidates, where, dying)
+        patch.setattr(candidates, "outcomes", dying)
         with pytest.raises(KeyboardInterrupt):
             search(small.search_problem(**first), 5, record=record, key="k")
     assert calls > 1
@@ -579,8 +534,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch, first
     assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("where", ["made", "outcomes"])
+@pytest.mark.parametrize(("where", "threads"), [("made", 1), ("made", 2), ("outcomes", 2)])
 def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, threads):
     """And the record has whole generations alone."""
     record = tmp_path / "trace.parquet"

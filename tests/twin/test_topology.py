@@ -13,11 +13,12 @@ from neuspring.core.errors import InputError
 from neuspring.twin.topology import (
     MIN_LENGTH,
     REPAIR_SPRINGS,
-    build,
+    controller_reach,
     controller_springs,
     distances,
     isolated,
     join,
+    node_spacing,
     object_springs,
     piecewise_topology,
     regions,
@@ -27,6 +28,8 @@ from tests.support.clips import NAMES, clip
 
 LENGTH = 2e-7
 """Relative: rest lengths are rounded to float32 (1.2e-7), and the record's distances were computed in another order."""
+DOUBLE = 1e-12
+"""Relative, in float64."""
 seeds = st.integers(0, 10**6)
 
 
@@ -73,13 +76,7 @@ def test_golden_springs(name: str) -> None:
     order = {tuple(sorted(pair)): length for pair, length in zip(topology.springs.tolist(), topology.rest_lengths, strict=True)}
     lengths = [order[tuple(sorted(pair))] for pair in recorded.springs.tolist()]
     np.testing.assert_allclose(lengths, recorded.rest_lengths, rtol=LENGTH)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_golden_springs_have_the_released_order_of_ends(name: str) -> None:
-    """Controllers come first in their springs, and all controller springs last."""
-    c = clip(name)
-    topology = uniform_topology(c.twin.topology.nodes, c.controllers[0], *c.topology_params)
+    # Controllers come first in their springs, and all controller springs last.
     outer = topology.springs[topology.object_spring_count :]
     assert (outer[:, 0] >= len(topology.nodes)).all()
     assert (outer[:, 1] < len(topology.nodes)).all()
@@ -106,36 +103,6 @@ def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: in
     rng, nodes = np.random.default_rng(seed), cloud(seed, count)
     radius, neighbors = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
     assert undirected(object_springs(nodes, radius, neighbors)) == brute(nodes, radius, neighbors)
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=seeds)
-def test_the_set_does_not_depend_on_node_order(seed: int) -> None:
-    nodes, order = cloud(seed), np.random.default_rng(seed + 1).permutation(25)
-    shuffled = same(nodes[order], 0.4, 7)
-    assert undirected(order[shuffled]) == undirected(same(nodes, 0.4, 7))
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=seeds, neighbors=st.integers(1, 9))
-def test_every_spring_is_asked_for_by_an_end_and_counts_are_capped(seed: int, neighbors: int) -> None:
-    """A node asks for at most neighbors - 1 others; it may have more springs, because others ask for it."""
-    nodes, radius = cloud(seed), 0.5
-    springs = same(nodes, radius, neighbors)
-    assert len(springs) <= len(nodes) * (neighbors - 1)
-    distance = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)
-    rank = distance.argsort(axis=1).argsort(axis=1)
-    for i, j in springs:
-        assert min(rank[i, j], rank[j, i]) < neighbors
-        assert distance[i, j] < radius
-
-
-def test_either_side_may_ask() -> None:
-    """Node 2 is nearest to nobody, but asks for node 1; the spring exists once, whichever side asks."""
-    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.5, 0, 0]])
-    assert undirected(same(nodes, 9.0, 2)) == {(0, 1), (1, 2)}
-    one_sided = object_springs(nodes, np.array([9.0, 9.0, 0.1]), np.array([2, 2, 2]))
-    assert undirected(one_sided) == {(0, 1)}
 
 
 def test_the_radius_is_strict() -> None:
@@ -173,26 +140,10 @@ def test_a_controller_on_a_node_is_refused() -> None:
         uniform_topology(nodes, nodes[1:], 0.5, 5, 0.5, 5)
 
 
-def test_zero_length_springs_are_refused() -> None:
-    with pytest.raises(InputError, match=r"zero-length spring \[0, 1\]"):
-        build(np.zeros((2, 3)), np.zeros((0, 3)), np.array([[0, 1]]))
-
-
 def test_a_topology_may_have_no_springs() -> None:
     topology = uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
     assert topology.springs.shape == (0, 2)
     assert topology.object_spring_count == 0
-
-
-def test_labels_and_rest_lengths() -> None:
-    nodes = cloud(3)
-    springs = same(nodes, 0.4, 6)
-    topology = build(nodes, np.zeros((0, 3)), springs, labels=np.arange(25) % 4)
-    np.testing.assert_array_equal(topology.labels, np.arange(25) % 4)
-    np.testing.assert_allclose(
-        topology.rest_lengths, np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1), rtol=LENGTH
-    )
-    assert not build(nodes, np.zeros((0, 3)), springs).labels.any()
 
 
 # Regions --------------------------------------------------------------------------------------------------------------
@@ -308,15 +259,6 @@ def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_r
     np.testing.assert_allclose(calibrated.rest_lengths[body:], distances(frame0, plain.springs[body:]), rtol=LENGTH)
 
 
-def test_without_a_rest_shape_calibration_changes_nothing() -> None:
-    one = np.zeros(25, np.int32)
-    first, other = (
-        piecewise_topology(cloud(3), cloud(4, 3), one, [0.5], [6], 0.6, 4, controller_rest=rest)
-        for rest in ("rest_shape", "first_frame")
-    )
-    np.testing.assert_array_equal(first.rest_lengths, other.rest_lengths)
-
-
 def test_another_place_of_rest_is_refused() -> None:
     with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
         replace(piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands")
@@ -358,3 +300,60 @@ def test_repair_joins_only_nodes_that_nothing_holds() -> None:
 def test_join_looks_past_nodes_at_the_same_place(copies: int) -> None:
     nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3)])
     assert undirected(join(nodes, np.zeros((0, 2), int), np.array([0]))) == {(0, copies + i) for i in range(REPAIR_SPRINGS)}
+
+
+# The spacing of nodes -------------------------------------------------------------------------------------------------
+
+
+def lattice(*counts: int) -> np.ndarray:
+    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, len(counts)).astype(float)
+
+
+def rings(count: int, of: int, apart: float, radius: float) -> np.ndarray:
+    """A straight cable along x."""
+    angle = 2 * np.pi * np.arange(of) / of
+    ring = np.stack([0 * angle, radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return (ring[None] + apart * np.array([1.0, 0, 0]) * np.arange(count)[:, None, None]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("counts", [(40, 1, 1), (15, 15, 1), (9, 8, 7)])
+def test_a_grid_has_the_spacing_of_its_nodes(counts):
+    assert node_spacing(0.018 * lattice(*counts)) == pytest.approx(0.018, rel=DOUBLE)
+
+
+@pytest.mark.parametrize("of", [3, 4, 8])
+def test_rings_of_near_nodes_have_the_distance_of_the_rings(of):
+    cable = rings(40, of, apart=0.025, radius=0.006)
+    nearest = np.linalg.norm(cable[1:of] - cable[0], axis=1).min()
+    assert nearest < 0.025 / 2
+    assert node_spacing(cable) == pytest.approx(0.025, rel=DOUBLE)
+
+
+def test_it_scales_with_the_body_and_forgets_the_order_of_its_nodes():
+    rng = np.random.default_rng(0)
+    nodes = lattice(12, 12, 1) + 0.3 * rng.random((144, 3))
+    expected = node_spacing(nodes)
+    assert node_spacing(1000 * nodes) == pytest.approx(1000 * expected, rel=DOUBLE)
+    assert node_spacing(nodes[rng.permutation(144)]) == pytest.approx(expected, rel=DOUBLE)
+
+
+def test_holes_and_nodes_at_the_same_place_do_not_count():
+    rope = lattice(60, 1, 1)
+    holes = np.delete(rope, [10, 11, 30], axis=0)
+    assert node_spacing(holes) == pytest.approx(1.0, rel=DOUBLE)
+    assert node_spacing(np.concatenate([rope, rope[::3]])) == pytest.approx(1.0, rel=DOUBLE)
+
+
+def test_parts_that_lie_farther_than_any_neighbor_are_a_forest():
+    body = lattice(8, 8, 1)
+    assert node_spacing(np.concatenate([body, body + 1000])) == pytest.approx(1.0, rel=DOUBLE)
+
+
+def test_one_place_has_no_spacing():
+    with pytest.raises(InputError, match="two nodes at different places"):
+        node_spacing(np.ones((3, 3)))
+
+
+def test_the_reach_is_that_of_the_nearest_controller():
+    hands = np.array([[0.0, 0.0, 2.0], [3.0, 0.0, 0.5], [0.0, 0.0, 9.0]])
+    assert controller_reach(lattice(5, 5, 1), hands) == 0.5

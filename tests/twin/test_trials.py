@@ -108,7 +108,7 @@ def test_candidates_that_diverge_do_not_touch_the_others(crowded):
     assert all(np.isfinite(outcome.cost) == (not outcome.diverged_frame) for outcome in together)
 
 
-@pytest.mark.parametrize("capacity", [1, 4, 7])
+@pytest.mark.parametrize("capacity", [1, 7])
 def test_overflow_is_that_of_a_candidate_alone(capacity):
     """Full lists: of every candidate, of some, of few nodes."""
     problem = colliding(small.observations(), collision_capacity=capacity)
@@ -188,8 +188,7 @@ def astray() -> Observations:
 SCENES = {"plain": small.observations, "hidden": hidden, "dark": dark, "astray": astray}
 
 
-@pytest.mark.parametrize("frozen", [False, True], ids=["own counts", "frozen counts"])
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(("scene", "frozen"), [("plain", False), ("hidden", True), ("dark", False), ("astray", True)])
 def test_the_cost_is_that_of_the_torch_losses(scene, frozen):
     problem = small.search_problem(SCENES[scene](), losses=config.Losses(chamfer=1.3, track=0.7, acceleration=0.2))
     twins, loss = candidates(problem, 3), loss_of(problem, frozen_counts=frozen)
@@ -218,7 +217,7 @@ def test_the_velocity_at_the_start_counts():
     assert costs != pytest.approx([by_torch(rest, twin, loss) for twin in twins], rel=0.01)
 
 
-@pytest.mark.parametrize("part", [0.5, 0.25, 0.1])
+@pytest.mark.parametrize("part", [0.25, 0.1])
 def test_divergence_names_the_frame_that_the_rollout_names(part):
     problem = small.search_problem()
     twins, loss = [unsteady(twin, part) for twin in candidates(problem)], loss_of(problem)
