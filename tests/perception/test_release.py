@@ -151,13 +151,6 @@ def test_observations_keep_when_controllers_hold_and_older_files_load(tmp_path):
     some = replace(plain, controller_valid=valid)
     some.save(tmp_path / "some.npz")
     np.testing.assert_array_equal(Observations.load(tmp_path / "some.npz").controller_valid, valid)
-    found = "\n".join(map(str, look_at_observations(some)))
-    assert (
-        f"hands let go: {valid.shape[1]} of {valid.shape[1]} let go, first in frame {len(valid) - 1}; while they do not hold"
-        in found
-    )
-    valid[1:3] = False
-    again = "\n".join(map(str, look_at_observations(replace(plain, controller_valid=valid))))
-    assert "let go, first in frame 1, and some take hold again, first in frame 3" in again
+    assert "hands let go" in [one.name for one in look_at_observations(some)]
     with pytest.raises(InputError, match=r"controller_valid: the shape must be \[T, C\] bool"):
         replace(plain, controller_valid=np.ones((3, 99), bool))

@@ -7,59 +7,25 @@ import numpy as np
 import pytest
 
 from neuspring.config.perception import ShapePriorSettings
-from neuspring.data.capture import OBJECT, CameraEntry, Writer
-from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.meshes import capsule, sphere, surface
-from neuspring.data.synthetic.render import Part, Renderer, quantized
+from neuspring.data.capture import OBJECT
+from neuspring.data.synthetic.meshes import capsule, sphere
 from neuspring.perception.figures import lifted_figure
-from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
-from neuspring.perception.sample import inside
+from neuspring.perception.results import ShapePrior
 from neuspring.perception.shape import front, round_chord, shape_prior, visual_hull
-from tests.support.captures import FRAMES, K, describe
+from tests.support.still import overlap, still, tracked
 
 RADIUS = 0.05
 EYE = np.array([0.5, 0.0, 0.35])
 SETTINGS = ShapePriorSettings(voxel=0.004)
-TWICE = np.diag([2.0, 2.0, 1.0]) @ K
-"""A camera of 240 x 136 pixels: 3 mm each at the object."""
 
 
 def film(folder, body, box, eyes=(EYE,)):
-    """Capture, masks, the cloud that the cameras saw, and the truth, of a still body at a height of 0.2 m."""
-    vertices, faces = surface(body, *box, 0.004)
-    renderer = Renderer([Part(vertices, faces, np.full((len(vertices), 3), 0.5), OBJECT, (30.0, 0.3))])
-    renderer.move([vertices])
-    poses = [looking(eye, np.array([0.0, 0.0, 0.2])) for eye in eyes]
-    entries = tuple(
-        CameraEntry(
-            name=str(k),
-            width=240,
-            height=136,
-            intrinsics=tuple(map(tuple, TWICE.tolist())),
-            camera_to_world=tuple(map(tuple, pose.tolist())),
-        )
-        for k, pose in enumerate(poses)
-    )
-    writer = Writer(folder, describe(cameras=entries))
-    cloud, masks = [], {}
-    for name, camera in writer.capture.cameras.items():
-        view = renderer.render(camera)
-        for frame in range(FRAMES):
-            writer.frame(name, frame, view.color, quantized(view.depth, 0.001), view.label)
-        y, x = np.nonzero(view.label == OBJECT)
-        cloud.append(camera.lift(np.stack([x, y], axis=1).astype(float), view.depth[y, x].astype(float)))
-        masks[name] = Masks(labels=np.repeat(view.label[None], FRAMES, axis=0), backend="given")
-    return writer.finish(), masks, np.concatenate(cloud), ShapePrior(vertices=vertices, faces=faces, backend="truth")
+    """A body at a height of 0.2 m; pixels are 3 mm wide there."""
+    return still(folder, body, box, eyes, (0.0, 0.0, 0.2), scale=2)
 
 
 def ball(folder, eyes=(EYE,)):
     return film(folder, sphere((0, 0, 0.2), RADIUS), ((-0.07, -0.07, 0.13), (0.07, 0.07, 0.27)), eyes)
-
-
-def overlap(first: ShapePrior, second: ShapePrior) -> float:
-    points = np.random.default_rng(0).uniform((-0.25, -0.12, 0.0), (0.12, 0.12, 0.32), (20000, 3))
-    a, b = inside(first, points), inside(second, points)
-    return float((a & b).sum() / (a | b).sum())
 
 
 def volume(prior: ShapePrior) -> float:
@@ -144,17 +110,7 @@ def test_record_and_picture_say_what_is_invented(tmp_path):
     assert prior.seen[height < -0.03].mean() < 0.05
     pictures = []
     for shown in (prior, replace(prior, seen=np.ones(len(prior.vertices), bool))):
-        lifted = LiftedTracks(
-            object_points=np.repeat(cloud[None, :50], 2, axis=0),
-            object_visibility=np.ones((2, 50), bool),
-            object_motion_valid=np.ones((2, 50), bool),
-            object_colors=np.zeros((50, 3)),
-            controller_points=np.zeros((2, 1, 3)),
-            cloud=cloud,
-            cloud_colors=np.zeros((len(cloud), 3)),
-            backend="x",
-        )
-        pictures.append(cv2.imread(str(lifted_figure(lifted, shown, tmp_path / "lifted.png"))).astype(int))
+        pictures.append(cv2.imread(str(lifted_figure(tracked(cloud[:50], 2), shown, tmp_path / "lifted.png"))).astype(int))
     # Orange is there where something is invented: much red, some green, little blue (BGR).
     orange = [int(((image[..., 2] > 220) & (image[..., 0] < 160) & (image[..., 1] > 120)).sum()) for image in pictures]
     assert orange[0] > orange[1] + 100

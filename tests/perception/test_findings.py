@@ -1,0 +1,214 @@
+"""Findings of the steps of perception, each provoked once: its name and level."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.core.findings import Finding, finding, findings_of, refuse_errors, told
+from neuspring.core.records import Recorder
+from neuspring.data.capture import HANDS, OBJECT, Writer
+from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks, mask_facts
+from neuspring.perception.results import ShapePrior
+from neuspring.perception.shape import no_prior
+from tests.support.captures import FRAMES, describe, entry
+from tests.support.still import tracked
+
+SIZE = (90, 120)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A camera with depth everywhere."""
+    intrinsics = ((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0))
+    camera = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=intrinsics)
+    writer = Writer(tmp_path, describe(cameras=(camera,)))
+    for frame in range(FRAMES):
+        writer.frame("0", frame, np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 800, np.uint16))
+    return writer.finish()
+
+
+def scene() -> np.ndarray:
+    """Labels of an object of 30 x 30 pixels with a hand beside it."""
+    labels = np.zeros((FRAMES, *SIZE), np.uint8)
+    labels[:, 30:60, 40:70] = OBJECT
+    labels[:, 30:60, 75:100] = HANDS
+    return labels
+
+
+def looked_at(capture, labels: np.ndarray) -> list[Finding]:
+    return look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels))
+
+
+def said(findings: list[Finding]) -> set[str]:
+    """Level and name of each."""
+    return {f"{one.level}: {one.name}" for one in findings}
+
+
+def test_good_masks_have_no_findings(capture):
+    assert looked_at(capture, scene()) == []
+
+
+def moved_to_the_border(labels):
+    labels[2:, 30:60, :] = np.roll(labels[2:, 30:60, :], -40, axis=2)
+
+
+def emptied(labels):
+    labels[3:][labels[3:] == OBJECT] = 0
+
+
+def split(labels):
+    labels[:, 2:22, 2:22] = OBJECT
+
+
+def shrunk(labels):
+    labels[2, 30:47, 40:70] = 0
+
+
+def sleeves(labels):
+    labels[:, :29] = labels[:, 62:] = HANDS
+
+
+def without_hand(labels):
+    labels[0][labels[0] == HANDS] = 0
+
+
+def tiny(labels):
+    labels[labels == OBJECT] = 0
+    labels[:, 40:50, 40:50] = OBJECT
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name"),
+    [
+        (moved_to_the_border, "object at the border"),
+        (emptied, "object missing"),
+        (split, "two objects"),
+        (shrunk, "mask jumps"),
+        (sleeves, "hands too large"),
+        (without_hand, "no hand in frame 0"),
+        (tiny, "small object"),
+    ],
+)
+def test_masks_that_cannot_be_right_are_said(capture, spoil, name):
+    labels = scene()
+    spoil(labels)
+    assert f"warning: {name}" in said(looked_at(capture, labels))
+
+
+def test_a_finding_says_where_value_limit_and_next_move(capture):
+    labels = scene()
+    tiny(labels)
+    text = "warning: camera 0: small object: 100 pixels of object in frame 0; at least 200 are expected. Film from nearer by."
+    assert text in map(str, looked_at(capture, labels))
+
+
+def test_an_object_without_depth_is_said(capture):
+    for frame in range(FRAMES):
+        depth = np.full(SIZE, 800, np.uint16)
+        depth[30:45, 40:70] = 0
+        cv2.imwrite(str(capture.path("depth", "0", frame)), depth)
+    assert "warning: depth holes" in said(looked_at(capture, scene()))
+
+
+def test_lost_and_few_tracks_are_said():
+    labels = scene()
+    y, x = (values[::10] for values in np.nonzero(labels[0] == OBJECT))
+    pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), FRAMES, axis=0)
+    visible = np.ones(pixels.shape[:2], bool)
+    assert look_at_tracks("0", labels, pixels, visible) == []
+    visible[3:, 3:] = False
+    assert said(look_at_tracks("0", labels, pixels, visible)) == {"warning: tracks lost"}
+    assert said(look_at_tracks("0", labels, pixels[:, :20], np.ones((FRAMES, 20), bool))) == {"warning: few tracks"}
+
+
+BOX = np.random.default_rng(0).uniform((0, 0, 0), (0.1, 0.1, 0.1), (200, 3))
+
+
+def test_size_and_place_of_the_object_are_said():
+    assert said(look_at_lifted(tracked(BOX), no_prior(), 1.0)) == {"note: size of the object"}
+    assert "warning: implausible size" in said(look_at_lifted(tracked(20.0 * BOX), no_prior(), 1.0))
+    below = "warning: object below the table"
+    assert below in said(look_at_lifted(tracked(BOX - [0, 0, 0.06]), no_prior(), 1.0))
+    # The same with z down: above and below are exchanged.
+    assert below in said(look_at_lifted(tracked(BOX), no_prior(), -1.0))
+
+
+def test_volume_and_invented_surface_are_said():
+    facts = {"volume": 0.0286, "invented_share": 0.93, "cameras": 1.0}
+    prior = ShapePrior(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]), backend="visual_hull, back: none", facts=facts)
+    assert {"warning: volume of the hull", "warning: invented surface"} < said(look_at_lifted(tracked(BOX), prior, 1.0))
+    half = replace(prior, facts={"volume": 0.002, "invented_share": 0.5, "cameras": 1.0})
+    assert said(look_at_lifted(tracked(BOX), half, 1.0)) == {"note: size of the object", "note: invented surface"}
+
+
+VISIBLE = np.ones((FRAMES, 200), bool)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"object_motion_valid": ~VISIBLE}, "motion not trusted"),
+        ({"object_visibility": VISIBLE & ((np.arange(FRAMES) < 3)[:, None] | (np.arange(200) < 2))}, "points lost"),
+        ({"facts": {"grip_elsewhere": 3.0}}, "grip elsewhere"),
+    ],
+)
+def test_lifted_tracks_that_cannot_be_right_are_said(changes, name):
+    assert f"warning: {name}" in said(look_at_lifted(replace(tracked(BOX), **changes), no_prior(), 1.0))
+
+
+def observed(hand: np.ndarray, step: np.ndarray, rate: float = 30.0, follows: bool = True) -> Observations:
+    """A box of points and three controllers at `hand`, which move by `step` per frame; the box with them if it follows."""
+    motion = np.arange(FRAMES)[:, None, None] * step
+    return Observations(
+        scenario=Scenario(
+            name="x", source="capture", category="toy", frame_count=FRAMES, train_end=FRAMES, frame_rate=rate, up="+z"
+        ),
+        object_points=BOX + motion * follows,
+        object_visibility=np.ones((FRAMES, len(BOX)), bool),
+        object_motion_valid=np.ones((FRAMES, len(BOX)), bool),
+        controller_points=hand + 0.01 * np.eye(3) + motion,
+        surface_points=np.zeros((0, 3)),
+        interior_points=np.zeros((0, 3)),
+        tracks=np.zeros((FRAMES, 0, 3)),
+    )
+
+
+ABOVE, SLOW = np.array([0.05, 0.05, 0.11]), np.array([0.0, 0.0, 0.01])
+
+
+def test_a_good_grip_has_no_findings():
+    assert look_at_observations(observed(ABOVE, SLOW)) == []
+
+
+@pytest.mark.parametrize(
+    ("observations", "name"),
+    [
+        (observed(ABOVE + np.array([0, 0, 0.06]), SLOW), "controllers hold nothing"),
+        (observed(ABOVE, 0.0 * SLOW), "controllers stand still"),
+        (observed(ABOVE, SLOW, follows=False), "object stands still"),
+        (observed(ABOVE, SLOW, rate=3000.0), "controllers too fast"),
+    ],
+)
+def test_implausible_hands_are_said(observations, name):
+    assert f"warning: {name}" in said(look_at_observations(observations))
+
+
+def test_a_hand_that_never_comes_near_is_refused():
+    with pytest.raises(InputError, match="hand far from the object"):
+        refuse_errors(look_at_observations(observed(ABOVE + np.array([0, 0, 0.5]), SLOW)))
+
+
+def test_findings_are_printed_kept_and_found_again(tmp_path, capsys):
+    one = finding("a thing", "warning", "camera 0", "5 of it", "at most 3", "Look at it.")
+    recorder = Recorder("segment", tmp_path / "scene" / "perception" / "0" / "masks.json")
+    recorder.output.parent.mkdir(parents=True)
+    recorder.save(facts={"x": 1.0} | told([one]))
+    assert capsys.readouterr().out == "warning: camera 0: a thing: 5 of it; at most 3. Look at it.\n"
+    assert findings_of(tmp_path, "scene") == [one]
+    assert told([]) == {}
+    (tmp_path / "scene" / "observations.json").write_text("{")
+    assert findings_of(tmp_path, "scene") == [one]
