@@ -8,6 +8,7 @@ from html import escape
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
 from neuspring.report.figures.twin import COLORS, region_colors, stiffness_limits
@@ -45,9 +46,9 @@ class Scale:
 
     def legend(self) -> str:
         """The legend as HTML: a bar from low to high with values and unit."""
-        stops = ", ".join(_hex(color) for color in colormaps[self.colors](np.linspace(0, 1, STEPS)))
+        stops = ", ".join(to_hex(color) for color in colormaps[self.colors](np.linspace(0, 1, STEPS)))
         middle = np.sqrt(self.low * self.high) if self.log else 0.5 * (self.low + self.high)
-        ticks = "".join(f"<span>{_number(value)}</span>" for value in (self.low, middle, self.high))
+        ticks = "".join(f"<span>{value:.3g}</span>" for value in (self.low, middle, self.high))
         kind = ", logarithmic" if self.log else ""
         return (
             f"<div style='margin:0 .6em;font-size:.8em'><b>{escape(self.title)}</b> [{escape(self.unit)}]{kind}"
@@ -145,17 +146,9 @@ def region_legend(twin: Twin) -> str:
     """The legend of regions as HTML."""
     names, counts = np.unique(twin.topology.labels, return_counts=True)
     rows = [
-        f"<span style='color:{_hex(color)}'>&#9632;</span> region {name} ({count} nodes)"
+        f"<span style='color:{to_hex(color)}'>&#9632;</span> region {name} ({count} nodes)"
         for name, count, color in zip(names, counts, region_colors(len(names)), strict=True)
     ]
     rows.append("<span style='color:#464646'>&#9632;</span> springs between regions")
     rows.append("<span style='color:#969696'>&#9632;</span> springs of hands")
     return f"<div style='margin:0 .6em;font-size:.8em'><b>region</b><br>{'<br>'.join(rows)}</div>"
-
-
-def _hex(color: np.ndarray) -> str:
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in color[:3])
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuspring.core.errors import InputError
+from neuspring.play import layers
 from neuspring.play.colors import QUANTITIES
 from neuspring.play.controls import Controls
 from neuspring.play.live import TOO_MUCH, Live
@@ -40,14 +41,14 @@ KEYS = "Keys: space plays, arrows left and right step, home and end jump, R rese
 OPENING = math.radians(45)
 """Vertical angle of view."""
 SMALL = "margin:0 .8em;font-size:.8em"
-MARKS = (
-    ("#00965a", "observed points"),
-    ("#9600c8", "annotated tracks"),
-    ("#e67800", "where the run predicts them"),
-    ("#d62728", "hands"),
-    ("#ffc800", "the node that is held"),
-    ("#3c3c3c", "cameras"),
-)
+MARKS = {
+    "observed points": layers.SEEN,
+    "annotated tracks": layers.TRACK,
+    "where the run predicts them": layers.PREDICTED,
+    "hands": layers.HAND,
+    "the node that is held": layers.GRABBED,
+    "cameras": layers.CAMERA,
+}
 """Colors of what is not a spring."""
 
 
@@ -128,7 +129,7 @@ class Page:
         for name, title in PARTS.items():
             hint, wanted = absent.get(name), getattr(self.player.display, name)
             self.parts[name] = gui.add_checkbox(title, wanted and not hint, disabled=bool(hint), hint=hint)
-        marks = "".join(f"<div><span style='color:{color}'>&#9679;</span> {text}</div>" for color, text in MARKS)
+        marks = "".join(f"<div><span style='color:rgb{color}'>&#9679;</span> {text}</div>" for text, color in MARKS.items())
         gui.add_html(f"<div style='{SMALL};margin-top:.6em'>{marks}</div>")
 
     def _add_keys(self) -> None:
