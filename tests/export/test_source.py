@@ -110,7 +110,7 @@ BROKEN = {
     "diverged": (diverged, "diverged: node 1 left.*name .*twin.npz"),
     "failed": (failed_fit, "a failure: all candidates diverged"),
     "baseline": (baseline, "a baseline's model"),
-    "older": (older, "records of format 1. Delete it and run again"),
+    "older": (older, "this version reads records of format"),
     "not a twin": (lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"), "Delete .*fit.json and run again"),
 }
 
