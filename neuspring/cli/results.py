@@ -30,23 +30,21 @@ def tables_options(parser: ArgumentParser) -> None:
 def tables(a: Namespace) -> None:
     """`neuspring tables`."""
     from neuspring.config.settings import Aim
-    from neuspring.report import gallery
-    from neuspring.report.tables import summary
-    from neuspring.report.tables.ratios import Judging
+    from neuspring.report import benchmark, gallery
     from neuspring.scores.runs import collect, collect_transfers, read_scores
 
     aims = tuple(parse(Aim, row, "--aims") for row in shared.json_value("--aims", a.aims, list))
-    judging = Judging(objects=a.objects, aims=aims)
+    judging = benchmark.Judging(objects=a.objects, aims=aims)
     if a.scores:
         scores = read_scores(a.scores)
         baseline = a.baseline or str(scores.runs["method"].iloc[0])
-        print(summary.write(replace(scores, left_out=_read_left_out(a.left_out)), baseline, a.output, judging=judging))
+        print(benchmark.write(replace(scores, left_out=_read_left_out(a.left_out)), baseline, a.output, judging=judging))
         return
     if not (a.scenarios and a.methods and a.seeds):
         raise InputError("tables", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
     collected = collect(a.results, a.scenarios, a.methods, a.seeds, _read_left_out(a.left_out))
     transfers = collect_transfers(a.results, a.transfers, a.methods, a.seeds)
-    print(summary.write(collected, a.baseline or a.methods[0], a.output, transfers, judging))
+    print(benchmark.write(collected, a.baseline or a.methods[0], a.output, transfers, judging))
     print(f"Tables: {a.output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
@@ -62,7 +60,7 @@ def perception_table_options(parser: ArgumentParser) -> None:
 
 def perception_table(a: Namespace) -> None:
     """`neuspring perception-table`."""
-    from neuspring.report.tables import perception
+    from neuspring.report import perception
 
     scenarios = [(name, str(category)) for name, category in shared.json_value("--scenarios", a.scenarios).items()]
     print(perception.write(perception.collect(a.results, scenarios), a.output.parent))
@@ -83,7 +81,7 @@ def study_options(parser: ArgumentParser) -> None:
 
 def study(a: Namespace) -> None:
     """`neuspring study`."""
-    from neuspring.report.tables import study
+    from neuspring.report import study
     from neuspring.scores.runs import read_scores
     from neuspring.scores.studies import read_studies
 

@@ -1,57 +1,14 @@
-"""The parts of a page. Blocks hold data and text. The template turns them into HTML and escapes every text."""
+"""The parts of a page as values: as HTML by a template, which escapes every text; paragraphs, lists and tables also as Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import dataclass
+from typing import ClassVar
 
 from markupsafe import Markup
 
-Tone = Literal["", "good", "bad", "warn", "mute"]
-SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chip:
-    """A word on a colored ground, with a symbol, so that nothing is said by color alone."""
-
-    text: str
-    tone: Tone = ""
-    symbol: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A cell: a main text, smaller lines and chips below it."""
-
-    text: str = ""
-    small: Sequence[str] = ()
-    chips: Sequence[Chip] = ()
-    best: bool = False
-    mark: str = ""
-    """Words for `best`, for screen readers."""
-    tone: Tone = ""
-    value: float | str | None = None
-    """Key by which the column is sorted; None: the text."""
-    wrap: bool = False
-    """May take several lines."""
-    link: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A table; the first `stub` cells of every row are its headings."""
-
-    kind: ClassVar[str] = "table"
-    caption: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
-    groups: Sequence[tuple[str, int]] = ()
-    """A line above the header: text and number of columns."""
-    stub: int = 1
-    sortable: bool = False
-    note: str = ""
+from neuspring.report.table import SYMBOLS, TEMPLATES, Chip, Table, Tone, template
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +22,11 @@ class Text:
 
 @dataclass(frozen=True, kw_only=True)
 class Items:
-    """A list."""
+    """A list below a title."""
 
     kind: ClassVar[str] = "items"
     items: Sequence[str | Link]
+    title: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,4 +149,38 @@ class Section:
     key: str
     title: str
     blocks: Sequence[Block]
-    about: str = field(default="")
+    about: str = ""
+
+
+def markdown(blocks: Sequence[Block], level: str = "##") -> str:
+    """Tables, paragraphs and lists as Markdown; what is folded on a page is not folded here."""
+    parts = []
+    for block in blocks:
+        if isinstance(block, Table):
+            parts += [f"{level} {block.caption}"] if block.caption else []
+            parts += [block.note] if block.note else []
+            parts.append("\n".join(block.markdown()))
+        elif isinstance(block, Text):
+            parts.append(f"**{block.text}**" if block.tone == "warn" else block.text)
+        elif isinstance(block, Items):
+            parts += [f"{block.title}:"] if block.title else []
+            parts.append("\n".join(f"- {item}" for item in block.items))
+        elif isinstance(block, Fold):
+            parts.append(markdown(block.blocks, level).rstrip("\n"))
+        else:
+            raise TypeError(f"{block.kind} has no Markdown")
+    return "\n\n".join(parts) + "\n" if parts else ""
+
+
+def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written: str = "", embedded: bool = True) -> str:
+    """The page as text. `embedded`: nothing but what it contains may be loaded; otherwise files beside it are shown too."""
+    return template("page.html.j2").render(
+        title=title,
+        subtitle=subtitle,
+        written=written,
+        sections=sections,
+        embedded=embedded,
+        symbols=SYMBOLS,
+        style=Markup((TEMPLATES / "style.css").read_text(encoding="utf-8")),
+        script=Markup((TEMPLATES / "page.js").read_text(encoding="utf-8")),
+    )

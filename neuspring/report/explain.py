@@ -23,8 +23,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_folder import RESULTS
 from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
-from neuspring.report.tables.cells import accounted, cells, counted, of_study
-from neuspring.report.tables.study import Made
+from neuspring.report.study import StudyRecord
+from neuspring.report.study_cells import accounted, cells, counted, restricted
 from neuspring.scores import paper
 from neuspring.scores.metrics import IN_STUDIES
 from neuspring.scores.runs import Collected, collect, one_line
@@ -96,7 +96,7 @@ def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] =
     """
     files, table = _find_table(cell, folder)
     label, task, metric = _find_cell(cell, files, table)
-    study = of_study(files.study, collect(results, files.scenarios, files.methods, files.seeds, files.left_out))
+    study = restricted(files.study, collect(results, files.scenarios, files.methods, files.seeds, files.left_out))
     wanted = (study.scores["task"] == task) & (study.scores["metric"] == metric)
     own = Collected(study.scores[wanted], study.runs, left_out=study.left_out)
     rows = _records(_only(cells(files.study, own), label, task, metric))
@@ -138,7 +138,7 @@ def _only(table: pd.DataFrame, label: str, task: str, metric: str) -> pd.DataFra
     return table[(table["label"] == label) & (table["task"] == task) & (table["metric"] == metric)]
 
 
-def _find_table(cell: str, folder: Path) -> tuple[Made, pd.DataFrame]:
+def _find_table(cell: str, folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
     """The study that a cell names: what its table was made of, and its CSV."""
     names = sorted(path.stem for path in Path(folder).glob("*.json") if path.with_suffix(".csv").is_file())
     if not names:
@@ -152,10 +152,10 @@ def _find_table(cell: str, folder: Path) -> tuple[Made, pd.DataFrame]:
     table = pd.read_csv(
         Path(folder) / f"{study}.csv", dtype=text, keep_default_na=False, na_values=[""], float_precision="round_trip"
     )
-    return Made.load(Path(folder) / f"{study}.json"), table
+    return StudyRecord.load(Path(folder) / f"{study}.json"), table
 
 
-def _find_cell(cell: str, files: Made, table: pd.DataFrame) -> tuple[str, str, str]:
+def _find_cell(cell: str, files: StudyRecord, table: pd.DataFrame) -> tuple[str, str, str]:
     """Label, task and metric of a cell. Labels may hold a slash."""
     cells = [f"{files.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
     parts = cell.split("/")

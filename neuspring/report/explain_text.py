@@ -13,7 +13,7 @@ import numpy as np
 from neuspring.core.records import canonical
 from neuspring.core.text import markdown
 from neuspring.report.explain import Behind, Explanation
-from neuspring.report.tables.render import our_change, paper_change
+from neuspring.report.study import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
 from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
 

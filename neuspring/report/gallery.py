@@ -13,8 +13,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from neuspring.core.files import write_text
-from neuspring.report.blocks import Block, Fold, Grid, Picture, Section, Text, Video
-from neuspring.report.render import html_page
+from neuspring.report.blocks import Block, Fold, Grid, Picture, Section, Text, Video, html_page
 from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected
 

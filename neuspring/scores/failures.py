@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.core.text import markdown
-from neuspring.scores.metrics import DASH, METRICS, TASKS, averages, headings_of
+from neuspring.scores.metrics import METRICS, TASKS, averages
 
 LeftOut = Mapping[str, Collection[str]]
 """Method to the scenarios to which it does not apply."""
@@ -102,31 +101,6 @@ def mean_rows(part: pd.DataFrame) -> list[tuple[str, str]]:
     """The lines of a method, from its rows of `both_averages`: what each is a mean over, and its column. One if no run failed."""
     first = part.iloc[0]
     return [("all", "own")] if first["succeeded"] == first["attempted"] else [(OWN, "own"), (ALL, "all")]
-
-
-def failures_text(table: pd.DataFrame) -> str:
-    """The section of the summary on `both_averages`; empty if no run has failed."""
-    if not len(table):
-        return ""
-    headings = headings_of(table)
-    rows = []
-    for method, part in table.groupby("method", sort=False):
-        stub = [str(method), f"{part.iloc[0]['succeeded']}/{part.iloc[0]['attempted']}"]
-        for over, column in mean_rows(part):
-            rows.append([*stub, over, *(_cell(part, key, column) for key in headings)])
-            stub = ["", ""]
-    lines = ["", "## Failures", "", f"{WHY} Errors in mm; in brackets the frame-weighted mean. {DASHES}", ""]
-    lines += markdown(["Method", "Succeeded", "Mean over", *headings.values()], rows)
-    lines += [line for text in unknown_lines(table) for line in ("", text)]
-    return "\n".join(lines) + "\n"
-
-
-def _cell(part: pd.DataFrame, key: tuple[str, str], column: str) -> str:
-    rows = part[(part["task"] == key[0]) & (part["metric"] == key[1])]
-    if not len(rows) or not np.isfinite(rows.iloc[0][column]):
-        return DASH
-    metric, row = METRICS[key[1]], rows.iloc[0]
-    return f"{metric.text(row[column])} ({metric.text(row[f'{column}_frames'])})"
 
 
 def unknown_lines(table: pd.DataFrame, labels: Labels = NOTHING) -> list[str]:

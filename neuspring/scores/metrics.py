@@ -31,6 +31,9 @@ SHORT = {"reconstruction": "Recon.", "future": "Future"}
 COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 DASH = "–"
 """Stands for a value that there is not."""
+AT_BOUND = 0.05
+"""A share of springs at the bound of their stiffness above this says that the bound was in training's way: in notes of runs and
+below tables alike."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,8 @@ PICTURE_ROLES = ("strip", "video", "turntable")
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
 """What a reader of image scores must know."""
 
-HELD = 0.05
-"""A share of springs at their bound above this, or of texels that moved below it, says that the settings were in training's way."""
+FEW_TEXELS = 0.05
+"""A share of texels that moved below this says that the settings were in training's way."""
 
 
 @stage(output="{scenario}/{method}/{seed}/run.json")
@@ -195,6 +195,8 @@ def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
 
 def _notes(records: Mapping[str, StageRecord]) -> list[str]:
     """What a reader of the scores must know although the run did not fail."""
+    from neuspring.scores.metrics import AT_BOUND
+
     notes = []
     render = records.get("render")
     if render and render.status == "failed" and records["rollout"].status == "ok":
@@ -216,11 +218,11 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
             notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
         if record.facts.get("at_ends"):
             notes.append(f"{name}: at an end of its range: {record.facts['at_ends']}")
-        if record.facts.get("at_bound", 0.0) > HELD:
+        if record.facts.get("at_bound", 0.0) > AT_BOUND:
             notes.append(
                 f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"
             )
-        if record.facts.get("texels_moved", 1.0) < HELD:
+        if record.facts.get("texels_moved", 1.0) < FEW_TEXELS:
             notes.append(f"{name}: only {record.facts['texels_moved']:.1%} of the texels moved by a tenth of their first scale")
     return notes
 

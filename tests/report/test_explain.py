@@ -15,8 +15,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RunRecord
 from neuspring.report import explain_text
+from neuspring.report import study as tables_paper
 from neuspring.report.explain import check_files, departures, explain, rerun
-from neuspring.report.tables import study as tables_paper
 from neuspring.scores import paper
 from neuspring.scores.studies import read_studies
 from neuspring.stages.score import score
@@ -210,13 +210,13 @@ def test_observations_and_records_that_changed_are_reported(results):
 
 def test_settings_are_compared_with_the_defaults_of_their_section():
     settings = {
-        "search": {"search": {"rollouts": 3, "start": {"stiffness": 1e4}}, "clusters": 5, "seed": 1},
+        "search": {"search": {"rollouts": 3, "variables": {"stiffness": {"start": 1e4}}}, "clusters": 5, "seed": 1},
         "render": {"margin": 123, "released_quirks": {"any_alpha": True, "unit_lpips": False}},
     }
     assert departures(settings) == {
         "search.clusters": 5,
         "search.search.rollouts": 3,
-        "search.search.start.stiffness": 1e4,
+        "search.search.variables.stiffness.start": 1e4,
         "render.margin": 123,
         "render.released_quirks.any_alpha": True,
     }

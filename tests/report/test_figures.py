@@ -10,12 +10,11 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
-from neuspring.report.figures import clusters as figures_clusters
-from neuspring.report.figures import ratios as figures_ratios
+from neuspring.report import benchmark as tables
+from neuspring.report.figures import benchmark as figures_benchmark
 from neuspring.report.figures import run as figures
 from neuspring.report.figures import twin as figures_twin
 from neuspring.report.figures import views as figures_views
-from neuspring.report.tables import summary as tables
 from neuspring.scores.metrics import COLUMNS
 from neuspring.scores.runs import Collected
 from neuspring.twin.topology import piecewise_topology, regions
@@ -312,7 +311,7 @@ STUDY = {
 
 
 def test_cluster_curves_are_the_means_and_deviations_over_seeds():
-    table = figures_clusters.cluster_curves(chamfer(STUDY).scores).set_index(["scenario", "task", "clusters"])
+    table = figures_benchmark.cluster_curves(chamfer(STUDY).scores).set_index(["scenario", "task", "clusters"])
     expected = {("a", 1): (12, 8**0.5), ("a", 10): (20, 0), ("b", 1): (30, 0), ("b", 10): (44, 32**0.5)}
     # Over scenarios: the seeds' means of K = 1 are 20 and 22 mm, of K = 10 they are 30 and 34 mm.
     expected |= {("", 1): (21, 2**0.5), ("", 10): (32, 8**0.5)}
@@ -326,9 +325,9 @@ def test_cluster_curves_are_the_means_and_deviations_over_seeds():
 
 def test_cluster_methods_are_sorted_by_number():
     assert list(
-        figures_clusters.cluster_methods(["clusters_10", "neuspring", "clusters_2", "clusters_2", "clusters_x"]).values()
+        figures_benchmark.cluster_methods(["clusters_10", "neuspring", "clusters_2", "clusters_2", "clusters_x"]).values()
     ) == [2, 5, 10]
-    assert figures_clusters.cluster_methods(["model_b", "neuspring"]) == {}
+    assert figures_benchmark.cluster_methods(["model_b", "neuspring"]) == {}
 
 
 @pytest.mark.parametrize(
@@ -349,9 +348,9 @@ def test_the_cluster_picture_is_made_for_two_counts_or_more(tmp_path, methods, m
 def test_few_scenarios_have_a_panel_each_and_many_share_one(tmp_path, scenarios, monkeypatch):
     values = {(f"s{i}", f"clusters_{k}", 0): 0.01 * (i + k) for i in range(scenarios) for k in (1, 2, 5)}
     kept = []
-    monkeypatch.setattr(figures_clusters, "save", lambda figure, path: kept.append(figure) or path)
+    monkeypatch.setattr(figures_benchmark, "save", lambda figure, path: kept.append(figure) or path)
     tables.write(chamfer(values), "clusters_1", tmp_path)
-    (figure,) = kept
+    figure = kept[-1]
     alone = scenarios <= 4
     assert len(figure.axes) == (scenarios if alone else 1)
     lines = figure.axes[0].lines
@@ -360,7 +359,7 @@ def test_few_scenarios_have_a_panel_each_and_many_share_one(tmp_path, scenarios,
     k, mean = (np.asarray(values, float) for values in lines[-1].get_data())
     assert k.tolist() == [1, 2, 5]
     np.testing.assert_allclose(mean, 10.0 * (k + (0 if alone else (scenarios - 1) / 2)))
-    plt.close(figure)
+    plt.close("all")
 
 
 def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monkeypatch):
@@ -368,7 +367,7 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monk
     failed = [("a", "clusters_10", 1), *((scenario, "clusters_4", seed) for scenario in "ab" for seed in (0, 1))]
     kept = []
     monkeypatch.setattr(tables, "clusters_figure", lambda scores, path, note: kept.append((scores, note)))
-    assert tables.draw_clusters(chamfer(values, failed=tuple(failed)), tmp_path) == ""
+    assert not tables.draw_clusters(chamfer(values, failed=tuple(failed)), tmp_path)
     ((scores, note),) = kept
     assert set(zip(scores["scenario"], scores["seed"], strict=True)) == {("a", 0), ("b", 0), ("b", 1)}
     # clusters_4 finished no run: it is not drawn and holds nobody back.
@@ -378,7 +377,7 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monk
 
 def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(figures_ratios, "save", lambda figure, path: kept.append(figure) or path)
+    monkeypatch.setattr(figures_benchmark, "save", lambda figure, path: kept.append(figure) or path)
     rows = [
         {
             "method": m,
@@ -392,7 +391,7 @@ def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
         for task in ("future", "reconstruction")
         for m, r in (("far", 1.1), ("near", 0.8))
     ]
-    assert figures_ratios.ratios_figure(pd.DataFrame(rows), tmp_path / "ratios.png", "") is not None
+    assert figures_benchmark.ratios_figure(pd.DataFrame(rows), tmp_path / "ratios.png", "") is not None
     (figure,) = kept
     assert [axis.get_title() for axis in figure.axes] == ["training frames", "future"]
     for axis in figure.axes:

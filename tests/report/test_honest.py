@@ -7,12 +7,12 @@ import pytest
 
 from neuspring.core.findings import finding, told
 from neuspring.core.records import Recorder
+from neuspring.report.notes import honest_notes
 from neuspring.report.page import page as report
-from neuspring.report.tables.honest import honest_notes
-from neuspring.report.tables.summary import summary_text
 from neuspring.scores.runs import Collected
 from tests.support.report_tree import make
 from tests.support.runs import run_record
+from tests.support.study_runs import summary
 
 GOOD = {
     "search.result.springs": 100,
@@ -73,7 +73,7 @@ def test_other_sources_have_no_such_notes():
 def test_notes_stand_below_the_summary_s_tables():
     seen = collected({"static": 0.0170, "ours": 0.0171}, GOOD)
     columns = {"reason": "", "images": "null", "run_key": "", "oracle": False, "floors": "{}"}
-    text = summary_text(replace(seen, runs=seen.runs.assign(**columns)), "static")
+    text = summary(replace(seen, runs=seen.runs.assign(**columns)), "static")
     assert "Of your own recordings:\n\n- bear / ours: on future frames no better than static" in text
 
 

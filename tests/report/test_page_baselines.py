@@ -12,7 +12,7 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.page import Options, write
-from neuspring.report.page.sources import Choice
+from neuspring.report.page.material import Choice
 from neuspring.scores.studies import Study
 from tests.support import report_tree
 from tests.support.report_tree import page_section as section
@@ -85,7 +85,7 @@ def test_settings_and_models_are_shown(page):
     assert "baselines.spring_gaus.anchors 1024 77" in text
     assert "baselines.spring_gaus.neighbors" not in text and "baselines.gs_dynamics" not in text
     assert "Method Model Search Regions" in text
-    assert "spring_gaus spring_gaus – – – – – ignore_hands: true" in text
+    assert "spring_gaus spring_gaus – – – ignore_hands: true" in text
 
 
 def test_a_report_of_twins_has_no_column_of_models(tmp_path):
@@ -150,7 +150,7 @@ def test_failures_have_both_averages_in_the_report(tmp_path):
     replace(failed, held_file="held.parquet").save(place / "run.json")
     page = report(folder, studies={"systems": SYSTEMS})
     text = section(page, "scores")
-    assert "spring_gaus 1 of 2 its successes" in text and "all, failures held" in text and "baseline 2 of 2 all" in text
+    assert "spring_gaus 1/2 its successes" in text and "all, failures held" in text and "baseline 2/2 all" in text
     assert "spring_gaus 1 (1 by its failures alone)" in text
     assert "SG 1/2 its successes" in section(page, "studies")
     failed.save(place / "run.json")

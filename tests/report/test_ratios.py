@@ -11,15 +11,16 @@ import pandas as pd
 from neuspring.config import parse, plain
 from neuspring.config.settings import Aim, Config
 from neuspring.core.run_record import RunRecord
-from neuspring.report.tables import study as tables_study
-from neuspring.report.tables import summary
-from neuspring.report.tables.cells import ORACLE_LINE, cells, of_study
-from neuspring.report.tables.differing import differing
-from neuspring.report.tables.ratios import Judging
+from neuspring.report import benchmark as summary
+from neuspring.report import study as tables_study
+from neuspring.report.benchmark import Judging
+from neuspring.report.notes import differing
+from neuspring.report.study_cells import ORACLE_LINE, cells, restricted
 from neuspring.scores.runs import Collected, collect, read_scores
 from neuspring.scores.studies import Study, read_studies
 from tests.support.runs import run_record
-from tests.support.study_runs import collected, write_run
+from tests.support.study_runs import collected, rows_of, write_run
+from tests.support.study_runs import summary as summary_of
 
 STUDIES = read_studies(Path(__file__).resolve().parents[2] / "config" / "studies.yaml")
 NAMES = [f"cable_{index}" for index in range(6)]
@@ -34,9 +35,9 @@ def with_oracle(values: dict[tuple[str, str, int], float], oracle: str = "oracle
 def test_an_oracle_stands_outside_every_comparison(tmp_path):
     """It finished fewer runs than the others, and is better: neither must be seen in their numbers."""
     values = {(s, m, 0): v * (1 + 0.1 * i) for i, s in enumerate("abcd") for m, v in (("x", 0.01), ("y", 0.008))}
-    without = summary.summary_text(collected(values), "x")
+    without = summary_of(collected(values))
     oracle = {("a", "oracle", 0): 0.001, ("b", "oracle", 0): 0.003}
-    text = summary.summary_text(with_oracle(values | oracle), "x")
+    text = summary_of(with_oracle(values | oracle))
     lines = text.splitlines()
     place = next(index for index, line in enumerate(lines) if ORACLE_LINE in line)
     assert lines[place + 1].startswith("| oracle") and "2.00" in lines[place + 1]
@@ -53,11 +54,11 @@ def test_an_oracle_in_a_study_is_never_marked():
     values = {(s, m, 0): v for s in NAMES for m, v in (("x", 0.01), ("y", 0.008), ("oracle", 0.001))}
     runs = with_oracle(values)
     runs = Collected(runs.scores, runs.runs.assign(source="mocap", run_key="", images="null"))
-    found = cells(study, of_study(study, runs)).set_index(["label", "metric"])
+    found = cells(study, restricted(study, runs)).set_index(["label", "metric"])
     assert found.loc[("O", "track_error"), ["verdict", "direction"]].dropna().iloc[-1] == "oracle"
-    grid = tables_study.main_grid(study, cells(study, of_study(study, runs)))
-    assert ORACLE_LINE in [names[0] for names, _ in grid.lines]
-    marked = [names[0] for names, texts in grid.lines if any(text.mark for text in texts)]
+    table = tables_study.main_table(study, cells(study, restricted(study, runs)))
+    assert ORACLE_LINE in rows_of(table)
+    marked = [row[0].text for row in table.rows if any(cell.mark for cell in row)]
     assert marked == ["y"]
 
 
@@ -70,7 +71,7 @@ def test_records_say_which_method_is_an_oracle_and_what_the_floor_is(tmp_path):
     found = collect(tmp_path, ["a", "b"], ["x", "o"], [0])
     assert found.oracles == ("o",)
     assert set(found.comparison.runs["method"]) == {"x"}
-    text = summary.summary_text(found, "x")
+    text = summary_of(found)
     assert "Floor in frame 0: CD 7.00 mm, TE 3.50 mm; TE bound 0 by construction." in text
     floors = summary.floors_of(found.runs).set_index("metric")["value"]
     assert floors.to_dict() == {"chamfer_floor": 0.007, "track_error_floor": 0.0035}
@@ -79,9 +80,9 @@ def test_records_say_which_method_is_an_oracle_and_what_the_floor_is(tmp_path):
 def test_the_new_metric_is_left_out_where_no_run_has_it():
     values = {(s, m, 0): 0.01 for s in "abc" for m in "xy"}
     old = collected(values)
-    assert "TE bound" not in summary.summary_text(old, "x")
+    assert "TE bound" not in summary_of(old)
     new = Collected(pd.concat([old.scores, old.scores.assign(metric="track_error_bound", value=0.004)]), old.runs)
-    text = summary.summary_text(new, "x")
+    text = summary_of(new)
     header = next(line for line in text.splitlines() if "Future TE" in line)
     assert "Future TE bound" in header and "Recon. TE bound" not in header
     assert "4.00 (4.00)" in text
@@ -158,7 +159,8 @@ def test_aims_reach_the_summary_and_its_file(tmp_path):
     judging = Judging(aims=tuple(parse(Aim, row, "here") for row in plain(config)["aims"]))
     text = summary.write(collected(values), "x", tmp_path, judging=judging)
     assert pd.read_csv(tmp_path / "aims.csv")["aim_verdict"].tolist() == ["reached", "missed"]
-    assert "| reached |" in text.replace("  ", " ") and "missed" in text
+    assert [row[-1].plain for row in summary.aim_table(pd.read_csv(tmp_path / "aims.csv"))[0].rows] == ["reached", "missed"]
+    assert "## Aims" in text
     table = pd.read_csv(tmp_path / "ratios.csv")
     assert table["verdict"].tolist() == ["below 1"]
     np.testing.assert_allclose(table["ratio"], 0.7 * np.exp(np.log1p(0.02 * np.arange(4)).mean()))

@@ -13,10 +13,10 @@ from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.data.phystwin import released_cases
-from neuspring.report.tables import cells as tables_cells
-from neuspring.report.tables import render as tables_render
-from neuspring.report.tables import study as tables_paper
-from neuspring.report.tables import summary as tables
+from neuspring.report import benchmark as tables
+from neuspring.report import study as tables_paper
+from neuspring.report import study_cells as tables_cells
+from neuspring.report.table import tex
 from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, averages
 from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores
@@ -45,7 +45,7 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
 def cells_of(name: str, runs: Collected) -> pd.DataFrame:
     """The cells of a study, by label, task and metric."""
     study = STUDIES[name]
-    return tables_cells.cells(study, tables_cells.of_study(study, runs)).set_index(["label", "task", "metric"])
+    return tables_cells.cells(study, tables_cells.restricted(study, runs)).set_index(["label", "task", "metric"])
 
 
 def everywhere(method: str, scores: Mapping[tuple[str, str], float], scenarios=RELEASED) -> dict:
@@ -218,7 +218,7 @@ def test_a_change_that_the_paper_does_not_show_is_not_confirmed():
     )
     key = ("reconstruction", "ssim")
     runs = collected(varied({"model_a": 1.0, "model_b_one_frame": 0.8}, metric=key))
-    found = tables_cells.cells(study, tables_cells.of_study(study, runs)).set_index(["label", "task", "metric"])
+    found = tables_cells.cells(study, tables_cells.restricted(study, runs)).set_index(["label", "task", "metric"])
     assert found.loc[("Model-B (NSF)", *key), "direction"] == "no change in the paper"
 
 
@@ -226,7 +226,7 @@ def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
     values = everywhere("baseline", {CD: 0.01}, ["a", "b"]) | everywhere("neuspring_one_frame", {CD: 0.02}, ["a"])
     values["b", "baseline", 0] = {CD: 0.5}
     runs = collected(values, failed=(("b", "neuspring_one_frame", 0),))
-    own = tables_cells.of_study(STUDIES["table2"], runs)
+    own = tables_cells.restricted(STUDIES["table2"], runs)
     found = cells_of("table2", runs)
     assert found.loc[("Baseline", *CD), "ours"] == pytest.approx(0.01)
     assert found.loc[("NeuSpring (PT+NSF)", *CD), ["ok", "failed", "missing"]].tolist() == [1, 1, 0]
@@ -296,9 +296,8 @@ def test_best_and_second_best_are_marked_where_the_paper_marks_them(written):
     latex = (out / "table1.tex").read_text()
     assert r"\underline{0.005}" in latex
     assert r"\textbf{0.004}" in latex
-    assert r"\underline" not in tables_render.as_latex(
-        tables_render.main_grid(STUDIES["table2"], cells_of("table2", collected({})).reset_index()), "x", "x"
-    )
+    of_two = tables_paper.main_table(STUDIES["table2"], cells_of("table2", collected({})).reset_index())
+    assert "second" not in {cell.mark for row in of_two.rows for cell in row}
 
 
 def test_latex_can_be_input(written):
@@ -315,9 +314,7 @@ def test_latex_can_be_input(written):
         for row in rows:
             spans = [int(count) - 1 for count in re.findall(r"\\multicolumn\{(\d+)\}", row)]
             assert len(re.findall(r"(?<!\\)&", row)) + sum(spans) == columns - 1
-    assert tables_render.tex("50 % of a_b & #1 [-0.3, +2] {x} 0.1 ± 0.2 –") == (
-        r"50 \% of a\_b \& \#1 {[}$-$0.3, +2] \{x\} 0.1 $\pm$ 0.2 --"
-    )
+    assert tex("50 % of a_b & #1 [-0.3, +2] {x} 0.1 ± 0.2 –") == (r"50 \% of a\_b \& \#1 {[}$-$0.3, +2] \{x\} 0.1 $\pm$ 0.2 --")
 
 
 def test_breakdowns_hold_every_finished_run(written):
@@ -348,7 +345,7 @@ def test_ours_stands_beside_the_released_values(written):
 
 def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values():
     runs = collected(everywhere("baseline", {CD: 0.012}), source="phystwin_raw")
-    own = tables_cells.of_study(STUDIES["table1"], runs)
+    own = tables_cells.restricted(STUDIES["table1"], runs)
     assert tables_paper.released_comparison(own, "baseline")["ours"].isna().all()
 
 

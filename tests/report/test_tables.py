@@ -6,11 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.report.tables import summary as tables
+from neuspring.report import benchmark as tables
+from neuspring.report.benchmark import Benchmark, errors_table, not_counted, score_blocks
+from neuspring.report.table import Cell, Chip, Table
 from neuspring.scores.metrics import COLUMNS
 from neuspring.scores.runs import Collected, collect
 from neuspring.scores.statistics import paired_differences, resampled_means
-from tests.support.study_runs import collected
+from tests.support.study_runs import collected, rows_of, summary, tables_in
 
 
 def test_paired_differences_use_the_same_scenario_and_seed():
@@ -66,7 +68,7 @@ def test_the_ratio_weighs_a_scenario_of_large_errors_like_another():
     perfect = paired_differences(collected(values | {("c", "y", 0): 0.0}).scores, "x").iloc[0]
     assert np.isnan(perfect["ratio"])
     assert np.isfinite(perfect["difference"])
-    assert "0.794 [" in tables.summary_text(collected(values), "x")
+    assert "0.794 [" in summary(collected(values))
 
 
 def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
@@ -97,56 +99,52 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
 
 
 def test_pictures_have_a_table_of_their_own():
-    text = tables.summary_text(with_images(), "x")
-    assert "Of 2 scenarios 1 have scores of pictures." in text
-    assert "Cameras scored: 0; masks: given; rasterizer: warp; none of the released evaluation's quirks." in text
-    (row,) = [line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line and "0.0500" in line]
-    assert "0.9500 (0.9500)" in row
-    assert "Part of the surface that no camera sees in frame 0: a 25%." in text
+    found = tables_in(score_blocks(Benchmark(everything=with_images(), baseline="x")))
+    (table,) = [table for caption, table in found.items() if caption.startswith("Pictures: PSNR")]
+    row = rows_of(table)["y"]
+    assert row["Recon. PSNR"].text == "33.00" and row["Recon. LPIPS"].text == "0.0500"
+    assert row["Recon. SSIM"].plain == "0.9500 (0.9500)" and row["Recon. SSIM"].mark == "best"
     # Runs are those with images; a percentage of decibels would mean nothing.
-    assert row.endswith("| 1/1  |")
-    assert "+3.00" in text
-    assert "+3.00 (" not in text
-    assert "+3.00" in text
+    assert row["Runs"].text == "1/1"
+    assert rows_of(found["Pictures: paired difference to x"])["y"]["Recon. PSNR"].plain == "+3.00"
+    assert table.note.startswith(
+        "Of 2 scenarios 1 have scores of pictures. Cameras scored: 0; masks: given; rasterizer: warp; none of"
+    )
+    assert "frame 0: a 25%." in summary(with_images())
 
 
 def test_what_was_not_computed_is_said_and_never_a_number():
-    text = tables.summary_text(with_images("no AlexNet weights: x is not there", ("any_alpha",)), "x")
-    assert "LPIPS not computed: no AlexNet weights: x is not there" in text
-    header = next(line for line in text.splitlines() if "Recon. PSNR" in line)
-    assert "not computed" in next(line for line in text.splitlines() if line.startswith("| y ") and "33.00" in line)
-    assert "Recon. LPIPS" in header
-    assert "released quirks: any_alpha" in text
+    runs = with_images("no AlexNet weights: x is not there", ("any_alpha",))
+    found = tables_in(score_blocks(Benchmark(everything=runs, baseline="x")))
+    (table,) = [table for caption, table in found.items() if caption.startswith("Pictures: PSNR")]
+    assert rows_of(table)["y"]["Recon. LPIPS"].text == "not computed"
+    assert "released quirks: any_alpha" in table.note
+    assert "LPIPS not computed: no AlexNet weights: x is not there" in summary(runs)
 
 
 def test_scenarios_without_images_are_said_to_have_none():
     one = collected({("a", "x", 0): 0.01})
-    text = tables.summary_text(Collected(one.scores, one.runs.assign(images="null")), "x")
+    text = summary(Collected(one.scores, one.runs.assign(images="null")))
     assert "No scores of pictures: these scenarios have no images" in text
 
 
 def test_pictures_that_could_not_be_made_say_why():
     one = collected({("a", "x", 0): 0.01})
     failed = json.dumps({"failed": "appearance: step 3 removed the last splat"})
-    text = tables.summary_text(Collected(one.scores, one.runs.assign(images=failed)), "x")
+    text = summary(Collected(one.scores, one.runs.assign(images=failed)))
     assert "No scores of pictures: appearance: step 3 removed the last splat." in text
 
 
-def test_a_method_that_has_not_begun_does_not_empty_the_table():
-    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008}
-    text = tables.summary_text(collected(values, failed=(("a", "z", 0),)), "x")
-    assert "10.00" in text
-    assert "8.00" in text
-    assert "a / z / seed 0: failed: diverged" in text
-
-
-def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
+def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_listed():
+    """A method that has finished nothing does not empty the table."""
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
-    text = tables.summary_text(collected(values, failed=(("b", "y", 0),)), "x")
-    assert "10.00" in text
-    assert "500" not in text
-    assert "b / y / seed 0: failed: diverged" in text
-    assert "1/2 (1 failed)" in text
+    found = collected(values, failed=(("b", "y", 0), ("a", "z", 0)))
+    rows = rows_of(errors_table(Benchmark(everything=found, baseline="x")))
+    assert [rows[name]["Future TE"].text for name in "xyz"] == ["10.00", "8.00", "–"]
+    assert [rows[name]["Runs"].text for name in "xyz"] == ["2/2", "1/2 (1 failed)", "0/1 (1 failed)"]
+    assert [rows[name]["Future TE"].mark for name in "xyz"] == ["", "best", ""]
+    (listed,) = not_counted(found.runs)
+    assert listed.items == ["b / y / seed 0: failed: diverged", "a / z / seed 0: failed: diverged"]
 
 
 def test_missing_runs_are_listed(tmp_path):
@@ -160,10 +158,10 @@ def test_missing_runs_are_listed(tmp_path):
 def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
     found = collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
     found.runs.loc[0, ["status", "reason"]] = ["failed", "diverged"]
-    text = tables.summary_text(found, "x")
-    assert "- s0 / x / seed 0: failed: diverged" in text
-    assert "- 17 runs have not finished, or were not asked for (" in text
-    assert "x 8" in text and "y 9" in text and "runs.csv names them" in text
+    (listed,) = not_counted(found.runs)
+    failed, missing = listed.items
+    assert failed == "s0 / x / seed 0: failed: diverged"
+    assert missing.startswith("17 runs have not finished") and "x 8" in missing and "y 9" in missing
 
 
 def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
@@ -174,10 +172,10 @@ def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
         f"fit: {10 + i}% of the springs lie at the bound; search: at an end of its range: dashpot" if x else ""
         for i, x in enumerate(of_x)
     ]
-    few = tables.summary_text(found, "x")
+    few = summary(found)
     assert "- s0 / x / seed 0: fit: 10% of the springs" in few
     found.runs.loc[~of_x, "notes"] = "fit: no epoch was better than the search"
-    many = tables.summary_text(found, "x")
+    many = summary(found)
     assert "- x, 9 of 9 runs: fit: 10 to 26% of the springs lie at the bound" in many
     assert "- x, 9 of 9 runs: search: at an end of its range: dashpot" in many
     assert "- y, 9 of 9 runs: fit: no epoch was better than the search" in many
@@ -187,15 +185,31 @@ def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
 def test_no_spread_is_shown_where_one_seed_of_several_has_finished():
     found = collected({("a", "x", 0): 0.010})
     rest = pd.DataFrame([{"scenario": "a", "method": "x", "seed": 1, "status": "missing", "reason": "", "notes": ""}])
-    text = tables.summary_text(Collected(found.scores, pd.concat([found.runs, rest])), "x")
-    assert "10.00 (10.00)" in text
-    assert "standard deviation" not in text
+    table = errors_table(Benchmark(everything=Collected(found.scores, pd.concat([found.runs, rest])), baseline="x"))
+    assert rows_of(table)["x"]["Future TE"].plain == "10.00 (10.00)"
+    assert "standard deviation" not in table.note
+
+
+def test_a_table_is_drawn_as_markdown_latex_and_html():
+    cell = Cell(text="1.5 ± 0.1", small=["(-2)"], chips=[Chip(text="worse", tone="bad", symbol="▼")], mark="second", value=1.5)
+    rows = [[Cell(text="a|b"), cell, Cell(text="<3")], [Cell(text="a long heading of rows"), Cell(), Cell()]]
+    table = Table(caption="C", header=["Method", "CD ↓", "CD ↓"], groups=["Recon.", "Future"], rows=rows, note="50 % of a_b")
+    head, rule, first, second = table.markdown()
+    assert first == "| a\\|b   | <ins>1.5 ± 0.1 (-2): worse</ins> | <3          |"
+    assert second == "| *a long heading of rows* | | |" and len(head) == len(rule) == len(first)
+    latex = table.latex("label", "T & U")
+    assert r"a$|$b & \underline{1.5 $\pm$ 0.1 ($-$2): worse} & $<$3 \\" in latex
+    assert r"\multicolumn{1}{c}{Reconstruction \& Resimulation}" in latex and r"\caption{\textbf{T \& U.} 50 \% of a\_b}" in latex
+    page = table.html()
+    assert page.count("<table") == 2 and "<caption>C: Future Prediction</caption>" in page
+    assert '<td data-value="1.5"><b>1.5 ± 0.1</b><span class="hidden"> (second)</span><small>(-2)</small>' in page
+    assert '<span class="chip bad"><span aria-hidden="true">▼</span> worse</span>' in page and "&lt;3" in page
 
 
 def test_runs_of_different_settings_are_pointed_out():
     found = collected({("a", "x", 0): 0.010, ("a", "x", 1): 0.011, ("a", "y", 0): 0.010, ("a", "y", 1): 0.011})
     digests = [{"search": "s", "fit": "f"}, {"search": "s", "fit": "g"}, {"search": "s"}, {"search": "s"}]
     found.runs["settings"] = [json.dumps(row) for row in digests]
-    assert "Runs were made with different settings (fit of x): make the older ones again" in tables.summary_text(found, "x")
+    assert "Runs were made with different settings (fit of x): make the older ones again" in summary(found)
     found.runs["settings"] = json.dumps(digests[0])
-    assert "different settings" not in tables.summary_text(found, "x")
+    assert "different settings" not in summary(found)

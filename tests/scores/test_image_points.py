@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Trajectory
 from neuspring.data.capture import Camera
-from neuspring.report.tables.summary import marked_lines
+from neuspring.report.benchmark import marked_blocks
 from neuspring.scores import metrics
 from neuspring.scores.image_points import BEHIND, carried_in_image, points_in_image, points_on_table
 from tests.support.colored import observed
+from tests.support.study_runs import rows_of
 
 K = np.array([[400.0, 0, 320], [0, 410.0, 240], [0, 0, 1]])
 DEPTH = 0.8
@@ -130,6 +131,5 @@ def test_scores_of_color_alone_have_the_errors_of_marked_points():
     assert not len(
         metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0).query("metric == 'image_error'")
     )
-    lines = marked_lines(rows, pd.DataFrame({"method": ["still"], "scenario": ["small"], "status": ["ok"]}))
-    assert "Recon. Marked" in "\n".join(lines)
-    assert "12.0" in "\n".join(lines)
+    (table,) = marked_blocks(rows, pd.DataFrame({"method": ["still"], "scenario": ["small"], "status": ["ok"]}))
+    assert rows_of(table)["still"]["Future Marked"].text == "12.0"

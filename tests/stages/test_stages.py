@@ -12,7 +12,7 @@ from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
-from neuspring.report.tables import summary as tables
+from neuspring.report import benchmark as tables
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
 from neuspring.stages.fit import fit
@@ -248,7 +248,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     by_name = collected.runs.set_index("scenario")
     assert by_name.loc["bad", "status"] == "failed"
     assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
-    text = tables.summary_text(collected, "phystwin")
+    text = tables.summary_text(tables.Benchmark(everything=collected, baseline="phystwin"))
     assert "1/2 (1 failed)" in text
     assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
     assert "nan" not in text.lower()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,9 @@ import pandas as pd
 
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import key_of
+from neuspring.report.benchmark import Benchmark, summary_text
+from neuspring.report.blocks import Block, Fold
+from neuspring.report.table import Cell, Table
 from neuspring.scores.metrics import COLUMNS, UNITS
 from neuspring.scores.runs import Collected
 from tests.support.runs import run_record
@@ -96,3 +99,22 @@ def write_benchmark(
         for seed in seeds:
             for method, factor in methods.items():
                 write_run(results, scenario, method, seed, all_scores(size * factor * rng.uniform(0.99, 1.01)), **facts)
+
+
+def summary(found: Collected, baseline: str = "x") -> str:
+    """The scores of a benchmark in Markdown."""
+    return summary_text(Benchmark(everything=found, baseline=baseline))
+
+
+def tables_in(blocks: Sequence[Block]) -> dict[str, Table]:
+    """Tables by their captions, folded ones too."""
+    own = {block.caption: block for block in blocks if isinstance(block, Table)}
+    return own | {name: table for block in blocks if isinstance(block, Fold) for name, table in tables_in(block.blocks).items()}
+
+
+def rows_of(table: Table) -> dict[str, dict[str, Cell]]:
+    """First cell of a row to its cells by heading; of several rows with the same first cell, the first."""
+    rows: dict[str, dict[str, Cell]] = {}
+    for row in table.rows:
+        rows.setdefault(row[0].text, dict(zip(table.headings, row, strict=True)))
+    return rows

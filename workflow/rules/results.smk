@@ -16,7 +16,7 @@ rule perception_table:
         runtime=NEEDS.minutes("perception_table"),
     params:
         arguments=ARGUMENTS.perception(GRAPH.judged(BENCHMARK.whole.scenarios)),
-        code=code_digest("neuspring.report.tables.perception"),
+        code=code_digest("neuspring.report.perception"),
     shell:
         common_job("perception-table {params.arguments:q} --output {output:q}")
 
@@ -36,7 +36,7 @@ rule tables:
         runtime=NEEDS.minutes("tables"),
     params:
         arguments=ARGUMENTS.tables(),
-        code=code_digest("neuspring.report.tables.summary", "neuspring.report.gallery"),
+        code=code_digest("neuspring.report.benchmark", "neuspring.report.gallery"),
     shell:
         common_job("tables {params.arguments:q}")
 
@@ -58,7 +58,7 @@ rule study:
         definition=lambda wildcards: json.dumps(
             settings.plain(BENCHMARK.studies[wildcards.study])
         ),
-        code=code_digest("neuspring.report.tables.study"),
+        code=code_digest("neuspring.report.study"),
     shell:
         common_job("study {params.arguments:q}")
 

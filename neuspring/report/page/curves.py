@@ -1,12 +1,16 @@
-"""Curves of search costs, losses, and errors over time: a panel per scenario with a line per method."""
+"""Curves of search costs, losses, and errors over time: a panel per scenario with a line per method, drawn on white as SVG."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import base64
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -16,9 +20,49 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
-from neuspring.report.page import draw
-from neuspring.report.page.sources import UNREADABLE, Material, Run
+from neuspring.report.page.material import UNREADABLE, Material, Run
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
+
+COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
+"""Of methods."""
+DASHES = (("-", ""), ((0, (5, 2)), "7 3"), ((0, (1.5, 1.5)), "2 2"), ((0, (6, 2, 1.5, 2)), "8 3 2 3"))
+"""Line styles for matplotlib and for SVG. Each is used with all colors before the next one."""
+STYLE = {
+    "svg.fonttype": "none",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+}
+
+
+def line_style(index: int) -> tuple[str, tuple[object, str]]:
+    """Color, and line style for (matplotlib, SVG), of the i-th line."""
+    return COLORS[index % len(COLORS)], DASHES[(index // len(COLORS)) % len(DASHES)]
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Figures made here fit the page."""
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        yield
+
+
+def svg(figure: Figure, caption: str, alt: str) -> Picture:
+    """The figure as a picture; equal figures have equal bytes."""
+    stream = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": alt, "svg.fonttype": "none"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    data = base64.b64encode(stream.getvalue()).decode("ascii")
+    return Picture(caption=caption, alt=alt, data=f"data:image/svg+xml;base64,{data}", paper=True)
+
+
+def thinned(count: int, most: int = 120) -> Sequence[int]:
+    """Indices of at most `most` of `count` points, the ends included."""
+    if count <= most:
+        return range(count)
+    return [round(i * (count - 1) / (most - 1)) for i in range(most)]
+
 
 PENALTY = 1e3
 """Costs above this stand for candidates that could not be simulated."""
@@ -54,7 +98,7 @@ class Plot:
     """Shown without a click, however many panels there are."""
 
 
-def section(material: Material) -> Section:
+def curves_section(material: Material) -> Section:
     """Error, search, fit and training curves of the shown methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
@@ -71,7 +115,7 @@ def _plot(material: Material, plot: Plot, scenarios: Iterable[str]) -> list[Bloc
         return []
     order = {name: index for index, name in enumerate(material.choice.shown)} if plot.of_methods else {}
     lines = sorted({name for curves in panels.values() for name in curves.by_name}, key=lambda name: (order.get(name, 0), name))
-    styles = {name: draw.line_style(order.get(name, index)) for index, name in enumerate(lines)}
+    styles = {name: line_style(order.get(name, index)) for index, name in enumerate(lines)}
     legend = Legend(entries=[(name, color, dash[1]) for name, (color, dash) in styles.items()])
     pictures = [_panel(curves, styles, scenario, plot.title) for scenario, curves in panels.items()]
     inner: list[Block] = [Text(text=plot.about), legend, Grid(blocks=pictures)]
@@ -211,7 +255,7 @@ PLOTS = (
 
 def _panel(curves: Curves, styles: Mapping[str, Any], scenario: str, title: str) -> Picture:
     future = curves.future
-    with draw.styled():
+    with styled():
         figure = Figure(figsize=PANEL)
         axis = figure.add_axes(FRAME)
         for name in reversed(list(curves.by_name)):
@@ -222,12 +266,12 @@ def _panel(curves: Curves, styles: Mapping[str, Any], scenario: str, title: str)
             axis.set_xlim(0, end)
         _scale(axis, log=future is None)
         axis.tick_params(length=2.5, width=0.6)
-        return draw.svg(figure, scenario, f"{title}, {scenario}: {', '.join(curves.by_name)}")
+        return svg(figure, scenario, f"{title}, {scenario}: {', '.join(curves.by_name)}")
 
 
 def _lines(axis: Axes, by_seed: Mapping[int, pd.Series], color: str, dash: tuple[Any, str]) -> None:
     for index, values in enumerate(by_seed.values()):
-        steps = list(draw.thinned(len(values)))
+        steps = list(thinned(len(values)))
         style: dict[str, Any] = {"color": color, "ls": dash[0], "lw": 0.8 if index else 1.5, "alpha": FAINT if index else 1.0}
         style["marker"] = "o" if len(steps) == 1 else ""
         axis.plot(values.index[steps], values.to_numpy()[steps], ms=3, **style)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,14 +15,27 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import now
 from neuspring.core.run_record import RUN_RECORD
-from neuspring.report.blocks import Block, Facts, Grid, Picture, Section, Text
-from neuspring.report.page import curves, failures, findings, pictures, prose, scores, setup, studies, work
-from neuspring.report.page.media import Media, embedded_png
-from neuspring.report.page.sources import Choice, Material, Run, damaged_records, job_records, on_disk
-from neuspring.report.page.words import hours, listed, several
-from neuspring.report.render import html_page
-from neuspring.report.tables.ratios import Judged, Judging, judged
-from neuspring.report.tables.summary import compared, draw_clusters, draw_ratios
+from neuspring.report import study_cells
+from neuspring.report.benchmark import (
+    Benchmark,
+    Judging,
+    breakdown_blocks,
+    draw_clusters,
+    draw_ratios,
+    score_blocks,
+    transfer_blocks,
+)
+from neuspring.report.blocks import Block, Facts, Fold, Grid, Picture, Section, Text, Verdict, html_page
+from neuspring.report.figures.benchmark import CLUSTERS, RATIOS
+from neuspring.report.page.curves import curves_section
+from neuspring.report.page.material import Choice, Material, Run, damaged_records, hours, job_records, listed, on_disk, several
+from neuspring.report.page.pictures import Media, embedded_png, pictures_section, wanted_pictures
+from neuspring.report.page.setup import perception_section, setup_section, tuning_section
+from neuspring.report.page.work import failures_section, findings_section, gpu_hours, work_section
+from neuspring.report.study import StudyNumbers, kind, study_blocks, verdict_chip
+from neuspring.report.study_cells import BETTER, WITHIN, WORSE
+from neuspring.report.table import Tone
+from neuspring.scores import paper
 from neuspring.scores.failures import LeftOut
 from neuspring.scores.runs import collect, collect_transfers
 from neuspring.scores.studies import Study
@@ -31,6 +45,10 @@ MARKUP = 400
 """Characters around an embedded picture."""
 MOST_SHOWN = 6
 """Methods that are drawn unless others are asked for."""
+ANSWERED = (WITHIN, BETTER, WORSE)
+WITHOUT_DIRECTION = (study_cells.NOT_RUN, study_cells.NOT_COMPUTED, study_cells.NOTHING_TO_COMPARE, study_cells.NO_VALUE, ")")
+"""Ends of verdicts on a change that name no direction; a bracket counts failed runs."""
+Studies = Mapping[str, StudyNumbers]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,24 +86,32 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         raise InputError(results, "the results folder must exist", "no such folder", "Run the workflow first, or name another.")
     written = written or now()
     material = gather(results, Path(output), options)
-    cells = studies.study_cells(material) if material.choice.size else {}
-    sections = _sections(material, cells)
-    sections |= _last(material, cells)
+    studies = _studies(material) if material.choice.size else {}
+    sections = _sections(material, studies)
+    sections |= _last(material, studies)
     # Pictures take the room that all else leaves.
     room = int(MEGABYTE * options.megabytes) - len(_page(material, list(sections.values()), written).encode())
-    wanted = pictures.wanted(material)
+    wanted = wanted_pictures(material)
     media = Media(material.output, wanted, room - MARKUP * len(wanted), int(MEGABYTE * options.video_megabytes))
     for path, reason in media.damaged.items():
         material.lost(path, reason)
-    sections |= {"pictures": pictures.section(material, media)} | _last(material, cells)
+    sections |= {"pictures": pictures_section(material, media)} | _last(material, studies)
     write_text(material.output, _page(material, list(sections.values()), written))
     return material.output
 
 
-def _last(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
+def _studies(material: Material) -> dict[str, StudyNumbers]:
+    known = material.studies
+    return {
+        name: StudyNumbers(name=name, study=study, collected=material.collected, beside=known.get(study.beside or ""))
+        for name, study in known.items()
+    }
+
+
+def _last(material: Material, studies: Studies) -> dict[str, Section]:
     """The sections that list damaged files; they are made last, because every other section may find some."""
-    verdicts = studies.verdicts(material, cells) if cells else []
-    return {"failures": failures.section(material), "verdict": _summary(material, verdicts)}
+    verdicts = [_verdict(numbers) for numbers in studies.values() if numbers.study.reference]
+    return {"failures": failures_section(material), "verdict": _summary(material, verdicts)}
 
 
 def gather(results: Path, output: Path, options: Options) -> Material:
@@ -139,25 +165,20 @@ def _choice(results: Path, options: Options, there: tuple[list[str], list[str], 
     )
 
 
-def _sections(material: Material, cells: Mapping[str, pd.DataFrame]) -> dict[str, Section]:
+def _sections(material: Material, studies: Studies) -> dict[str, Section]:
     """All in order, by key; those that depend on the others are empty."""
-    usable, differences = compared(material.collected, material.choice.baseline)
-    config = material.settings or Config()
-    figures = judged(
-        material.collected, material.choice.baseline, Judging(objects=config.objects, aims=config.aims), material.transfers
-    )
     parts = [
         _empty("verdict"),
-        studies.section(material, cells) if cells else None,
-        _with_figures(material, scores.section(material, usable, differences, figures), usable, figures),
-        curves.section(material),
+        _study_section(studies) if studies else None,
+        _score_section(material),
+        curves_section(material),
         _empty("pictures"),
-        findings.section(material),
-        prose.perception(material),
-        prose.tuning(material),
-        work.section(material),
+        findings_section(material),
+        perception_section(material),
+        tuning_section(material),
+        work_section(material),
         _empty("failures"),
-        setup.section(material),
+        setup_section(material),
     ]
     return {part.key: part for part in parts if part is not None}
 
@@ -175,7 +196,7 @@ def _summary(material: Material, verdicts: Sequence[Block]) -> Section:
     status = runs["status"].value_counts().to_dict()
     damaged = f", or of {several(len(material.damaged), 'damaged file')}" if material.damaged else ""
     failed_jobs = sum(job.failed for job in material.jobs)
-    spent, source = work.gpu_hours(material)
+    spent, source = gpu_hours(material)
     facts = [
         (f"{status.get('ok', 0)} of {choice.size}", "runs finished", f"{status.get('missing', 0)} missing"),
         (f"{status.get('failed', 0)}", "failed runs", f"numerical{damaged}"),
@@ -202,25 +223,75 @@ def _data(runs: pd.DataFrame) -> Text:
     )
 
 
-def _with_figures(material: Material, section: Section, usable: pd.DataFrame, figures: Judged) -> Section:
-    """The section with the pictures of ratios and of regions, as `tables` draws them."""
-    if not len(usable):
-        return section
-    size = f"{several(usable['scenario'].nunique(), 'scenario')}, {several(usable['seed'].nunique(), 'seed')}"
+def _verdict(numbers: StudyNumbers) -> Verdict:
+    """The answer of a study of the paper."""
+    name, study, cells = numbers.name, numbers.study, numbers.cells
+    printed = cells[cells["paper"] != ""]
+    kinds = printed["verdict"].map(kind)
+    counts = Counter(kinds)
+    directions = Counter(printed.loc[printed["label"] != study.baseline, "direction"])
+    changes = [f"{way} ({count})" for way, count in directions.most_common() if not way.endswith(WITHOUT_DIRECTION)]
+    small = [f"Change against {study.baseline}: {', '.join(changes)}"] if changes else []
+    if printed["verdict"].str.startswith("partial").any():
+        small.append(f"Partial: fewer than the paper's {len(paper.scenarios())} scenarios are finished.")
+    answer, tone = _answer(counts, len(printed))
+    chips = [verdict_chip(verdict, f"{count} {verdict}") for verdict, count in counts.most_common()]
+    return Verdict(title=f"{name}: {study.title}", answer=answer, tone=tone, chips=chips, small=small, target=f"study-{name}")
+
+
+def _answer(counts: Counter[str], total: int) -> tuple[str, Tone]:
+    answered = sum(counts[name] for name in ANSWERED)
+    agree = counts[WITHIN] + counts[BETTER]
+    if not answered:
+        if counts[study_cells.OTHER_DATA]:
+            return "Cannot be said: these are not the paper's data.", "mute"
+        return ("Cannot be said yet: no interval.", "warn") if counts[study_cells.NO_INTERVAL] else ("Not run yet.", "mute")
+    tone: Tone = "good" if not counts[WORSE] and answered == total else "bad" if counts[WORSE] > agree else "warn"
+    if agree == total:
+        return f"Reproduced: all {total} cells are within the interval or better.", tone
+    return f"{agree} of {total} cells within the interval or better, {counts[WORSE]} worse, {total - answered} open.", tone
+
+
+def _study_section(studies: Studies) -> Section:
+    """The tables of the studies, as `neuspring study` writes them; those without any run are folded."""
+    folds: list[Block] = []
+    for name, numbers in studies.items():
+        has_runs = len(numbers.cells) > 0 and bool(numbers.cells["ours"].notna().any())
+        summary = f"{name}: {numbers.study.title}" + ("" if has_runs else " (not run)")
+        folds.append(Fold(summary=summary, blocks=study_blocks(numbers), open=has_runs, key=f"study-{name}"))
+    about = "The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."
+    return Section(key="studies", title="The paper's tables", blocks=folds, about=about)
+
+
+def _score_section(material: Material) -> Section:
+    """The benchmark's own tables and pictures, as `neuspring tables` writes them."""
+    config = material.settings or Config()
+    judging = Judging(objects=config.objects, aims=config.aims)
+    benchmark = Benchmark(
+        everything=material.collected, baseline=material.choice.baseline, judging=judging, transfers=material.transfers
+    )
+    if not len(material.collected.runs):
+        return Section(key="scores", title="Scores", blocks=[Text(text="No run has finished.", tone="mute")])
+    blocks = [*_figures(benchmark), *score_blocks(benchmark), *transfer_blocks(benchmark), *breakdown_blocks(benchmark)]
+    return Section(key="scores", title="Scores", blocks=blocks)
+
+
+def _figures(benchmark: Benchmark) -> list[Block]:
+    """The pictures of ratios and of regions."""
     captions = {
-        "ratios.png": f"Ratio of every method's errors to those of {material.choice.baseline}",
-        "clusters.png": "Chamfer distance against the number of regions",
+        RATIOS: f"Ratio of every method's errors to those of {benchmark.baseline}",
+        CLUSTERS: "Chamfer distance against the number of regions",
     }
     blocks: list[Block] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        draw_ratios(figures, folder, size)
-        draw_clusters(material.collected, folder)
+        if len(benchmark.usable):
+            draw_ratios(benchmark, folder)
+            draw_clusters(benchmark.everything, folder)
         for file, caption in captions.items():
-            png = embedded_png(folder / file)
-            if png:
+            if png := embedded_png(folder / file):
                 blocks.append(Picture(caption=caption, alt=caption, data=png.uri, size=png.size, wide=True, paper=True))
-    return Section(key=section.key, title=section.title, about=section.about, blocks=[*blocks, *section.blocks])
+    return blocks
 
 
 def _page(material: Material, sections: Sequence[Section], written: str) -> str:

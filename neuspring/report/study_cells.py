@@ -62,7 +62,7 @@ Estimates = dict[tuple[str, str, str], Estimate]
 """By method, task, metric."""
 
 
-def of_study(study: Study, collected: Collected) -> Collected:
+def restricted(study: Study, collected: Collected) -> Collected:
     """The scores, in the paper's units, and the runs of a study's methods."""
     methods = list(study.rows.values())
     own = collected.of(methods)
@@ -193,12 +193,12 @@ def in_order(columns: Collection[tuple[str, str]]) -> list[tuple[str, Metric]]:
 def cells(study: Study, own: Collected) -> pd.DataFrame:
     """One row per label, task and metric: the paper's value, ours (`Estimate`), their difference, and both verdicts."""
     scores = counted(own)
-    ours = estimates(scores, study.rows[study.baseline]) | _of_oracles(own, scores)
+    ours = estimates(scores, study.rows[study.baseline]) | _oracle_estimates(own, scores)
     columns = columns_of(study, scores)
     return pd.DataFrame([_cell(study, own, scores, ours, label, *column) for label in study.rows for column in columns])
 
 
-def _of_oracles(own: Collected, scores: pd.DataFrame) -> Estimates:
+def _oracle_estimates(own: Collected, scores: pd.DataFrame) -> Estimates:
     """Oracles on the scenarios and seeds that count, each alone, so that they take nothing from the others."""
     cells: Estimates = {}
     for method in own.oracles:

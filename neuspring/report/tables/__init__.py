@@ -1,1 +1,0 @@
-"""Tables of a benchmark (`summary`), of studies beside the paper (`cells`, `render`, `study`), and of perception."""
