@@ -3,8 +3,7 @@
     settings                       the whole configuration (`Config`), GPUs, a part of it for one step
     simulation, search, twin       integration; the zero-order search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
-    baselines                      Spring-Gaus, GS-Dynamics
-    gpus, tuning                   sharing GPUs; sweeps over settings
+    baselines, tuning              Spring-Gaus, GS-Dynamics; sweeps over settings
     rows                           rows of the scenario, method and search tables
     parse                          the types of settings, YAML to settings and back
     page                           writes config/README.md from all of these
