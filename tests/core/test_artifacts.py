@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuspring.core import artifacts
-from neuspring.core.artifacts import Artifact, Material, Observations, Scenario, Simulation, Topology, Trajectory, Twin
+from neuspring.core.artifacts import Artifact, Material, Simulation, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from tests.support.scenarios import observations, scenario
@@ -82,23 +82,10 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
     assert_same(type(made).load(path), made)
     assert os.listdir(path.parent) == ["it.npz"]
     assert path.stat().st_mode & 0o777 == 0o644
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_there_is_no_pickle_inside(name: str, tmp_path: Path) -> None:
-    made, path = MAKERS[name](), tmp_path / "it.npz"
-    made.save(path)
     with np.load(path, allow_pickle=False) as stored:
-        arrays = {key: stored[key] for key in stored.files}
-    assert not any(array.dtype.hasobject for array in arrays.values())
-    meta = json.loads(arrays["meta"].tobytes())
+        assert not any(stored[key].dtype.hasobject for key in stored.files)
+        meta = json.loads(stored["meta"].tobytes())
     assert (meta["kind"], meta["format"]) == (made.kind, artifacts.FORMAT_VERSION)
-
-
-def test_saving_twice_gives_the_same_arrays(tmp_path: Path) -> None:
-    twin().save(tmp_path / "a.npz")
-    Twin.load(tmp_path / "a.npz").save(tmp_path / "b.npz")
-    assert_same(Twin.load(tmp_path / "b.npz"), twin())
 
 
 def test_arrays_are_copied_cast_and_frozen() -> None:
@@ -148,9 +135,7 @@ BAD_FIELDS = {
     "scenario name": (lambda: scenario(name="../etc"), r"scenario\.name.*'\.\./etc'"),
     "scenario name with newline": (lambda: scenario(name="a\n"), r"scenario\.name"),
     "split": (lambda: scenario(train_end=9), r"scenario scene, split: 1 < train_end <= frame_count = 5.*train_end = 9"),
-    "no training": (lambda: scenario(train_end=1), r"split"),
     "frame rate": (lambda: scenario(frame_rate=0.0), r"frame_rate: a positive number.*received 0"),
-    "infinite frame rate": (lambda: scenario(frame_rate=float("inf")), r"frame_rate"),
     "up": (lambda: scenario(up="y"), r"up: must be '\+z' or '-z'; received 'y'"),
     "frames": (
         lambda: observations(scenario=scenario(frame_count=6)),
@@ -160,7 +145,6 @@ BAD_FIELDS = {
     "no hand": (lambda: observations(controller_points=np.zeros((5, 0, 3))), r"at least one controller point.*Without a hand"),
     "hidden at rest": (lambda: observations(object_visibility=np.zeros((5, 3), bool)), r"visible in frame 0.*3 of 3 are not"),
     "index": (lambda: topology(springs=np.array([[0, 1], [1, 2], [5, 3]])), r"topology\.springs: indices must lie in \[0, 5\)"),
-    "negative index": (lambda: topology(springs=np.array([[-1, 1], [1, 2], [4, 3]])), r"indices must lie in"),
     "order": (lambda: topology(springs=np.array([[0, 1], [4, 2], [1, 3]])), r"object springs must come before controller springs"),
     "two hands": (
         lambda: topology(controllers=np.ones((2, 3)), springs=np.array([[0, 1], [1, 2], [4, 5]])),
@@ -171,14 +155,11 @@ BAD_FIELDS = {
         lambda: material(stiffness=np.array([1.0, -2, 1])),
         r"material\.stiffness: must not be negative; received -2",
     ),
-    "negative dashpot": (lambda: material(dashpot=np.array([1.0, -2, 1])), r"material\.dashpot"),
     "drag": (lambda: material(drag=-1.0), r"drag >= 0"),
     "nan friction": (lambda: material(ground_friction=float("nan")), r"material\.ground_friction: must be finite"),
     "distance": (lambda: material(contact_distance=0.0), r"contact_distance > 0"),
     "substeps": (lambda: Simulation(frame_time=0.1, substeps=0), r"simulation: .*substeps >= 1"),
     "frame time": (lambda: Simulation(frame_time=0.0, substeps=1), r"frame_time > 0"),
-    "nan frame time": (lambda: Simulation(frame_time=float("nan"), substeps=1), r"frame_time > 0"),
-    "infinite frame time": (lambda: Simulation(frame_time=float("inf"), substeps=1), r"frame_time"),
     "gravity": (lambda: Simulation(frame_time=0.1, substeps=1, gravity=float("nan")), r"finite gravity"),
     "simulation up": (lambda: Simulation(frame_time=0.1, substeps=1, up="z"), r"up"),  # type: ignore[arg-type]
     "one value per spring": (
@@ -188,7 +169,6 @@ BAD_FIELDS = {
         r"one stiffness per spring \(3\); received 2",
     ),
     "frames of a trajectory": (lambda: trajectory(frame_count=4), r"trajectory\.positions: 4 frames are expected; received 3"),
-    "frames of a diverged one": (lambda: trajectory(frame_count=9, diverged_frame=4), r"4 frames are expected; received 3"),
 }
 
 
@@ -248,23 +228,6 @@ def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
     with np.load(path) as stored:
         np.savez(path, **{name: stored[name] for name in stored.files if name != "rest_shape"})
     assert_same(Topology.load(path), topology())
-
-
-LATER: dict[str, dict[str, Any]] = {"simulation": {"initial_velocity": "rest"}}
-"""Plain fields that older files of twins lack, by part, and what they stand for."""
-
-
-def test_a_twin_of_an_older_version_has_the_defaults(tmp_path: Path) -> None:
-    path = tmp_path / "old.npz"
-    made = twin()
-    made = dataclasses.replace(made, **{part: dataclasses.replace(getattr(made, part), **values) for part, values in LATER.items()})
-    made.save(path)
-    with np.load(path) as stored:
-        kept = json.loads(stored["meta"].tobytes())["fields"]
-    for part, values in LATER.items():
-        kept[part] = {name: value for name, value in kept[part].items() if name not in values}
-    rewrite(path, fields=kept)
-    assert_same(Twin.load(path), made)
 
 
 def test_masses_are_positive_and_one_per_node(tmp_path: Path) -> None:
@@ -337,7 +300,7 @@ def test_foreign_files(tmp_path: Path) -> None:
         damaged(path, path.read_bytes())
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_flipped_byte_is_refused_or_harmless(data: st.DataObject, tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
@@ -383,8 +346,3 @@ def test_text_is_written_atomically(tmp_path: Path) -> None:
     write_text(tmp_path / "a" / "it.json", "Größe")
     assert (tmp_path / "a" / "it.json").read_text(encoding="utf-8") == "Größe"
     assert os.listdir(tmp_path / "a") == ["it.json"]
-
-
-def test_every_kind_has_a_name_of_its_own() -> None:
-    kinds = [Scenario, Observations, Topology, Material, Twin, Trajectory]
-    assert len({kind.kind for kind in kinds}) == len(kinds)

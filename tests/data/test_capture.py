@@ -157,18 +157,17 @@ def test_depth_of_another_size_than_color_is_refused(tmp_path):
         capture.depth("0", 1)
 
 
-def test_depth_must_have_sixteen_bits(tmp_path):
-    capture = write(tmp_path)
-    cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((24, 32), np.uint8))
-    with pytest.raises(InputError, match="depth must be 16-bit integers"):
-        capture.depth("0", 1)
-
-
 def test_damaged_files_and_unknown_labels_are_refused(tmp_path):
     capture = write(tmp_path)
     capture.path("color", "0", 2).write_bytes(b"no picture")
     with pytest.raises(InputError, match="must be a readable PNG"):
         capture.color("0", 2)
+    cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((24, 32), np.uint8))
+    with pytest.raises(InputError, match="depth must be 16-bit integers"):
+        capture.depth("0", 1)
+    cv2.imwrite(str(capture.path("mask", "0", 1)), np.ones((24, 32), np.uint16))
+    with pytest.raises(InputError, match="masks are gray images of 8 bits; received uint16"):
+        capture.mask("0", 1)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 255, np.uint8))
     with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received 255"):
         capture.mask("0", 2)
@@ -192,13 +191,6 @@ def test_tracks_do_not_outlive_their_capture_and_may_be_none(tmp_path):
     (tmp_path / "tracks.json").write_text("{}")
     with pytest.raises(InputError, match="a list of tracks is required; received dict"):
         Capture.load(tmp_path).tracks()
-
-
-def test_masks_of_sixteen_bits_are_refused(tmp_path):
-    capture = write(tmp_path)
-    cv2.imwrite(str(capture.path("mask", "0", 2)), np.ones((24, 32), np.uint16))
-    with pytest.raises(InputError, match="masks are gray images of 8 bits; received uint16"):
-        capture.mask("0", 2)
 
 
 def test_a_capture_names_the_digest_of_its_images(tmp_path):

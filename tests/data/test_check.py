@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.findings import broken, note, unusual
+from neuspring.data import phystwin
 from neuspring.data.check import check_layout, render
 from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
@@ -29,6 +31,17 @@ def test_missing_optional_files_are_notes(tmp_path: Path, missing: str) -> None:
     findings = check_layout(folder)
     assert serious(findings) == []
     assert holds(findings, "note", missing, "skipped")
+
+
+def judged(folder: Path, level: str, file: str, words: tuple[str, ...]) -> None:
+    """The check says so, and the reader refuses what is an error, and nothing less."""
+    assert holds(check_layout(folder), level, file, *words), render(check_layout(folder))
+    row = ScenarioRow(scenario="case", source="phystwin", category="rope", path=".", self_collision=False, ground=True)
+    if level == "error" and "visible in both frames" not in words:  # readable, and the numbers would be wrong
+        with pytest.raises(InputError, match=file):
+            phystwin.read(row, folder)
+    else:
+        phystwin.read(row, folder)
 
 
 def set_entry(key: str, index: Any, value: Any) -> Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]:
@@ -89,12 +102,20 @@ def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         (lambda d: d | {"interior_points": "text"}, "error", ("interior_points", "received str")),
         (lambda d: {k: v for k, v in d.items() if k != "controller_points"}, "error", ("controller_points", "missing")),
         (lambda _: [1, 2], "error", ("dict of arrays", "list")),
+        (set_entry("controller_points", (5, 4, 2), -np.inf), "error", ("controller_points", "-inf at frame 5, point 4")),
+        (
+            lambda d: d | {"object_visibilities": d["object_visibilities"].astype(np.uint8)},
+            "error",
+            ("dtype must be bool", "uint8"),
+        ),
+        (lambda d: d | {"object_points": d["object_points"].astype(int)}, "error", ("object_points", "floating")),
+        (lambda d: d | {"object_points": d["object_points"].tolist()}, "error", ("object_points", "received list")),
     ],
 )
 def test_departures_of_final_data(tmp_path: Path, change: Callable[[Any], Any], level: str, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     dump(folder / "final_data.pkl", change(stored(folder)))
-    assert holds(check_layout(folder), level, "final_data.pkl", *words), render(check_layout(folder))
+    judged(folder, level, "final_data.pkl", words)
 
 
 @pytest.mark.parametrize(
@@ -104,12 +125,16 @@ def test_departures_of_final_data(tmp_path: Path, change: Callable[[Any], Any], 
         ({"frame_len": 9, "train": [0, 7], "test": [7, 10]}, "warning", ("frame_len", "10 frames")),
         ({"frame_len": 10, "train": [0, 7], "test": [7, 11]}, "error", ("test", "[7, 11]")),
         ({"frame_len": 10, "train": [0, 7]}, "error", ("test", "whole numbers")),
+        ({"train": [-1, 7], "test": [7, 10]}, "error", ("train", "[-1, 7]")),
+        ({"train": [0, 1], "test": [1, 10]}, "error", ("train", "one frame after frame 0")),
+        ({"train": [0, 7.0], "test": [7, 10]}, "error", ("train", "whole numbers")),
+        ([0, 7], "error", ("JSON object", "list")),
     ],
 )
 def test_departures_of_the_split(tmp_path: Path, split: Any, level: str, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     write_json(folder / "split.json", split)
-    assert holds(check_layout(folder), level, "split.json", *words)
+    judged(folder, level, "split.json", words)
 
 
 @pytest.mark.parametrize(
@@ -149,6 +174,21 @@ def test_departures_of_the_metadata(tmp_path: Path, metadata: Any, level: str, w
     folder = write_case(tmp_path)
     write_json(folder / "metadata.json", metadata)
     assert holds(check_layout(folder), level, "metadata.json", *words)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "words"),
+    [
+        (np.zeros((10, 5, 2)), ("[T, K, 3]",)),
+        (np.zeros((10, 5, 3), int), ("floating point",)),
+        (np.full((10, 5, 3), np.inf), ("inf at frame 0, point 0",)),
+        ([1, 2], ("list",)),
+    ],
+)
+def test_tracks_that_are_none(tmp_path: Path, tracks: Any, words: tuple[str, ...]) -> None:
+    folder = write_case(tmp_path)
+    dump(folder / "gt_track_3d.pkl", tracks)
+    judged(folder, "error", "gt_track_3d.pkl", words)
 
 
 def test_departures_of_the_tracks(tmp_path: Path) -> None:

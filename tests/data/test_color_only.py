@@ -6,12 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.cli.main import main
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, OBJECT, POINTS, Capture
+from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.data.check import check_layout
-from neuspring.data.intake import make
 from neuspring.data.intake.images import pairs
 from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
@@ -23,7 +21,7 @@ from neuspring.perception.backends import BACKENDS
 from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.marks.store import film_of, save_masks
 from tests.support.board import BOARD, LENS, board_image
-from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses, write_video
+from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses
 from tests.support.findings import holds, of_level, serious
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -77,18 +75,6 @@ def test_a_folder_of_color_becomes_a_capture_with_the_table_of_the_pose(tmp_path
     assert serious(check_layout(made.folder)) == []
 
 
-def test_a_video_by_the_command(tmp_path, capsys):
-    video = write_video(tmp_path / "a.mkv", [seen(camera(), frame)[0] for frame in range(FRAMES)], "ffv1", "bgr0")
-    root = write_folders(tmp_path, frames=1)
-    poses = write_poses(root / "poses.json", 1)
-    words = ["--color", str(video), "--intrinsics", str(root / "intrinsics.json"), "--poses", str(poses), "--category", "ball"]
-    assert main(["make-capture", *words, "--output", str(tmp_path / "capture")]) == 0
-    assert "depth: none, color alone" in capsys.readouterr().out
-    made = Capture.load(tmp_path / "capture")
-    assert made.description.frame_rate == pytest.approx(15, rel=0.01)
-    np.testing.assert_array_equal(made.color("0", 3), seen(camera(), 3)[0])
-
-
 def test_a_board_gives_the_pose(tmp_path):
     pose = looking(np.array([0.1, -0.55, 0.45]), np.array([0.1, -0.14, 0]))
     (tmp_path / "color_0").mkdir()
@@ -130,23 +116,6 @@ def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
 def test_several_cameras_need_depth(tmp_path):
     with pytest.raises(InputError, match="--color: without depth one camera is required"):
         pairs([tmp_path, tmp_path], [])
-
-
-def test_an_interrupted_call_goes_on_where_it_was(tmp_path, monkeypatch):
-    root, write, written = write_folders(tmp_path), make.Writer.frame, []
-
-    def stop_after_four(self, camera, frame, *images):
-        if len(written) == 4:
-            raise KeyboardInterrupt
-        written.append(frame)
-        write(self, camera, frame, *images)
-
-    monkeypatch.setattr(make.Writer, "frame", stop_after_four)
-    with pytest.raises(KeyboardInterrupt):
-        make_capture(intake(root))
-    monkeypatch.setattr(make.Writer, "frame", lambda *a: (written.append(a[2]), write(*a)))
-    make_capture(intake(root))
-    assert written == [0, 1, 2, 3, 3, 4, 5, 6]
 
 
 def test_a_good_capture_says_how_large_the_object_is(capture):
@@ -193,23 +162,6 @@ def test_a_pose_in_another_unit_makes_an_implausible_size(capture):
 
     edit(capture, five_times)
     assert "implausible size: 13" in "\n".join(of_level(check_layout(capture.folder), "warning"))
-
-
-def test_a_camera_high_above_the_table(capture):
-    high = looking(np.array([0.0, -2.0, 4.0]), np.zeros(3))
-    edit(capture, lambda values: values["cameras"][0].update(camera_to_world=high.tolist()))
-    assert "a camera should be at most 3 m above the table" in "\n".join(of_level(check_layout(capture.folder), "warning"))
-
-
-def test_an_obstacle_around_the_object(capture):
-    around = {"shape": "box", "center": [0.05, 0.05, 0.1], "half_sizes": [0.3, 0.3, 0.1]}
-    edit(capture, lambda values: values.update(obstacles=[around]))
-    assert "obstacles[0]: the object of frame 0 must be outside" in errors(capture)
-
-
-def test_points_that_cannot_be_read(capture):
-    (capture.folder / POINTS).write_text('{"0": [[[1, 2]]]}')
-    assert f"{POINTS}: every track needs {FRAMES} entries; received 1" in errors(capture)
 
 
 def test_masks_of_a_run_are_not_judged_by_depth(capture):

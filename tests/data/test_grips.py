@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config import Mocap, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
-from neuspring.data.mocap import circle, clamps, transport
+from neuspring.data.mocap import clamps, transport
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
 RADIUS, COUNT = 0.006, 3
@@ -79,25 +79,12 @@ def test_a_direction_that_goes_around_a_circle_of_latitude_turns_the_normal_by_t
     assert angle % (2 * np.pi) == pytest.approx(2 * np.pi * (1 - np.cos(polar)), abs=1e-6)
 
 
-def test_a_straight_pull_does_not_turn_the_ring() -> None:
-    held = np.repeat(wild(1), 50, axis=0) + np.linspace(0, 0.3, 50)[:, None, None] * np.array([1.0, 2.0, -1.0])
-    offsets = rings(held) - held[:, :, None]
-    np.testing.assert_allclose(offsets, np.broadcast_to(offsets[0], offsets.shape), atol=EDGE)
-
-
 def test_a_recording_seen_from_elsewhere_has_its_clamps_there() -> None:
     held, rotation = wild(), Rotation.from_rotvec([0.3, -1.1, 0.6])
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     one = clamps(held, normals, RADIUS, COUNT, 1e-4, "cable")
     other = clamps(held @ rotation.as_matrix().T + 1.0, rotation.apply(normals), RADIUS, COUNT, 1e-4, "cable")
     np.testing.assert_allclose(other, one @ rotation.as_matrix().T + 1.0, atol=1e-11)
-
-
-def test_a_circle_has_equal_steps() -> None:
-    points = circle(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), RADIUS, 4)
-    steps = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
-    np.testing.assert_allclose(steps, 2 * RADIUS * np.sin(np.pi / 4), atol=EDGE)
-    np.testing.assert_allclose(points.mean(axis=0), 0, atol=EDGE)
 
 
 def test_markers_of_an_end_that_meet_are_refused() -> None:

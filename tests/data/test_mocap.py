@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pickle
 from itertools import pairwise
 from pathlib import Path
@@ -104,13 +103,6 @@ def test_frames_are_cut_after_the_stride(tmp_path: Path) -> None:
     np.testing.assert_array_equal(observations.object_points[9], recording()[27, :, 2:-2].T.astype(np.float32))
 
 
-def test_the_beginning_can_be_left_out(tmp_path: Path) -> None:
-    path = write(tmp_path, recording())
-    whole, observations = mocap.read(ROW, path, Mocap(stride=3)), mocap.read(ROW, path, Mocap(stride=3, start=6))
-    np.testing.assert_array_equal(observations.object_points, whole.object_points[2:])
-    np.testing.assert_array_equal(observations.controller_points, whole.controller_points[2:])
-
-
 @pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
 def test_ring_geometry(spacing: float, radius: float, ring: int) -> None:
     centers, tangents = mocap.centerline(helix(), spacing)
@@ -181,18 +173,6 @@ def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, m
         mocap.read(ROW, write(tmp_path, recording()), settings)
 
 
-def test_a_hostile_recording_does_not_run(tmp_path: Path) -> None:
-    class Hostile:
-        def __reduce__(self) -> Any:
-            return os.mkdir, (str(tmp_path / "ran"),)
-
-    path = write(tmp_path, Hostile())
-    with pytest.raises(InputError, match="mkdir"):
-        mocap.read(ROW, path, Mocap())
-    assert "mkdir" in mocap.check_mocap(path)[0].message
-    assert not (tmp_path / "ran").exists()
-
-
 def test_check_of_files_and_folders(tmp_path: Path) -> None:
     data = recording(samples=500)
     data[30, :, [4, 5]] = data[30, :, [5, 4]]
@@ -208,10 +188,10 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 def test_released_recordings() -> None:
-    assert [d for d in check_layout(REAL) if d.level != "note"] == []
     settings = Mocap()
     for cable in ("DLO1", "DLO2", "DLO4"):
         file = next((REAL / cable / "train").glob("*.pkl"))
+        assert [d for d in check_layout(file) if d.level != "note"] == []
         observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, settings)
         assert observations.scenario.frame_count == 250
         assert observations.object_points.shape[1] == (9 if cable == "DLO1" else 8)

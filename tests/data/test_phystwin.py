@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data import phystwin
-from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
+from tests.support.phystwin_case import edit, stored, write_case, write_json
 
 ROW = ScenarioRow(scenario="thing", source="phystwin", category="toy", path="x", self_collision=True, ground=True)
 
@@ -67,79 +66,6 @@ def test_a_frame_without_a_visible_point_is_readable(tmp_path: Path) -> None:
     assert not phystwin.read(ROW, folder).object_visibility[4].any()
 
 
-def changed(key: str, index: Any, value: Any) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
-    """A change of some entries of one array."""
-
-    def change(data: dict[str, np.ndarray]) -> np.ndarray:
-        result = data[key].copy()
-        result[index] = value
-        return result
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("key", "change", "message"),
-    [
-        ("object_points", changed("object_points", (3, 17, 1), np.nan), r"object_points.*finite.*nan at frame 3, point 17"),
-        ("object_points", changed("object_points", (0, 2, 0), np.inf), r"object_points.*inf at frame 0, point 2"),
-        ("controller_points", changed("controller_points", (5, 4, 2), -np.inf), r"controller_points.*-inf at frame 5, point 4"),
-        ("surface_points", changed("surface_points", (3, 0), np.nan), r"surface_points.*nan at point 3"),
-        ("object_points", lambda d: d["object_points"][..., :2], r"object_points.*3 entries along axis 2"),
-        ("object_points", lambda d: d["object_points"][0], r"object_points.*shape must be \[T, No, 3\]"),
-        ("controller_points", lambda d: d["controller_points"][:-1], r"controller_points.*10 entries along axis 0"),
-        ("object_visibilities", lambda d: d["object_visibilities"].astype(np.uint8), r"object_visibilities.*dtype.*bool.*uint8"),
-        ("object_points", lambda d: d["object_points"].astype(int), r"object_points.*dtype must be floating"),
-        ("object_points", lambda d: d["object_points"].tolist(), r"object_points.*array .* is required; received list"),
-        ("controller_points", lambda d: d["controller_points"][:, :0], r"controller_points.*at least one controller"),
-        ("object_visibilities", changed("object_visibilities", (0, 5), False), r"object_visibilities.*frame 0.*point 5"),
-        ("interior_points", lambda _: None, r"interior_points: this key is missing"),
-        ("object_motions_valid", lambda _: None, r"object_motions_valid: this key is missing"),
-    ],
-)
-def test_bad_arrays_are_refused(tmp_path: Path, key: str, change: Callable[[Any], Any], message: str) -> None:
-    folder = write_case(tmp_path)
-    edit(folder, **{key: change(stored(folder))})
-    with pytest.raises(InputError, match=rf"final_data\.pkl: {message}"):
-        phystwin.read(ROW, folder)
-
-
-@pytest.mark.parametrize(
-    ("split", "message"),
-    [
-        ({"train": [0, 11], "test": [7, 10]}, r"train: .*10 frames.*\[0, 11\]"),
-        ({"train": [0, 7], "test": [7, 12]}, r"test: .*10 frames.*\[7, 12\]"),
-        ({"train": [-1, 7], "test": [7, 10]}, r"train: .*\[-1, 7\]"),
-        ({"train": [0, 1], "test": [1, 10]}, r"train: at least one frame after frame 0"),
-        ({"train": [0, 7.0], "test": [7, 10]}, r"train: two whole numbers"),
-        ({"test": [7, 10]}, r"train: two whole numbers.*nothing"),
-        ([0, 7], r"a JSON object.*list"),
-    ],
-)
-def test_bad_splits_are_refused(tmp_path: Path, split: Any, message: str) -> None:
-    folder = write_case(tmp_path)
-    write_json(folder / "split.json", split)
-    with pytest.raises(InputError, match=rf"split\.json: {message}"):
-        phystwin.read(ROW, folder)
-
-
-@pytest.mark.parametrize(
-    ("tracks", "message"),
-    [
-        (np.zeros((9, 5, 3)), "has 10 frames"),
-        (np.zeros((10, 5, 2)), r"\[T, K, 3\]"),
-        (np.zeros((10, 5, 3), int), "floating point"),
-        (np.full((10, 5, 3), np.inf), "inf at frame 0, point 0"),
-        ([1, 2], "list"),
-    ],
-)
-def test_bad_tracks_are_refused(tmp_path: Path, tracks: Any, message: str) -> None:
-    folder = write_case(tmp_path)
-    dump(folder / "gt_track_3d.pkl", tracks)
-    with pytest.raises(InputError, match=rf"gt_track_3d\.pkl: .*{message}"):
-        phystwin.read(ROW, folder)
-
-
 @pytest.mark.parametrize("fps", [0, -1, "30", True, float("nan"), 10**400])
 def test_bad_frame_rates_are_refused(tmp_path: Path, fps: Any) -> None:
     folder = write_case(tmp_path)
@@ -157,3 +83,16 @@ def test_missing_and_damaged_files_are_named(tmp_path: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(InputError, match=rf"{name}.*readable.*No such file"):
         phystwin.read(ROW, folder)
+
+
+def test_the_table_of_released_cases() -> None:
+    cases = phystwin.released_cases()
+    assert len(cases) == 22
+    assert sum(int(row["frames"]) for row in cases.values()) == 2423
+    assert sum(int(row["frames"]) - int(row["train_end"]) for row in cases.values()) == 735
+    assert all(int(row["train_end"]) == int(0.7 * int(row["frames"])) for row in cases.values())
+    assert [name for name, row in cases.items() if not row["nodes"]] == [
+        "double_lift_sloth",
+        "double_stretch_sloth",
+        "single_lift_sloth",
+    ]

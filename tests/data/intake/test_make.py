@@ -97,13 +97,6 @@ def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
     )
 
 
-def test_poses_the_wrong_way_round_are_named(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    listed = [np.linalg.inv(camera(k).camera_to_world).tolist() for k in range(2)]
-    with pytest.raises(InputError, match=r"what looks like a world-to-camera matrix. Invert it"):
-        make_capture(intake(root, 2, poses=write_json(tmp_path / "poses.json", {"camera_to_world": listed})))
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

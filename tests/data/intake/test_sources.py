@@ -118,10 +118,6 @@ def test_ranges_that_are_none(wanted):
         chosen(wanted, [1, 2, 3])
 
 
-def test_a_source_without_pictures_has_none_of_them():
-    assert chosen("0-", []) == []
-
-
 def test_a_stride_and_a_jump_are_known(tmp_path):
     root = write_folders(tmp_path, frames=12)
     views = pairs([root / "color_0"], [root / "depth_0"])
