@@ -50,6 +50,10 @@ RENAMED = {
     "scales": "now variables.NAME: {scale: ...}",
     "start": "of a search now variables.NAME: {start: ...}",
     "betas": "a constant of neuspring/twin/fit.py now",
+    "freed_sigma": "a constant of neuspring/twin/search.py now",
+    "hand_knots": "a constant of neuspring/twin/hand_paths.py now",
+    "polish.step": "a constant of neuspring/twin/polish.py now",
+    "polish.tolerance": "a constant of neuspring/twin/polish.py now",
     "last_frame": REMOVED,
     "warmup_scenarios": "a third of the scenarios now",
 }

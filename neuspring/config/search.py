@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, NonNegative, Positive, Section
+from neuspring.config.parse import STRICT, Count, Finite, Positive, Section
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
@@ -81,7 +81,7 @@ class SearchVariables(Section):
     hand_size: Variable = _default(0.0, 1.0, 0.0)
     """Color alone: how much of a hand's distance follows from its apparent size, the rest from that plane."""
     hand_depth: Variable = _default(0.97, 1.03, 1.0, "log")
-    """Color alone: factors on a hand's distance from the camera at its knots (`hand_knots`)."""
+    """Color alone: factors on a hand's distance from the camera at its knots."""
 
     @model_validator(mode="before")
     @classmethod
@@ -118,10 +118,6 @@ class Polish(Section):
     """Largest part of the budget `rollouts` that its rounds may take: a search of few rollouts has fewer rounds, or none."""
     variables: tuple[str, ...] = ("stiffness", "dashpot", "drag")
     """What is polished: variables that decide nothing of which springs and pairs there are; fixed ones are left out."""
-    step: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
-    """Step of the finite differences, in normalized variables."""
-    tolerance: NonNegative = 1e-3
-    """A round whose step lowers the cost by less than this fraction of it is the last."""
 
     def __post_init__(self) -> None:
         allowed = [name for name in VARIABLES if name not in (*TOPOLOGY, "contact_distance")]
@@ -142,16 +138,11 @@ class Search(Section):
     tied_rollouts: Annotated[int, Field(ge=0)] = 0
     """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
     candidate."""
-    freed_sigma: Positive = 0.06
-    """Step in normalized variables after `tied_rollouts`, when each region becomes free."""
     isolated_nodes: Literal["repair", "allow"] = "repair"
     """Nodes without any spring. repair: join them to their 3 nearest nodes. allow: leave them, as released."""
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `variables`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
-    hand_knots: Annotated[int, Field(ge=0)] = 3
-    """Color alone: knots of each hand's distance, spread evenly over the training frames after frame 0; between them the factor is
-    a smooth curve, and it stays as it is after the last one."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"

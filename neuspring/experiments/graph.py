@@ -32,7 +32,7 @@ from neuspring.stages.stage import Stage
 
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-REGIONS_ONLY = ("tied_rollouts", "freed_sigma")
+REGIONS_ONLY = ("tied_rollouts",)
 """Settings of the search that concern nothing where there is one region."""
 Files = str | list[str]
 

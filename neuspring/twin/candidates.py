@@ -136,7 +136,7 @@ class SearchProblem:
             regional = name in REGIONAL and self.clusters > 1
             names += [f"{name}.{region}" for region in range(self.clusters)] if regional else [name]
         image = self.observations.image
-        return (*names, *(hand_paths.names(image, self.search.hand_knots) if image else ()))
+        return (*names, *(hand_paths.names(image) if image else ()))
 
     @property
     def variables(self) -> tuple[str, ...]:

@@ -29,20 +29,22 @@ from scipy.spatial.transform import Rotation
 from neuspring import config
 from neuspring.core.artifacts import ImageObservations, Observations, Twin
 
+KNOTS = 3
+"""Of each hand's depth, spread evenly over the training frames after frame 0."""
 LEVEL = 90.0
 """Tilt of the level plane, degrees."""
 NEAREST, FARTHEST = 0.5, 2.0
 """Depth of a hand over that of frame 0: beyond, the plane is seen edge on and says nothing."""
 
 
-def names(image: ImageObservations, knots: int) -> tuple[str, ...]:
+def names(image: ImageObservations) -> tuple[str, ...]:
     """Variables of the hands: tilt and size of all, and the factors of each hand, knot by knot."""
-    return ("hand_tilt", "hand_size", *(f"hand_depth.{k}" for k in range(knots * image.hands)))
+    return ("hand_tilt", "hand_size", *(f"hand_depth.{k}" for k in range(KNOTS * image.hands)))
 
 
 def start(image: ImageObservations, search: config.Search) -> dict[str, float]:
     """The values that the search begins with; those of `controller_points`."""
-    return {name: float(getattr(search.variables, name.partition(".")[0]).start) for name in names(image, search.hand_knots)}
+    return {name: float(getattr(search.variables, name.partition(".")[0]).start) for name in names(image)}
 
 
 def with_hands(observations: Observations, twin: Twin) -> Observations:

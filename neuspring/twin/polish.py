@@ -30,6 +30,10 @@ SLOPES, POLISH = "slopes", "polish"
 """Stages of a search after CMA-ES; candidates of `SLOPES` are its means alone and never its result."""
 RESIDUAL, PRODUCT = "product.residual", "product."
 """Columns of the trace: J_k'r and J_k'J_l in the row of the neighbor in variable k."""
+STEP = 0.01
+"""Of the finite differences, in normalized variables."""
+TOLERANCE = 1e-3
+"""A round whose step lowers the cost by less than this fraction of it is the last."""
 REACH = 0.25
 """Longest step of a round in a normalized variable."""
 FIRST_DAMPING, MOST_DAMPING = 0.1, 1e4
@@ -64,7 +68,7 @@ class Polish:
 
     def steps(self) -> np.ndarray:
         """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""
-        here, step = self.base[list(self.columns)], self.search.polish.step
+        here, step = self.base[list(self.columns)], STEP
         return np.where(here - step < 0, step, -step)
 
     def ask(self) -> list[np.ndarray]:
@@ -93,7 +97,7 @@ class Polish:
         costs = [row["cost"] for row in rows]
         best = int(np.argmin(costs))
         if costs[best] < self.cost:
-            self.finished = self.cost - costs[best] < self.search.polish.tolerance * self.cost
+            self.finished = self.cost - costs[best] < TOLERANCE * self.cost
             self.base, self.cost = np.asarray(self._asked[best]), costs[best]
             self.damping *= FACTORS[best]
             self.stage = SLOPES

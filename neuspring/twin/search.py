@@ -28,6 +28,9 @@ from neuspring.twin.candidates import CMAES, PENALTY, UNSTABLE, Map, SearchProbl
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
+FREED_SIGMA = 0.06
+"""Step of CMA-ES in normalized variables when each region becomes free."""
+
 
 class Proposals:
     """The candidates of CMA-ES, in all 2K + 10 normalized variables.
@@ -57,7 +60,7 @@ class Proposals:
     def ask(self) -> list[np.ndarray]:
         """The next generation; the last one with tied regions may be cut short."""
         if self._tied and self._evaluated == self._tied:
-            self._strategy = _strategy(self._best[1], self._problem.search.freed_sigma, self._seed)
+            self._strategy = _strategy(self._best[1], FREED_SIGMA, self._seed)
             self._columns = np.arange(len(self._problem.variables))
         self._population = self._strategy.ask()
         if self._evaluated < self._tied:

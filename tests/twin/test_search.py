@@ -24,7 +24,7 @@ from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.search import search
+from neuspring.twin.search import FREED_SIGMA, search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import small
@@ -360,7 +360,7 @@ def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best(
     assert (radii.nunique(axis=1) == 3).all()
     # 12 candidates for 16 variables, drawn around the best of the uniform ones: their mean is within four standard errors.
     start = uniform.loc[uniform["cost"].idxmin()]
-    sigma = config.Search().freed_sigma
+    sigma = FREED_SIGMA
     names = [column for column in trace if column.startswith("normalized.")]
     inside = [n for n in names if 0.2 < start[re.sub(r"\.\d$", "", n)] < 0.8]  # away from the bounds, where steps are folded back
     assert len(inside) > 8
