@@ -2,173 +2,155 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Literal
 
-from neuspring.cli import options as shared
-from neuspring.cli.tracking import add_results
+from neuspring.cli.options import Positional, Results, Settings, arg, json_value, read_settings
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 
-
-def tables_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring tables`."""
-    add_results(parser)
-    for name in ("scenarios", "methods"):
-        parser.add_argument(f"--{name}", nargs="+", default=())
-    parser.add_argument("--seeds", nargs="+", type=int, default=())
-    parser.add_argument("--transfers", nargs="*", default=[], help="scenarios whose twins were rolled out on other recordings")
-    parser.add_argument("--baseline", help="method that others are compared with (default: the first)")
-    parser.add_argument("--objects", choices=("scenario", "category"), default="scenario", help="what intervals of ratios are over")
-    parser.add_argument("--aims", metavar="JSON", default="[]", help="JSON: ratios that are aimed at (config/README.md, aims)")
-    parser.add_argument("--scores", type=Path, help="instead of run records: a scores.csv that tables wrote, on any machine")
-    _add_left_out(parser)
-    shared.add_output(parser, "folder to write to")
+Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
+Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
+LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, where they have no runs")]
+StudyTable = Annotated[Path, arg(help="the study table")]
+Folder = Annotated[Path, arg(help="folder to write to")]
+Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
+WHAT = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
 
 
-def tables(a: Namespace) -> None:
-    """`neuspring tables`."""
+def tables(
+    output: Folder,
+    results: Results = Path("results"),
+    scenarios: tuple[str, ...] = (),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    transfers: Transfers = (),
+    baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
+    objects: Annotated[Literal["scenario", "category"], arg(help="what intervals of ratios are over")] = "scenario",
+    aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
+    scores: Scores = None,
+    left_out: LeftOut = "{}",
+) -> None:
+    """Run records -> tables."""
     from neuspring.config.settings import Aim
     from neuspring.report import benchmark, gallery
     from neuspring.scores.runs import collect, collect_transfers, read_scores
 
-    aims = tuple(parse(Aim, row, "--aims") for row in shared.json_value("--aims", a.aims, list))
-    judging = benchmark.Judging(objects=a.objects, aims=aims)
-    if a.scores:
-        scores = read_scores(a.scores)
-        baseline = a.baseline or str(scores.runs["method"].iloc[0])
-        print(benchmark.write(replace(scores, left_out=_read_left_out(a.left_out)), baseline, a.output, judging=judging))
+    wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
+    judging = benchmark.Judging(objects=objects, aims=wanted)
+    without = _read_left_out(left_out)
+    if scores:
+        found = read_scores(scores)
+        against = baseline or str(found.runs["method"].iloc[0])
+        print(benchmark.write(replace(found, left_out=without), against, output, judging=judging))
         return
-    if not (a.scenarios and a.methods and a.seeds):
-        raise InputError("tables", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
-    collected = collect(a.results, a.scenarios, a.methods, a.seeds, _read_left_out(a.left_out))
-    transfers = collect_transfers(a.results, a.transfers, a.methods, a.seeds)
-    print(benchmark.write(collected, a.baseline or a.methods[0], a.output, transfers, judging))
-    print(f"Tables: {a.output / 'summary.md'}")
+    if not (scenarios and methods and seeds):
+        raise InputError("tables", WHAT)
+    collected = collect(results, scenarios, methods, seeds, without)
+    moved = collect_transfers(results, transfers, methods, seeds)
+    print(benchmark.write(collected, baseline or methods[0], output, moved, judging))
+    print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
-    seed = next((seed for seed in a.seeds if seed in finished), a.seeds[0])
-    print(f"Pictures and videos: {gallery.write(a.results, a.scenarios, a.methods, seed, collected, a.output)}")
+    seed = next((seed for seed in seeds if seed in finished), seeds[0])
+    print(f"Pictures and videos: {gallery.write(results, scenarios, methods, seed, collected, output)}")
 
 
-def perception_table_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring perception-table`."""
-    add_results(parser)
-    parser.add_argument("--scenarios", required=True, help="names and categories, as JSON")
-    shared.add_output(parser)
-
-
-def perception_table(a: Namespace) -> None:
-    """`neuspring perception-table`."""
+def perception_table(
+    scenarios: Annotated[str, arg(help="names and categories, as JSON")], output: Path, results: Results = Path("results")
+) -> None:
+    """Errors of perception, per category."""
     from neuspring.report import perception
 
-    scenarios = [(name, str(category)) for name, category in shared.json_value("--scenarios", a.scenarios).items()]
-    print(perception.write(perception.collect(a.results, scenarios), a.output.parent))
+    named = [(name, str(category)) for name, category in json_value("--scenarios", scenarios).items()]
+    print(perception.write(perception.collect(results, named), output.parent))
 
 
-def study_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring study`."""
-    parser.add_argument("--study", required=True, help="row of the study table")
-    _add_study_table(parser)
-    add_results(parser)
-    parser.add_argument("--scenarios", nargs="+")
-    parser.add_argument("--methods", nargs="+")
-    parser.add_argument("--seeds", nargs="+", type=int)
-    parser.add_argument("--scores", type=Path, help="instead of run records: a scores.csv that tables wrote, on any machine")
-    _add_left_out(parser)
-    shared.add_output(parser, "folder to write to")
-
-
-def study(a: Namespace) -> None:
-    """`neuspring study`."""
-    from neuspring.report import study
+def study(
+    study: Annotated[str, arg(help="row of the study table")],
+    output: Folder,
+    table: StudyTable = Path("config/studies.yaml"),
+    results: Results = Path("results"),
+    scenarios: tuple[str, ...] = (),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    scores: Scores = None,
+    left_out: LeftOut = "{}",
+) -> None:
+    """Run records -> one of the paper's tables, beside the paper's values."""
+    from neuspring.report.study import write_collected, write_study
     from neuspring.scores.runs import read_scores
     from neuspring.scores.studies import read_studies
 
-    studies = read_studies(a.table)
-    if a.study not in studies:
-        raise InputError("--study", f"must be a row of {a.table}", a.study, f"Known: {', '.join(studies)}")
-    definition, left_out = studies[a.study], _read_left_out(a.left_out)
+    studies = read_studies(table)
+    if study not in studies:
+        raise InputError("--study", f"must be a row of {table}", study, f"Known: {', '.join(studies)}")
+    definition, without = studies[study], _read_left_out(left_out)
     beside = studies[definition.beside] if definition.beside else None
-    if a.scores:
-        collected = replace(read_scores(a.scores), left_out=left_out)
-        print(study.write_collected(a.study, definition, collected, a.output, beside))
-    elif a.scenarios and a.methods and a.seeds:
-        print(study.write_study(a.study, definition, a.results, a.scenarios, a.seeds, a.methods, a.output, left_out, beside))
+    if scores:
+        print(write_collected(study, definition, replace(read_scores(scores), left_out=without), output, beside))
+    elif scenarios and methods and seeds:
+        print(write_study(study, definition, results, scenarios, seeds, methods, output, without, beside))
     else:
-        raise InputError("study", "--scores, or --scenarios, --methods and --seeds of a results folder, are required")
+        raise InputError("study", WHAT)
 
 
-def explain_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring explain`."""
-    parser.add_argument("cell", help="STUDY/ROW/TASK/METRIC, for example table1/NeuSpring/future/chamfer")
-    add_results(parser)
-    parser.add_argument("--tables", default="tables", help="folder of the tables in the results folder")
-    parser.add_argument("--configfile", nargs="+", default=(), help="files the benchmark was run with, for the commands")
-    parser.add_argument("--json", action="store_true")
+def explain(
+    cell: Annotated[Positional[str], arg(help="STUDY/ROW/TASK/METRIC, for example table1/NeuSpring/future/chamfer")],
+    results: Results = Path("results"),
+    tables: Annotated[str, arg(help="folder of the tables in the results folder")] = "tables",
+    configfile: Annotated[tuple[str, ...], arg(help="files the benchmark was run with, for the commands")] = (),
+    json: bool = False,
+) -> int:
+    """A cell of a study's table -> the runs behind it, and how to make them again; 1 if a run behind it has changed."""
+    from neuspring.report.explain import explain
+    from neuspring.report.explain_text import text
 
-
-def explain(a: Namespace) -> int:
-    """`neuspring explain`: exit status 1 if a run behind the cell has changed."""
-    from neuspring.report import explain, explain_text
-
-    explanation = explain.explain(a.cell, a.results, a.results / a.tables / "studies", a.configfile)
-    print(explanation.as_json() if a.json else explain_text.text(explanation), end="")
+    explanation = explain(cell, results, results / tables / "studies", configfile)
+    print(explanation.as_json() if json else text(explanation), end="")
     return 1 if explanation.problems else 0
 
 
-def report_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring report`."""
-    add_results(parser)
-    for name in ("scenarios", "methods"):
-        parser.add_argument(f"--{name}", nargs="+", default=(), help="those of the settings, else all on disk, by default")
-    parser.add_argument("--seeds", nargs="+", type=int, default=())
-    parser.add_argument("--transfers", nargs="*", default=(), help="scenarios whose twins were rolled out on other recordings")
-    parser.add_argument("--baseline", help="method that others are compared with")
-    parser.add_argument("--shown", nargs="+", default=(), help="methods to draw (default: six at most)")
-    _add_study_table(parser)
-    parser.add_argument("--tables", default="tables", help="folder of tables in the results folder")
-    parser.add_argument("--megabytes", type=float, default=25.0, help="size that pictures and videos may fill")
-    parser.add_argument("--video-megabytes", type=float, default=8.0, help="part of it for videos; the others are linked")
-    _add_left_out(parser)
-    shared.add_settings(parser)
-    shared.add_output(parser)
-
-
-def report(a: Namespace) -> None:
-    """`neuspring report`."""
+def report(
+    output: Path,
+    results: Results = Path("results"),
+    scenarios: Names = (),
+    methods: Names = (),
+    seeds: tuple[int, ...] = (),
+    transfers: Transfers = (),
+    baseline: Annotated[str | None, arg(help="method that others are compared with")] = None,
+    shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
+    table: StudyTable = Path("config/studies.yaml"),
+    tables: Annotated[str, arg(help="folder of tables in the results folder")] = "tables",
+    megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,
+    video_megabytes: Annotated[float, arg(help="part of it for videos; the others are linked")] = 8.0,
+    left_out: LeftOut = "{}",
+    settings: Settings = "{}",
+) -> None:
+    """Results folder -> one self-contained HTML file."""
     from neuspring.report import page
     from neuspring.scores.studies import read_studies
 
     options = page.Options(
-        scenarios=a.scenarios,
-        methods=a.methods,
-        seeds=a.seeds,
-        baseline=a.baseline,
-        transfers=a.transfers,
-        left_out=_read_left_out(a.left_out),
-        shown=a.shown,
-        settings=None if a.settings == "{}" else shared.read_settings(a.settings),
-        studies=read_studies(a.table),
-        tables=a.tables,
-        megabytes=a.megabytes,
-        video_megabytes=a.video_megabytes,
+        scenarios=scenarios,
+        methods=methods,
+        seeds=seeds,
+        baseline=baseline,
+        transfers=transfers,
+        left_out=_read_left_out(left_out),
+        shown=shown,
+        settings=None if settings == "{}" else read_settings(settings),
+        studies=read_studies(table),
+        tables=tables,
+        megabytes=megabytes,
+        video_megabytes=video_megabytes,
     )
-    print(f"Report: {page.write(a.results, a.output, options)}")
-
-
-def _add_study_table(parser: ArgumentParser) -> None:
-    parser.add_argument("--table", type=Path, default=Path("config/studies.yaml"), help="the study table")
-
-
-def _add_left_out(parser: ArgumentParser) -> None:
-    about = "JSON: methods and the scenarios to which they do not apply, where they have no runs"
-    parser.add_argument("--left-out", metavar="JSON", default="{}", help=about)
+    print(f"Report: {page.write(results, output, options)}")
 
 
 def _read_left_out(text: str) -> dict[str, tuple[str, ...]]:
     """Method -> scenarios to which it does not apply, from JSON text. Raises InputError."""
-    values = shared.json_value("--left-out", text)
+    values = json_value("--left-out", text)
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in values.values()):
         raise InputError("--left-out", "must map methods to lists of scenarios", text)
-    return {method: tuple(names) for method, names in values.items() if isinstance(names, list)}
+    return {method: tuple(names) for method, names in values.items()}
