@@ -1,79 +1,259 @@
-"""Commands on data: fetch, check-data, verify-released."""
+"""Commands on data: fetch, check-data, verify-released, make-capture, mask, compare-masks, annotate."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+import os
+import sys
+import time
+import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from neuspring.cli import options as shared
+from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
+from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
-    from neuspring.core.findings import Finding
+    from collections.abc import Callable
+
+    from neuspring.data.check import Departure
+
+SHOWN = 5
+"""How many doubtful frames are named per camera."""
+BOARD = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
 
 
-def fetch_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring fetch`."""
-    parser.add_argument("source", choices=["phystwin"])
-    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="all 22 by default")
-    parser.add_argument("--data-root", type=Path, required=True, help="folder to write to; data_root of the configuration")
-    parts = "data, results, appearance, images, other; all: these five; extra: more clothes"
-    parser.add_argument("--parts", nargs="+", default=["data", "results"], help=f"{parts} (default: data results)")
-    parser.add_argument("--revision", default="main", help="branch, tag or commit of the data set")
-    parser.add_argument("--dry-run", action="store_true", help="say what would be fetched and the space it takes")
-
-
-def fetch(a: Namespace) -> int:
-    """`neuspring fetch`: exit status 2 if a fetched file is damaged."""
+def fetch(
+    source: Positional[Literal["phystwin"]],
+    scenarios: Annotated[Positional[tuple[str, ...]], arg(help="all 22 by default")] = (),
+    *,
+    data_root: Annotated[Path, arg(help="folder to write to; data_root of the configuration")],
+    parts: Annotated[
+        tuple[str, ...], arg(help="data, results, appearance, images, other; all: these five; extra: more clothes")
+    ] = ("data", "results"),
+    revision: Annotated[str, arg(help="branch, tag or commit of the data set")] = "main",
+    dry_run: Annotated[bool, arg(help="say what would be fetched and the space it takes")] = False,
+) -> int:
+    """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.data import fetch
     from neuspring.scores.released.check_data import check
 
-    findings = fetch.fetch(a.data_root, a.scenarios, a.parts, revision=a.revision, dry_run=a.dry_run, check=check)
-    return 0 if a.dry_run else _tell(findings)
+    departures = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
+    return 0 if dry_run else _tell(departures)
 
 
-def check_data_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring check-data`."""
-    parser.add_argument("folder", type=Path)
-
-
-def check_data(a: Namespace) -> int:
-    """`neuspring check-data`: 2 where the data cannot be used."""
+def check_data(folder: Positional[Path]) -> int:
+    """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
     from neuspring.scores.released.check_data import check
 
-    return _tell(check(a.folder))
+    return _tell(check(folder))
 
 
-def _tell(findings: list[Finding]) -> int:
-    """Print findings; returns 2 where the data cannot be used."""
+def _tell(departures: list[Departure]) -> int:
     from neuspring.data.check import render
 
-    print(render(findings))
-    return 2 if any(finding.level == "error" for finding in findings) else 0
+    print(render(departures))
+    return 2 if any(departure.level == "error" for departure in departures) else 0
 
 
-def verify_released_options(parser: ArgumentParser) -> None:
-    """Add the options of `neuspring verify-released`."""
-    parser.add_argument("data_root", type=Path, help="folder that holds data, experiments and the other released folders")
-    parser.add_argument("--scenarios", nargs="+", default=(), help="all that are there by default")
-    checks = "1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"
-    parser.add_argument("--checks", nargs="+", type=int, help=checks)
-    shared.add_settings(parser)
-    shared.add_device(parser)
-    shared.add_output(parser, "folder to write to")
-
-
-def verify_released(a: Namespace) -> int:
-    """`neuspring verify-released`."""
+def verify_released(
+    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and the other released folders")],
+    output: Annotated[Path, arg(help="folder to write to")],
+    scenarios: Annotated[tuple[str, ...], arg(help="all that are there by default")] = (),
+    checks: Annotated[
+        tuple[int, ...],
+        arg(help="1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"),
+    ] = (),
+    settings: Settings = "{}",
+    device: Device = "auto",
+) -> int:
+    """PhysTwin's released results, checked against ours."""
     from neuspring.scores.released import run
 
-    report = run.verify_released(
-        a.data_root,
-        a.output,
-        scenarios=a.scenarios,
-        checks=a.checks or tuple(run.CHECKS),
-        device=a.device,
-        lpips=shared.read_settings(a.settings).images.lpips,
-    )
+    lpips = read_settings(settings).images.lpips
+    chosen = checks or tuple(run.CHECKS)
+    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device, lpips=lpips)
     print(report.text, end="")
     return report.status
+
+
+def make_capture(
+    output: Annotated[Path, arg(help="the capture folder to write")],
+    category: Annotated[str, arg(help="kind of object: cloth, rope, package, or any other word")],
+    name: Annotated[str | None, arg(help="name of the capture; that of the folder by default")] = None,
+    color: Annotated[tuple[Path, ...], arg(help="per camera: a folder of images, or a video; see --depth")] = (),
+    depth: Annotated[
+        tuple[Path, ...],
+        arg(help="per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"),
+    ] = (),
+    bag: Annotated[tuple[Path, ...], arg(help="instead of color: per camera a RealSense .bag file")] = (),
+    phystwin_raw: Annotated[Path | None, arg(help="instead of color: a case in PhysTwin's raw layout")] = None,
+    cameras: Annotated[tuple[str, ...], arg(help="names of the cameras; 0 1 2 ... by default")] = (),
+    intrinsics: Annotated[Path | None, arg(help="JSON: fx, fy, cx, cy or K of each camera, and distortion")] = None,
+    depth_unit: Annotated[float | None, arg(help="meters per count of depth; guessed by default, and said")] = None,
+    rate: Annotated[float | None, arg(help="frames per second at which it was filmed; that of the video by default")] = None,
+    frames: Annotated[str, arg(help="what is kept, by number: 250-335, 0-300/2, 1,5,9-20")] = "",
+    train_end: Annotated[int | None, arg(help="training frames end before this frame; the first 70 percent by default")] = None,
+    poses: Annotated[
+        Path | None,
+        arg(help="JSON: camera_to_world or world_to_camera; one camera with depth needs none: the table gives its pose"),
+    ] = None,
+    board: Annotated[
+        str | None, arg(metavar=BOARD, help="a ChArUco board that every camera sees, like 5x7:0.04:0.03:DICT_5X5_100")
+    ] = None,
+    board_images: Annotated[
+        tuple[Path, ...], arg(help="per camera: an image of the board, or a folder of them; the first frames by default")
+    ] = (),
+    level: Annotated[bool, arg(help="move the world of given poses so that the table is z = 0")] = False,
+    top_down: Annotated[bool, arg(help="the camera looks straight down: the plane it faces is the table")] = False,
+    table_at: Annotated[tuple[float, float] | None, arg(help="a pixel of the table, where another plane is larger")] = None,
+    force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
+) -> None:
+    """Color and depth of a camera -> a capture folder. What was found is printed, and the next command."""
+    from neuspring.data.intake.images import pairs
+    from neuspring.data.intake.lenses import Board
+    from neuspring.data.intake.make import Intake, make_capture
+    from neuspring.data.intake.recordings import Bag, Raw
+
+    given = [option for option, value in (("--color", color), ("--bag", bag), ("--phystwin-raw", phystwin_raw)) if value]
+    if len(given) != 1:
+        rule = "one of --color with --depth, --bag, --phystwin-raw is required"
+        raise InputError("make-capture", rule, " ".join(given) or "none")
+    raw = Raw.open(phystwin_raw) if phystwin_raw else None
+    if raw:
+        views = raw.views
+    elif bag:
+        names = cameras or tuple(str(k) for k in range(len(bag)))
+        if len(set(names)) != len(bag):
+            raise InputError("--cameras", f"{len(bag)} different names are required", " ".join(names))
+        views = [Bag(camera, path) for camera, path in zip(names, bag, strict=True)]
+    else:
+        views = pairs(color, depth, cameras)
+    intake = Intake(
+        folder=output,
+        name=name or output.resolve().name,
+        category=category,
+        views=views,
+        rate=rate if rate is not None or raw is None else raw.rate,
+        frames=frames,
+        depth_unit=depth_unit,
+        intrinsics=intrinsics,
+        poses=poses,
+        board=Board.of(board) if board else None,
+        board_images=board_images,
+        level=level,
+        top_down=top_down,
+        table_at=table_at,
+        train_end=train_end,
+        raw=raw,
+        force=force,
+    )
+    capture, report = make_capture(intake)
+    print("\n".join(report))
+    print(f"written: {capture.folder}\nnext:")
+    print(f"  neuspring check-data {capture.folder}")
+    if not capture.description.masks:
+        print(f"  neuspring annotate {capture.folder}")
+
+
+def mask(
+    capture: Annotated[Positional[Path], arg(help="capture folder")],
+    marks: Annotated[Path | None, arg(help="marks of object and hands; marks.json of the capture by default")] = None,
+    backend: Annotated[Literal["marks", "sam2"], arg(help="sam2 needs its weights")] = "marks",
+    cameras: Annotated[tuple[str, ...], arg(help="all that have marks by default")] = (),
+    again: Annotated[bool, arg(help="also where marks, images and settings are unchanged")] = False,
+    settings: Settings = "{}",
+    device: Device = "auto",
+) -> None:
+    """Marks on a few frames -> masks of object and hands in every frame of a capture."""
+    from neuspring.data.capture import Capture
+    from neuspring.perception import segment_sam2
+    from neuspring.perception.marks import store
+    from neuspring.perception.marks.marks import MARKS, Marks
+
+    read, path = Capture.load(capture), marks or capture / MARKS
+    marked = Marks.load(path)
+    marked.require(read, path)
+    segmentation = read_settings(settings).perception.segment
+    own = segmentation.marks if backend == "marks" else segmentation.grounded_sam2
+    wanted = cameras or tuple(name for name in read.cameras if marked.of(name))
+    for name in wanted:
+        read.require_camera(name)
+        if not marked.of(name):
+            raise InputError(f"{path}, cameras", f"camera {name} needs marks", sorted(marked.cameras))
+    if not wanted:
+        raise InputError(f"{path}, cameras", "a camera of the capture needs marks", sorted(marked.cameras))
+    made = store.Made.of(read)
+    for name in wanted:
+        source = store.source_digest(read, name, marked.of(name), backend, own)
+        if made.holds(read, name, source) and not again:
+            doubts = made.cameras[name].doubt
+            told = "marks, images and settings are unchanged; its masks are kept"
+        else:
+            if backend == "sam2":
+                from neuspring.core.device import resolve_device
+
+                carried = segment_sam2.carry(read, name, marked.of(name), segmentation.grounded_sam2, resolve_device(device))
+            else:
+                bar = _bar(f"camera {name}")
+                carried = store.carry_camera(read, name, marked.of(name), segmentation.marks, progress=bar)
+            doubts = store.save_carried(read, name, carried, source, backend).doubt
+            told = f"masks are in {capture / 'mask' / name}"
+        print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")
+        worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]
+        print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
+    without = [name for name in read.cameras if not store.has_masks(read, [name])]
+    if without:
+        print(f"cameras without masks: {', '.join(without)}; {read.folder / 'capture.json'} says masks: true when all have some")
+
+
+def _bar(name: str) -> Callable[[int, int], None]:
+    """A line that shows how far the work is: on a terminal it is drawn over and over, elsewhere it is written ten times."""
+    began, live, told = time.perf_counter(), sys.stderr.isatty(), [-1]
+
+    def show(done: int, total: int) -> None:
+        tenth = 10 * done // max(total, 1)
+        if live or tenth != told[0]:
+            told[0] = tenth
+            left = (time.perf_counter() - began) / max(done, 1) * (total - done)
+            line = f"{name}: {'#' * (2 * tenth):<20} {100 * done // max(total, 1):3d} %, {left:.0f} s left"
+            print(f"\r{line:<70}" if live else line, end="" if live and done < total else "\n", file=sys.stderr, flush=True)
+
+    return show
+
+
+def compare_masks(
+    masks: Annotated[Positional[Path], arg(help="folder of masks, <frame>.png")],
+    truth: Annotated[Positional[Path], arg(help="folder of masks to compare with; its frames count")],
+) -> None:
+    """Two folders of masks -> their overlap per frame."""
+    from neuspring.perception.marks.store import compare, table
+
+    print(table(compare(masks, truth)), end="")
+
+
+def annotate(
+    capture: Annotated[Positional[Path], arg(help="folder with capture.json")],
+    host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
+    port: Annotated[int, arg(help="0: any that is free")] = 8765,
+    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
+    settings: Settings = "{}",
+) -> None:
+    """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
+    from neuspring.data.capture import Capture
+    from neuspring.perception.annotate.guard import is_loopback
+    from neuspring.perception.annotate.server import Server
+
+    server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)
+    print(f"Annotate {capture} at {server.url} (stop with Ctrl-C)", flush=True)
+    if not is_loopback(host):
+        print("Anybody who can read this network's traffic can read the address; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
+    # Without a window webbrowser may start a text browser in this terminal.
+    has_display = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if not no_open and has_display:
+        webbrowser.open(server.url)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        print("\nStopped. Marks and clicks are saved.", flush=True)
+    finally:
+        server.close()

@@ -1,22 +1,51 @@
 """The command line, `neuspring`: every stage of the workflow by hand, and the tools around it.
 
-Exit status: 0 done (a numerical failure is a recorded result), 2 bad input (only another input can help), 1 anything else.
-Only the module of the command that runs is imported, after the number of threads is set.
+A command is a typed function: a stage, or a function of `TOOLS`; tyro makes its options. Exit status: 0 done (a numerical failure
+is a recorded result), 2 bad input (only another input can help), 1 anything else. Only the module of the command that runs is
+imported, after the number of threads is set.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from neuspring import __version__
-from neuspring.cli.tools import TOOLS
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.stages import STAGES
 
+TOOLS = {
+    "draw strip": ("pictures", "observed frames on top, each method's prediction and error below -> PDF or PNG"),
+    "draw twin": ("pictures", "stiffness and regions of twins, from any side -> PDF or PNG"),
+    "draw film": ("pictures", "observed beside predicted, moving -> MP4 or GIF of limited size"),
+    "draw frames": ("pictures", "splats and trajectory -> RGBA pictures of any camera"),
+    "play": ("twins", "runs of a results folder in the browser; twins that can be pulled by hand"),
+    "export": ("twins", "a twin -> USD, PLY, SPZ, Newton, MuJoCo, or npz with a JSON description"),
+    "fetch": ("data", "released archives -> the folders that the readers expect"),
+    "make-capture": ("data", "color and depth of a camera -> a capture folder"),
+    "check-data": ("data", "report how a data folder departs from the expected layout"),
+    "mask": ("data", "marks on a few frames -> masks of object and hands in every frame of a capture"),
+    "compare-masks": ("data", "two folders of masks -> their overlap per frame"),
+    "annotate": ("data", "mark masks and tracks of a capture in the browser"),
+    "verify-released": ("data", "PhysTwin's released results, checked against ours"),
+    "tables": ("results", "run records -> tables"),
+    "perception-table": ("results", "errors of perception, per category"),
+    "study": ("results", "run records -> one of the paper's tables, beside the paper's values"),
+    "explain": ("results", "a cell of a study's table -> the runs behind it, and how to make them again"),
+    "report": ("results", "results folder -> one self-contained HTML file"),
+    "track-init": ("runs", "prepare the MLflow store, once before any run is logged"),
+    "log": ("runs", "log one run.json to MLflow"),
+    "sync": ("runs", "send to MLflow what is missing there, and close runs that were killed"),
+    "compare": ("runs", "runs of two commits, from MLflow -> paired differences"),
+    "ui": ("runs", "open the MLflow UI of a results folder"),
+    "tune": ("runs", "one worker of a sweep"),
+    "tune-report": ("runs", "a sweep -> summary, plots, best.yaml"),
+    "doctor": ("runs", "say what this machine can do, and what is missing"),
+}
+"""Command -> the module of neuspring.cli with a function of its name, and what it does."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OWN_THREADS = ("search",)
 """Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
@@ -25,16 +54,10 @@ OWN_THREADS = ("search",)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["draw"]:
-        words = importlib.import_module("neuspring.cli.draw").words(words)
     for name in THREADS:
         os.environ.setdefault(name, _threads(words))
     try:
-        if words and words[0] in STAGES:
-            STAGES[words[0]](**STAGES[words[0]].parse(words[1:]))
-            return 0
-        parsed = _parser(words[0] if words else "").parse_args(words)
-        return parsed.command(parsed) or 0
+        return _run(words)
     except (InputError, NumericalFailure) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
         return 2
@@ -54,22 +77,38 @@ def _threads(words: Sequence[str]) -> str:
         return "1"
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
-    """The parser, with the options of the command `name` alone: the modules of the others stay unimported."""
-    parser = argparse.ArgumentParser(prog="neuspring", description="Spring-mass twins of deformable objects from RGBD video.")
-    parser.add_argument("--version", action="version", version=__version__)
-    commands = parser.add_subparsers(required=True, metavar="command")
-    about = {stage: declared.about for stage, declared in STAGES.items()} | {tool: text for tool, (_, text) in TOOLS.items()}
-    for command, text in about.items():
-        own = commands.add_parser(command, help=text, description=text)
-        if command == name:
-            add_options, run = _functions(command)
-            add_options(own)
-            own.set_defaults(command=run)
-    return parser
+def _run(words: list[str]) -> int:
+    if words[:1] == ["--version"]:
+        print(__version__)
+        return 0
+    if words[:1] in ([], ["-h"], ["--help"]):
+        print(_overview())
+        return 0 if words else 2
+    command = " ".join(words[:2]) if words[0] == "draw" else words[0]
+    if command in TOOLS:
+        import tyro
+
+        module = importlib.import_module(f"neuspring.cli.{TOOLS[command][0]}")
+        function = getattr(module, command.replace("-", "_").replace(" ", "_"))
+        rest, options = words[len(command.split()) :], (tyro.conf.FlagCreatePairsOff,)
+        about = (function.__doc__ or "").strip()
+        return tyro.cli(function, args=rest, prog=f"neuspring {command}", description=about, config=options) or 0
+    from neuspring.stages import STAGES
+
+    if command in STAGES:
+        STAGES[command](**STAGES[command].parse(words[1:]))
+        return 0
+    close = difflib.get_close_matches(command, [*STAGES, *TOOLS], n=1) or [name for name in TOOLS if name.startswith(words[0])]
+    remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
+    raise InputError("command", "must be a stage or a tool", command, remedy)
 
 
-def _functions(command: str) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int | None]]:
-    """What adds a command's options, and what runs it."""
-    module, name = importlib.import_module(TOOLS[command][0]), command.replace("-", "_")
-    return getattr(module, f"{name}_options"), getattr(module, name)
+def _overview() -> str:
+    from neuspring.stages import STAGES
+
+    stages = [f"  {name:<17} {stage.about}" for name, stage in STAGES.items()]
+    tools = [f"  {name:<17} {about}" for name, (_, about) in TOOLS.items()]
+    head = (
+        "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n\nSpring-mass twins of deformable objects from RGBD video."
+    )
+    return "\n".join([head, "\nStages of the workflow, each by hand:", *stages, "\nTools:", *tools])

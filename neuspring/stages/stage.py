@@ -312,6 +312,8 @@ class Stage:
         """Values of a command line, as `__call__` takes them. Raises InputError, and SystemExit for words that are no options."""
         import tyro
 
+        pairs = (tyro.conf.FlagCreatePairsOff,)
+
         fields: list[Any] = []
         for name, parameter in self.parameters.items():
             kind, default = _typed(parameter)
@@ -324,7 +326,8 @@ class Stage:
             note = tyro.conf.arg(help="JSON, or YAML files separated by commas; defaults otherwise")
             fields.append(("settings", Annotated[str, note], dataclasses.field(default="{}")))
         made = dataclasses.make_dataclass(self.name, fields, kw_only=True)
-        read = dataclasses.asdict(tyro.cli(made, prog=f"neuspring {self.name}", description=f"{self.about}.", args=list(words)))
+        about = f"{self.about}."
+        read = dataclasses.asdict(tyro.cli(made, args=list(words), prog=f"neuspring {self.name}", description=about, config=pairs))
         if "settings" in read:
             read["settings"] = read_settings(read["settings"])
         for name, parameter in self.parameters.items():
@@ -364,11 +367,10 @@ def _typed(parameter: Parameter) -> tuple[Any, Any]:
 def _about(parameter: Parameter) -> str:
     if parameter.type is ScenarioRow:
         return "a row of the scenario table, by its name or as JSON"
-    return (
-        f"{parameter.name}.json or .npz" + (" of every camera or recording, in their order" if parameter.many else "")
-        if parameter.is_input
-        else ""
-    )
+    if not parameter.is_input:
+        return ""
+    name = f"{parameter.name}.json" if parameter.one is Before else {Capture: "capture.json"}.get(parameter.one, "observations.npz")
+    return name + (" of every camera, in their order" if parameter.one is Before and parameter.many else "")
 
 
 def read_settings(text: str) -> Config:
