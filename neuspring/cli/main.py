@@ -90,7 +90,7 @@ def _run(words: list[str]) -> int:
 
         module = importlib.import_module(f"neuspring.cli.{TOOLS[command][0]}")
         function = getattr(module, command.replace("-", "_").replace(" ", "_"))
-        rest, options = words[len(command.split()) :], (tyro.conf.FlagCreatePairsOff,)
+        rest, options = words[len(command.split()) :], (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
         about = (function.__doc__ or "").strip()
         return tyro.cli(function, args=rest, prog=f"neuspring {command}", description=about, config=options) or 0
     from neuspring.stages import STAGES

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
-from neuspring.cli import options as shared
+from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
 from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
@@ -32,6 +32,102 @@ ELEVATION = 25.0
 """Degrees above the horizon of a view that is not asked for."""
 
 
+MEGABYTES = 2.0
+"""Size of a film that a README loads at once."""
+
+
+@dataclass(kw_only=True)
+class RunOptions:
+    """Which runs, seen from where, as which file."""
+
+    results: Annotated[
+        Positional[tuple[Path, ...]], arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario")
+    ]
+    methods: Annotated[tuple[str, ...], arg(help="METHOD or METHOD/SEED, in the order of the picture")] = ()
+    labels: Annotated[tuple[str, ...], arg(help="names in the picture, one per method")] = ()
+    camera: Annotated[str | None, arg(help="a camera of the capture; the first by default, or a view of the broad side")] = None
+    azimuth: Annotated[float | None, arg(help="instead of a camera: degrees around the vertical axis, 0 from +x")] = None
+    elevation: Annotated[float | None, arg(help="degrees above the horizon; 25 by default")] = None
+    settings: Settings = "{}"
+    device: Device = "auto"
+    output: Annotated[Path, arg(help="file to write, for example picture.pdf or film.gif")]
+
+
+@dataclass(kw_only=True)
+class ComparedOptions(RunOptions):
+    """How predictions and errors are drawn."""
+
+    frames: Annotated[tuple[int, ...], arg(help="of a strip: first, last of training, middle of the future, last by default")] = ()
+    style: Annotated[Literal["splats", "nodes"] | None, arg(name="as", help="splats where the runs have them by default")] = None
+    error: Annotated[
+        Literal["color", "distance", "none"] | None,
+        arg(help="difference of pictures, distance of nodes to observed points, or no errors"),
+    ] = None
+    most: Annotated[float | None, arg(help="upper end of the range of errors: of 1 for color, mm for distance")] = None
+    background: Annotated[
+        Literal["white", "image"] | None,
+        arg(help="white paper, or the photo (pale behind a prediction); white for splats, image for nodes by default"),
+    ] = None
+
+
+Inches = Annotated[float, arg(help="inches on paper, where text has 8 points")]
+Dots = Annotated[float, arg(help="dots per inch of what is not lines or text")]
+
+
+@dataclass(kw_only=True)
+class StripOptions(ComparedOptions):
+    """The size on paper."""
+
+    width: Inches = 7.0
+    dpi: Dots = 300.0
+
+
+@dataclass(kw_only=True)
+class FilmOptions(ComparedOptions):
+    """Size and speed."""
+
+    width: Annotated[int, arg(help="pixels")] = 800
+    speed: Annotated[float, arg(help="1: as fast as it was; 0.5: half as fast")] = 1.0
+    megabytes: Annotated[float, arg(help="largest file; a film beyond it is made coarser")] = MEGABYTES
+
+
+@dataclass(kw_only=True)
+class TwinOptions(RunOptions):
+    """What is drawn of twins, and the size on paper."""
+
+    by: Annotated[tuple[Literal["stiffness", "region"], ...], arg(help="rows: springs by stiffness, nodes by region")] = (
+        "stiffness",
+        "region",
+    )
+    frame: Annotated[int, arg(help="of the prediction")] = 0
+    style: Annotated[Literal["springs", "splats"], arg(name="as", help="springs as lines, or the surface that splats show")] = (
+        "springs"
+    )
+    background: Annotated[Literal["white", "image"], arg(help="what is behind: white paper, or the photo, pale")] = "white"
+    width: Inches = 7.0
+    dpi: Dots = 300.0
+
+
+def draw_frames(
+    capture: Annotated[Path, arg(help="capture.json")],
+    appearance: Annotated[Path, arg(help="appearance.json")],
+    rollout: Annotated[Path, arg(help="rollout.json")],
+    camera: str,
+    output: Annotated[Path, arg(help="folder to write to")],
+    frames: Annotated[tuple[int, ...], arg(help="all by default")] = (),
+    background: Literal["black", "white"] = "black",
+    settings: Settings = "{}",
+    device: Device = "auto",
+) -> None:
+    """Splats and trajectory -> RGBA pictures of any camera."""
+    from neuspring.core.records import Before
+    from neuspring.stages.render import draw_frames
+
+    records, chosen = (Before.load(appearance), Before.load(rollout)), read_settings(settings)
+    made = draw_frames(capture.parent, *records, camera, frames or None, background, chosen, device, output)
+    print(f"{len(made)} pictures: {output}")
+
+
 @dataclass(frozen=True, eq=False)
 class Chosen:
     """The runs of a picture, and how they are drawn."""
@@ -43,8 +139,8 @@ class Chosen:
     device: str
 
 
-def strip(a: Namespace) -> None:
-    """`neuspring draw strip`."""
+def draw_strip(a: StripOptions) -> None:
+    """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
     sheet.require_ending(a.output, sheet.PICTURES)
     sheet.require_size(a.width, a.dpi)
     chosen = _choose(a)
@@ -58,8 +154,8 @@ def strip(a: Namespace) -> None:
     print(f"Caption: {caption(painter)}")
 
 
-def film(a: Namespace) -> None:
-    """`neuspring draw film`."""
+def draw_film(a: FilmOptions) -> None:
+    """Observed beside predicted, moving -> MP4 or GIF of limited size."""
     sheet.require_ending(a.output, sheet.FILMS)
     chosen = _choose(a)
     count = chosen.found.observations.scenario.frame_count
@@ -69,8 +165,8 @@ def film(a: Namespace) -> None:
     print(f"Wrote {a.output}: {made}, {painter.manner.style}")
 
 
-def twin(a: Namespace) -> None:
-    """`neuspring draw twin`."""
+def draw_twin(a: TwinOptions) -> None:
+    """Stiffness and regions of twins, from any side -> PDF or PNG."""
     sheet.require_ending(a.output, sheet.PICTURES)
     sheet.require_size(a.width, a.dpi)
     chosen = _choose(a, positions=a.frame > 0)
@@ -91,17 +187,17 @@ def twin(a: Namespace) -> None:
     print(f"Wrote {a.output}: {', '.join(take.label for take in chosen.takes)}, frame {a.frame}, camera {scene.camera.name}")
 
 
-def _choose(a: Namespace, *, positions: bool = True) -> Chosen:
+def _choose(a: RunOptions, *, positions: bool = True) -> Chosen:
     """The runs that are named, read. Raises InputError."""
-    device, images, found = resolve_device(a.device), shared.read_settings(a.settings).images, find(a.results)
+    device, images, found = resolve_device(a.device), read_settings(a.settings).images, find(a.results)
     runs = _named(a, found)
-    labels = a.labels or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
+    labels = list(a.labels) or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
     if len(labels) != len(runs):
         raise InputError("--labels", f"one name for each of {len(runs)} methods is required", len(labels))
     return Chosen(found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], images, device)
 
 
-def _named(a: Namespace, found: Found) -> list[Run]:
+def _named(a: RunOptions, found: Found) -> list[Run]:
     """The runs of --methods in their order; of a method without seed the first one. Without --methods those to begin with."""
     by_name = {run.name: run for run in found.runs}
     if not a.methods:
@@ -143,7 +239,7 @@ def _require_splats(chosen: Chosen, remedy: str) -> None:
         raise InputError("--as splats", rule, f"none for {without}", remedy)
 
 
-def _painter(a: Namespace, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
+def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
     """What paints a strip or a film; `error` is what is drawn where nothing is asked for, None for the best there is."""
     if a.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw nodes.")
@@ -170,7 +266,7 @@ def _painter(a: Namespace, chosen: Chosen, frames: list[int], error: Error | Non
     return Painter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
 
 
-def _scene(a: Namespace, chosen: Chosen, frames: list[int], takes: list[Take]) -> Scene:
+def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Take]) -> Scene:
     """The scene from the camera that is asked for. Raises InputError."""
     found, observations = chosen.found, chosen.found.observations
     cameras = found.capture.cameras if found.capture else {}
