@@ -60,9 +60,9 @@ class ComparedOptions(RunOptions):
     frames: Annotated[tuple[int, ...], arg(help="of a strip: first, last of training, middle of the future, last by default")] = ()
     style: Annotated[Literal["splats", "nodes"] | None, arg(name="as", help="splats where the runs have them by default")] = None
     error: Annotated[
-        Literal["color", "distance", "none"] | None,
-        arg(help="difference of pictures, distance of nodes to observed points, or no errors"),
-    ] = None
+        Literal["best", "color", "distance", "none"],
+        arg(help="difference of pictures, distance of nodes to observed points, or no errors; best: what can be drawn"),
+    ] = "best"
     most: Annotated[float | None, arg(help="upper end of the range of errors: of 1 for color, mm for distance")] = None
     background: Annotated[
         Literal["white", "image"] | None,
@@ -139,52 +139,65 @@ class Chosen:
     device: str
 
 
-def draw_strip(a: StripOptions) -> None:
+def draw_strip(picture: StripOptions) -> None:
     """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
-    sheet.require_ending(a.output, sheet.PICTURES)
-    sheet.require_size(a.width, a.dpi)
-    chosen = _choose(a)
+    sheet.require_ending(picture.output, sheet.PICTURES)
+    sheet.require_size(picture.width, picture.dpi)
+    chosen = _choose(picture)
     scenario = chosen.found.observations.scenario
-    frames = sorted(set(_frames(a.frames, scenario.frame_count) or chosen_frames(scenario, scenario.frame_count)))
-    painter = _painter(a, chosen, frames, None)
-    figure = strip_figure(painter, a.width)
+    frames = sorted(set(_frames(picture.frames, scenario.frame_count) or chosen_frames(scenario, scenario.frame_count)))
+    painter = _painter(picture, chosen, frames, None)
+    figure = strip_figure(painter, picture.width)
     width, height = figure.get_size_inches()
-    sheet.save(figure, a.output, a.dpi)
-    print(f"Wrote {a.output}: {len(frames)} frames, {width:.2f} x {height:.2f} inches, {painter.manner.style}")
+    sheet.save(figure, picture.output, picture.dpi)
+    print(f"Wrote {picture.output}: {len(frames)} frames, {width:.2f} x {height:.2f} inches, {painter.manner.style}")
     print(f"Caption: {caption(painter)}")
 
 
-def draw_film(a: FilmOptions) -> None:
+def draw_film(picture: FilmOptions) -> None:
     """Observed beside predicted, moving -> MP4 or GIF of limited size."""
-    sheet.require_ending(a.output, sheet.FILMS)
-    chosen = _choose(a)
+    sheet.require_ending(picture.output, sheet.FILMS)
+    chosen = _choose(picture)
     count = chosen.found.observations.scenario.frame_count
-    frames = sorted(set(_frames(a.frames, count) or range(count)))
-    painter = _painter(a, chosen, frames, "none")
-    made = write_film(painter, a.output, a.width, a.speed, a.megabytes)
-    print(f"Wrote {a.output}: {made}, {painter.manner.style}")
+    frames = sorted(set(_frames(picture.frames, count) or range(count)))
+    painter = _painter(picture, chosen, frames, "none")
+    made = write_film(painter, picture.output, picture.width, picture.speed, picture.megabytes)
+    print(f"Wrote {picture.output}: {made}, {painter.manner.style}")
 
 
-def draw_twin(a: TwinOptions) -> None:
+def draw_twin(picture: TwinOptions) -> None:
     """Stiffness and regions of twins, from any side -> PDF or PNG."""
-    sheet.require_ending(a.output, sheet.PICTURES)
-    sheet.require_size(a.width, a.dpi)
-    chosen = _choose(a, positions=a.frame > 0)
-    _frames([a.frame], chosen.found.observations.scenario.frame_count, "--frame")
+    sheet.require_ending(picture.output, sheet.PICTURES)
+    sheet.require_size(picture.width, picture.dpi)
+    chosen = _choose(picture, positions=picture.frame > 0)
+    _frames([picture.frame], chosen.found.observations.scenario.frame_count, "--frame")
     for take, run in zip(chosen.takes, chosen.runs, strict=True):
         if take.twin is None:
             rule = "must have a twin"
             raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Name methods with a search.")
-        if a.frame >= len(take.positions):
-            raise InputError("--frame", f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged", a.frame)
-    if a.style == "splats":
+        if picture.frame >= len(take.positions):
+            raise InputError(
+                "--frame", f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged", picture.frame
+            )
+    if picture.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw springs.")
-    scene = _scene(a, chosen, [a.frame], chosen.takes)
-    if a.background == "image" and scene.photo(a.frame) is None:
+    scene = _scene(picture, chosen, [picture.frame], chosen.takes)
+    if picture.background == "image" and scene.photo(picture.frame) is None:
         raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
-    body = Body(scene, chosen.takes, a.frame, tuple(dict.fromkeys(a.by)), a.style, a.background, chosen.images, chosen.device)
-    sheet.save(body_figure(body, a.width), a.output, a.dpi)
-    print(f"Wrote {a.output}: {', '.join(take.label for take in chosen.takes)}, frame {a.frame}, camera {scene.camera.name}")
+    body = Body(
+        scene,
+        chosen.takes,
+        picture.frame,
+        tuple(dict.fromkeys(picture.by)),
+        picture.style,
+        picture.background,
+        chosen.images,
+        chosen.device,
+    )
+    sheet.save(body_figure(body, picture.width), picture.output, picture.dpi)
+    print(
+        f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, camera {scene.camera.name}"
+    )
 
 
 def _choose(a: RunOptions, *, positions: bool = True) -> Chosen:
@@ -259,7 +272,7 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
         raise InputError("--background image", "needs a camera of a capture", scene.camera.name, "Leave it out.")
     manner = Manner(
         style=style,
-        error=a.error or error or ("color" if comparable else "distance"),
+        error=(error if a.error == "best" else a.error) or ("color" if comparable else "distance"),
         ground=a.background or ("image" if style == "nodes" else "white"),
         most=a.most,
     )
