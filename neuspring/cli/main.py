@@ -98,7 +98,8 @@ def _run(words: list[str]) -> int:
     if command in STAGES:
         STAGES[command](**STAGES[command].parse(words[1:]))
         return 0
-    close = difflib.get_close_matches(command, [*STAGES, *TOOLS], n=1) or [name for name in TOOLS if name.startswith(words[0])]
+    close = [name for name in TOOLS if name.startswith(f"{words[0]} ")]
+    close = close or difflib.get_close_matches(command, [*STAGES, *TOOLS], n=1)
     remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
     raise InputError("command", "must be a stage or a tool", command, remedy)
 

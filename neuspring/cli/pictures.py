@@ -196,7 +196,8 @@ def draw_twin(picture: TwinOptions) -> None:
     )
     sheet.save(body_figure(body, picture.width), picture.output, picture.dpi)
     print(
-        f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, camera {scene.camera.name}"
+        f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, "
+        f"camera {scene.camera.name}"
     )
 
 
