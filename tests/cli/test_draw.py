@@ -160,7 +160,7 @@ def test_what_a_run_lacks_is_named(plain, tmp_path, capsys):
         ["draw", kind, str(scenario), "--output", str(tmp_path / f"{kind}.png"), "--methods"] for kind in ("twin", "strip")
     )
     assert main([*twin, "baseline"]) == 2
-    assert "--methods baseline/0: must have a twin; received no twin methods with a search." in capsys.readouterr().err
+    assert "--methods baseline/0: must have a twin; received no twin" in capsys.readouterr().err
     assert main([*strip, "neuspring"]) == 2
     assert "--methods neuspring/0: must have a prediction; received no prediction" in capsys.readouterr().err
     # A strip needs no twin, and a twin in frame 0 no prediction.
