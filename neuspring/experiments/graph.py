@@ -337,12 +337,16 @@ class Graph:
     # --- what makes a job run again beside its command
 
     def stamp(self, stage: Stage) -> Callable[..., str]:
-        """Wildcards of a job -> a digest of its code, of images that the user may change, and of optional weights."""
+        """Wildcards of a job -> its options and settings, digests of its code and of images that the user may change, weights.
+
+        Of the command Snakemake remembers nothing: what is made from a job's inputs is no parameter of its own to it.
+        """
 
         def digest(wildcards: Any) -> str:
             config = self.config_of(stage, wildcards)
             modules = stage.code(config, self._given(stage, wildcards))
-            parts = [code_digest(f"neuspring.stages.{stage.name}", *modules)]
+            parts = [_json(self.options(stage, wildcards)), self.settings(stage, wildcards)]
+            parts.append(code_digest(f"neuspring.stages.{stage.name}", *modules))
             if "capture" in stage.inputs or stage.name == "capture":
                 parts.append(self._image_stamps(wildcards.scenario))
             if stage.name == "render":
