@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.benchmarks.footage import Errors, Points, carried, clicked, film, overlaps, stepwise, truths
 from tests.support.real import FOOTAGE
+from workflow.scripts.footage import Errors, Points, carried, clicked, film, overlaps, stepwise, truths
 
 pytestmark = pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
 MASKS = {

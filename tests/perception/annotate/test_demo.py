@@ -11,10 +11,10 @@ from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.make import make
 from neuspring.perception.marks.marks import Mark
 from neuspring.perception.marks.store import overlap
-from tests.benchmarks.masks import MOST_MARKS, corrections, outlines
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
 from tests.support.served import TOKEN, Client, served
+from workflow.scripts.masks import MOST_MARKS, corrections, outlines
 
 DEMO = config.read_yaml(ROOT / "config" / "data" / "demo.yaml")
 KEYS = {"object": "1", "hand": "2"}

@@ -1,10 +1,10 @@
 """How well masks are carried from a few marks: IoU against drawn or rendered masks, as a table.
 
-    python -m tests.benchmarks.masks plush FOLDER                     real RGBD film, marks in tests/data/marks
-    python -m tests.benchmarks.masks captures FOLDER ...              synthetic captures; outlines of frame 0 stand in for a user
+    python -m workflow.scripts.masks plush FOLDER                     real RGBD film, marks in tests/data/marks
+    python -m workflow.scripts.masks captures FOLDER ...              synthetic captures; outlines of frame 0 stand in for a user
 
 FOLDER of `plush` has color/NUMBER.png, depth/NUMBER.png (mm) and masks_250_335. With --pictures FOLDER, frames with masks are drawn
-to look at. Real color film: `tests.benchmarks.footage`.
+to look at. Real color film: `workflow.scripts.footage`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from neuspring.perception.marks.carry import Carried, carry
 from neuspring.perception.marks.marks import Mark, Marks
 from neuspring.perception.marks.store import carry_camera, overlap, overlay
 
-MARKS = Path(__file__).parents[1] / "data" / "marks"
+MARKS = Path(__file__).parents[2] / "tests" / "data" / "marks"
 MOST_MARKS = 5
 OUTLINE = 1.5
 """How far, pixels, the outline that a user draws is from the truth."""

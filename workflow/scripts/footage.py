@@ -1,6 +1,6 @@
 """Masks and tracks on real color film against what was drawn by hand: tables of IoU and of pixel errors.
 
-    python -m tests.benchmarks.footage FOLDER [--cases ...] [--masks FOLDER] [--trackers ...]
+    python -m workflow.scripts.footage FOLDER [--cases ...] [--masks FOLDER] [--trackers ...]
 
 FOLDER has videos/combine_tracking__CASE.mp4 or combine_rendering__CASE.mp4 (the left half is the film), masks/CASE/FRAME.png
 (0 nothing, 1 object, 2 hands) and tracks/CASE.json (points marked by hand, null where hidden). Marks of frame 0 alone
@@ -30,7 +30,7 @@ from neuspring.perception.annotate.follow import follow as follow_click
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import Marks
 from neuspring.perception.marks.store import overlap
-from tests.benchmarks.masks import MARKS, Frames
+from workflow.scripts.masks import MARKS, Frames
 
 RIM = 3.0
 """How far beside its mask a point may lie, pixels: points were marked at tips and corners."""

@@ -1,20 +1,29 @@
-"""The pure parts of the comparison with PhysTwin: shifts, IoU without hands, means, differences, strips, names of jobs."""
+"""The pure parts of the studies of color alone: shifts, IoU without hands, means, differences, costs, hands, captures."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.data.capture import HANDS, OBJECT
-from tests.benchmarks.beside_cost import GROUPS, cost_lines, costs, merged, minutes_by_job
-from tests.benchmarks.beside_data import LEFT_OUT, PHYSTWIN, STILL, Published, Run, fitted_shift, iou_without_hands, shifted
-from tests.benchmarks.beside_phystwin import Scores, labeled_rows
-from tests.benchmarks.beside_strips import WHITE, frames_shown, layout, over_white, surroundings
-from tests.benchmarks.beside_tables import COLUMNS, cell, differences, mean_and_spread, tables
+from neuspring.core.records import digest_file
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.check import check_layout
+from neuspring.perception.marks.marks import MARKS, Marks
+from tests.support import small
+from tests.support.colored import paint
+from tests.support.findings import of_level
+from tests.support.real import FOOTAGE
+from workflow.scripts.beside_data import PHYSTWIN, Run, fitted_shift, iou_without_hands, shifted
+from workflow.scripts.beside_phystwin import Scores
+from workflow.scripts.beside_tables import COLUMNS, GROUPS, cell, costs, differences, mean_and_spread, minutes_by_job
+from workflow.scripts.footage import film
+from workflow.scripts.footage_captures import write_capture
+from workflow.scripts.one_color_camera import hand_errors, one_camera
 
 
 def block(rows: slice, columns: slice, shape: tuple[int, int] = (40, 60)) -> np.ndarray:
@@ -36,15 +45,6 @@ def test_a_shift_is_found_again(shift):
     assert fitted_shift(mask, labels, most=3.0) == shift
 
 
-def test_whole_shifts_move_pixels_and_half_ones_keep_those_covered_by_more_than_a_half():
-    mask = block(slice(10, 20), slice(15, 25))
-    assert (shifted(mask, (2, -3)) == block(slice(7, 17), slice(17, 27))).all()
-    assert (shifted(mask, (0.5, 0)) == block(slice(10, 20), slice(16, 25))).all()
-    color = np.where(mask[..., None], 200, 0).astype(np.uint8).repeat(3, axis=2)
-    moved = shifted(color, (0.5, 0))
-    assert (moved[12, 15], moved[12, 16], moved[12, 25]) == (pytest.approx(100), pytest.approx(200), pytest.approx(100))
-
-
 def test_hands_count_on_neither_side():
     labels = np.zeros((40, 60), np.uint8)
     labels[10:20, 10:20] = OBJECT
@@ -52,16 +52,6 @@ def test_hands_count_on_neither_side():
     assert iou_without_hands(block(slice(10, 20), slice(10, 30)), labels) == 1
     assert iou_without_hands(block(slice(10, 20), slice(10, 15)), labels) == 0.5
     assert iou_without_hands(block(slice(10, 20), slice(5, 25)), labels) == pytest.approx(100 / 150)
-
-
-def test_published_pictures_are_cut_out_and_moved():
-    mask = block(slice(8, 16), slice(16, 32))
-    right = np.full((40, 60, 3), 90, np.uint8)
-    one = Published(np.packbits(mask.ravel())[None], [right], (2.0, -1.0))
-    rgba = one.picture(0)
-    assert (one.silhouette(0) == block(slice(7, 15), slice(18, 34))).all()
-    assert (rgba[..., 3] == np.where(one.silhouette(0), 255, 0)).all()
-    assert (rgba[..., :3] == np.where(one.silhouette(0)[..., None], 90, 0)).all()
 
 
 def test_means_are_over_cases_and_the_spread_is_of_seeds_with_every_case():
@@ -94,26 +84,6 @@ def test_differences_are_paired_by_case():
     assert np.isnan(low)
 
 
-def test_tables_leave_cases_out_of_means_and_put_methods_first():
-    rows = []
-    for case, value in (("a", 0.6), (LEFT_OUT[0], 0.1)):
-        for method in (PHYSTWIN, STILL, "m"):
-            rows += [(case, method, 0, part, "iou_drawn", value) for part in ("0", "1/3", "2/3", "last")]
-            rows += [
-                (case, method, 0, part, metric, value)
-                for part in ("reconstruction", "future")
-                for metric in ("iou", "psnr", "ssim")
-            ]
-    rows += [("a", "m", 0, part, f"points_{name}", 3.0) for part in ("last", "later") for name in ("median", "mean", "count")]
-    text = "\n".join(tables(table(*rows), ["a note"]))
-    first = next(line for line in text.splitlines() if line.startswith("| m "))
-    assert first.split("|")[2:7] == [f" {cell:5s} " for cell in ("1", "0.600", "0.600", "0.600", "0.600")]
-    assert text.index("| m ") < text.index(f"| {PHYSTWIN}") < text.index(f"| {STILL}")
-    assert f"| {LEFT_OUT[0]} " in text
-    assert "- a note" in text
-    assert "Paired differences" in "\n".join(tables(table(*rows), []))
-
-
 @pytest.mark.parametrize("keep", [False, True])
 def test_runs_of_another_machine_stay_if_they_are_to_be_kept(tmp_path, keep):
     def scores(keep: bool) -> Scores:
@@ -134,44 +104,12 @@ def test_runs_of_another_machine_stay_if_they_are_to_be_kept(tmp_path, keep):
     assert found == {("a", 0): 0.9, ("a", 1): 0.6} | ({("b", 0): 0.7} if keep else {})
 
 
-@pytest.mark.parametrize("drawn", [True, False])
-def test_cases_without_drawn_masks_are_compared_with_carried_ones(drawn):
-    labels = np.where(block(slice(10, 20), slice(10, 20)), OBJECT, 0).astype(np.uint8)
-    case = SimpleNamespace(drawn={0: labels} if drawn else {}, labeled=dict.fromkeys((0, 3, 6, 9), labels))
-    rows = list(labeled_rows(case, [(9, block(slice(10, 20), slice(10, 15)))]))
-    assert [(row["part"], row["metric"], row["value"]) for row in rows] == [("last", "iou_drawn" if drawn else "iou_carried", 0.5)]
-
-
-def test_no_scores_make_no_tables():
-    assert not any(line.startswith("|") for line in tables(table(), []))
-
-
-def test_strips_show_first_and_last_frames_around_the_object():
-    assert frames_shown(62) == [0, 12, 24, 37, 49, 61]
-    rows, columns = surroundings([block(slice(10, 12), slice(3, 5)), block(slice(30, 31), slice(40, 41))], margin=4)
-    assert (rows, columns) == (slice(6, 35), slice(0, 45))
-    assert surroundings([np.zeros((4, 4), bool)]) == (slice(None), slice(None))
-    observed = np.full((4, 6, 3), 100, np.uint8)
-    rgba = np.zeros((4, 6, 4), np.uint8)
-    rgba[:, :3] = [10, 20, 30, 255]
-    drawn = over_white(observed, rgba)
-    assert (drawn[:, :3] == [10, 20, 30]).all()
-    assert (drawn[:, 3:] == round((1 - WHITE) * 100 + WHITE * 255)).all()
-    strip = layout({"observed": [observed] * 2, "m": [drawn] * 2}, [0, 5], 3)
-    assert strip.dtype == np.uint8
-    bars = strip[2, [10, -10]].astype(int)
-    assert bars[0, 2] > bars[0, 0]
-    assert bars[1, 0] > bars[1, 2]
-
-
 def write(path, values) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"format": 1, **values}))
 
 
 def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_path):
-    from neuspring.core.records import digest_file
-
     def job(name: str, *attempts: tuple[str, float]) -> None:
         made = [
             {"started": "2026-01-01T00:00:00+00:00", "outcome": outcome, "cpu_seconds": 60.0 * cpu} for outcome, cpu in attempts
@@ -207,13 +145,37 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
     assert costs(tmp_path, [Run(tmp_path / "s" / "o" / "0")]).set_index("group")["minutes"]["fit"] == 8
 
 
-def test_costs_of_two_machines_are_one_table():
-    def cost(*rows: tuple) -> pd.DataFrame:
-        return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
+def test_hands_count_by_their_motion_alone():
+    seen = small.observations()
+    hands = seen.controller_points.astype(float)
+    poses = np.zeros((len(hands), 1, 7))
+    # Anywhere in the hand: only its way counts.
+    poses[:, 0, :3] = hands.mean(axis=1) + np.array([0.0, 0.03, 0.05])
+    truth = SimpleNamespace(hand_poses=poses)
+    assert hand_errors(truth, seen)[1] == pytest.approx(0.0, abs=1e-6)
+    off = np.linspace(0, 0.02, len(hands))[:, None, None] * [0.0, 0.0, 1.0]
+    mean, last = hand_errors(truth, replace(seen, controller_points=hands + off))
+    assert last == pytest.approx(0.02, abs=1e-6)
+    assert mean == pytest.approx(np.linspace(0, 0.02, len(hands))[1:].mean(), abs=1e-6)
 
-    earlier = cost(("s", "neuspring", 0, "search", 50.0), ("s", "neuspring", 1, "search", 3.0), ("s", "static", 0, "search", 0.0))
-    both = merged(cost(("s", "neuspring", 0, "search", 1.0)), earlier)
-    assert both[["method", "minutes"]].to_numpy().tolist() == [["static", 0.0], ["neuspring", 1.0], ["neuspring", 3.0]]
-    line = next(line for line in cost_lines(both) if line.startswith("| s "))
-    assert [cell.strip() for cell in line.split("|")[2:-1]][:3] == ["2", "–", "2.0"]
-    assert cost_lines(cost()) == []
+
+def test_a_capture_of_one_camera_has_its_color_and_masks(tmp_path):
+    capture = paint(tmp_path / "painted", frames=5)
+    color = one_camera(capture, tmp_path / "scene_color", depth=False)
+    assert not color.has_depth
+    np.testing.assert_array_equal(Capture.load(color.folder).mask("0", 3), capture.mask("0", 3))
+
+
+@pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
+def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
+    case = "single_lift_rope"
+    capture = write_capture(FOOTAGE, tmp_path, case, 5)
+    about = capture.description
+    assert (about.depth, about.up, about.category, about.name, about.masks) == ("none", "-z", "rope", case, True)
+    np.testing.assert_array_equal(capture.color("0", 4), film(FOOTAGE, case, 5)[4])
+    assert (capture.mask("0", 4) == 1).sum() > 3000
+    Marks.load(capture.folder / MARKS).require(capture)
+    found = check_layout(capture.folder)
+    assert of_level(found, "error") == []
+    # The white rope is 38.7 cm long.
+    assert any("object size on the table 39 x" in text for text in of_level(found, "note"))

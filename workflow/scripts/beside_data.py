@@ -22,7 +22,7 @@ from neuspring.scores.images import iou
 from neuspring.scores.pictures import Scored
 from neuspring.splats.draw import picture
 from neuspring.stages.render import posed
-from tests.benchmarks.footage import Points, truths
+from workflow.scripts.footage import Points, truths
 
 PHYSTWIN = "PhysTwin (published)"
 STILL = "frame 0 repeated"
