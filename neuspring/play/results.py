@@ -41,7 +41,6 @@ class Run:
     """One run: a method with a seed. Its arrays are read when they are asked for."""
 
     folder: Path
-    scenario_folder: Path
     method: str
     seed: str
     notes: tuple[str, ...] = ()
@@ -176,7 +175,7 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     twin = path("fit" if "fit" in run.stages else "search", "twin")
     if paths["trajectory_path"] is None and not notes:
         notes.append("no prediction in its record")
-    return Run(folder, scenario_folder, folder.parent.name, folder.name, tuple(notes), twin, **paths)
+    return Run(folder, folder.parent.name, folder.name, tuple(notes), twin, **paths)
 
 
 def _capture(folder: Path, notes: list[str]) -> Capture | None:

@@ -14,7 +14,7 @@ from neuspring.core.records import digest_file
 from neuspring.play.page import Page
 from neuspring.play.results import find
 from neuspring.scores.metrics import track_errors
-from tests.support.played import dressed, spoil
+from tests.support.played import dressed, record, spoil
 
 RUN = "baseline/0"
 
@@ -117,6 +117,7 @@ def test_a_run_of_an_older_format_is_shown_as_far_as_it_goes(opened, scenario):
     path = scenario / "baseline" / "0" / "twin.npz"
     arrays, meta = read_npz(path)
     write_npz(path, arrays, json.dumps(meta | {"format": 0}), compress=True)
+    record(path.parent)
     page = opened(scenario)
     assert page.player._bodies[RUN].springs is None and "this version reads format" in page.notes.content
     page.panel.start(RUN)

@@ -24,7 +24,7 @@ def test_a_record_of_splats_that_names_a_file_elsewhere_is_not_followed(scenario
     (tmp_path / "secret.ply").write_bytes(b"secret")
     spoil(scenario / "appearance" / "0" / "appearance.json", '"splats.ply"', '"../../../secret.ply"')
     run = find([scenario]).runs[0]
-    assert run.splats_path is None and any("must lie inside" in note for note in run.notes)
+    assert run.splats_path is None and any("must lie beside" in note for note in run.notes)
 
 
 def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
