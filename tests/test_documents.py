@@ -15,7 +15,7 @@ PATH = re.compile(
 
 
 def anchors(page: Path) -> set[str]:
-    """Of the headings of a page, as code hosts make them."""
+    """Anchors of the headings of a page, as code hosts make them."""
     titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     plain = [re.sub(r"[`*]|\[([^\]]*)\]\([^)]*\)", r"\1", title).lower() for title in titles]
     return {re.sub(r"[^\w\- ]", "", title).replace(" ", "-") for title in plain}
@@ -39,3 +39,15 @@ def test_every_room_has_a_page_or_a_map():
     for room in (ROOT / "neuspring").iterdir():
         if room.is_dir() and any(room.glob("*.py")):
             assert len((room / "__init__.py").read_text()) > 40
+
+
+def test_the_table_of_what_to_add_names_files_and_names_that_there_are():
+    page = (ROOT / ".github" / "CONTRIBUTING.md").read_text()
+    table = page.partition("## To add a thing")[2].partition("\n## ")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| a")]
+    assert len(rows) >= 10
+    absent = [path for path in re.findall(r"`([\w.]+/[\w./]+)`", table) if not (ROOT / path).exists()]
+    for name, path in re.findall(r"`(\w+)`(?: of| in) `([\w/]+\.py)`", table):
+        if (ROOT / path).exists() and not re.search(rf"^(?:def |class )?{name}\b", (ROOT / path).read_text(), re.MULTILINE):
+            absent.append(f"{name} in {path}")
+    assert not absent
