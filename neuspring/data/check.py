@@ -229,7 +229,11 @@ def check_layout(folder: Path) -> list[Finding]:
         return [finding for path in captures for finding in check_capture(path)]
     if cases := find_cases(folder):
         return [finding for case in cases for finding in _check_case(case)]
-    return _check_recordings(folder)
+    files = sorted(folder.rglob("*.pkl"))
+    if not files:
+        rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
+        raise InputError(folder, rule, "none of them")
+    return [finding for file in files for finding in mocap.check_mocap(file)]
 
 
 def find_cases(folder: Path) -> list[Released]:
@@ -283,21 +287,25 @@ def _subfolders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
-def _check_recordings(folder: Path) -> list[Finding]:
-    files = sorted(folder.rglob("*.pkl"))
-    if not files:
-        rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
-        raise InputError(folder, rule, "none of them")
-    return [finding for file in files for finding in mocap.check_mocap(file)]
-
-
 def _check_case(case: Released) -> list[Finding]:
     inspection = Inspection(case.folder)
     data = _check_final_data(inspection)
     frames = None if data is None else len(data["object_points"])
-    _check_split(inspection, frames)
-    _check_tracks(inspection, frames)
-    _check_calibration(inspection)
+    path = case.folder / phystwin.SPLIT
+    split = inspection.load(path, load_json)
+    if split is not None and frames is None:
+        message = "needs the number of frames of final_data.pkl: the check of the split is skipped"
+        inspection.findings.append(note(path, message))
+    elif split is not None and frames is not None:
+        inspection.findings += phystwin.split_findings(path, split, frames)
+    path = case.folder / phystwin.TRACKS
+    tracks = inspection.load_optional(path, load_pickle, "annotated tracks and the track error are")
+    if tracks is not None:
+        inspection.findings += phystwin.tracks_findings(path, tracks, frames)
+    path = case.folder / CALIBRATION
+    poses = inspection.load_optional(path, load_pickle, "the calibration check is")
+    if poses is not None:
+        inspection.findings += poses_findings(path, poses, CAMERAS)
     _check_metadata(inspection, frames)
     if case.loose is None:
         _check_results(inspection, case, data)
@@ -379,31 +387,6 @@ def _place(rows: np.ndarray) -> str:
 
 def _list(values: np.ndarray, most: int = 8) -> str:
     return ", ".join(str(int(v)) for v in values[:most]) + (f", ... ({len(values)} in all)" if len(values) > most else "")
-
-
-def _check_split(case: Inspection, frames: int | None) -> None:
-    path = case.folder / phystwin.SPLIT
-    split = case.load(path, load_json)
-    if split is None:
-        return
-    if frames is None:
-        case.findings.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
-    else:
-        case.findings += phystwin.split_findings(path, split, frames)
-
-
-def _check_tracks(case: Inspection, frames: int | None) -> None:
-    path = case.folder / phystwin.TRACKS
-    tracks = case.load_optional(path, load_pickle, "annotated tracks and the track error are")
-    if tracks is not None:
-        case.findings += phystwin.tracks_findings(path, tracks, frames)
-
-
-def _check_calibration(case: Inspection) -> None:
-    path = case.folder / CALIBRATION
-    poses = case.load_optional(path, load_pickle, "the calibration check is")
-    if poses is not None:
-        case.findings += poses_findings(path, poses, CAMERAS)
 
 
 def _check_metadata(case: Inspection, frames: int | None) -> None:

@@ -57,11 +57,6 @@ class Source:
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
     """Names of the cameras before the capture is made. Raises InputError."""
 
-    @property
-    def importer(self) -> str:
-        """The module that writes its captures."""
-        return self.module
-
 
 def read_observations(row: ScenarioRow, settings: Config, output: Path) -> Observations:
     """The observations of a scenario that is not filmed; the truth of a toy scene is written beside `output`."""
