@@ -165,7 +165,7 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
             found = run.file(stage, role)
             return None if found is None else inside(scenario_folder, found)
         except (InputError, TypeError, ValueError, IndexError) as error:
-            notes.append(f"no {role}: {error}")
+            notes.append(f"no {'prediction' if role == 'trajectory' else role}: {error}")
             return None
 
     if "rollout" in run.stages and run.records["rollout"].status == "failed":
