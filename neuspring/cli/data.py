@@ -35,7 +35,7 @@ def fetch(
 ) -> int:
     """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.data import fetch
-    from neuspring.scores.released.check_data import check
+    from neuspring.scores.released.run import check
 
     departures = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
     return 0 if dry_run else _tell(departures)
@@ -43,7 +43,7 @@ def fetch(
 
 def check_data(folder: Positional[Path]) -> int:
     """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
-    from neuspring.scores.released.check_data import check
+    from neuspring.scores.released.run import check
 
     return _tell(check(folder))
 

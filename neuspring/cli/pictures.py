@@ -21,11 +21,10 @@ from neuspring.play.results import Run, find
 from neuspring.play.results import Scene as Found
 from neuspring.report.figures.run import chosen_frames
 from neuspring.report.paper import sheet
-from neuspring.report.paper.body import Body, body_figure
-from neuspring.report.paper.cells import Error, Manner, Painter, Style
+from neuspring.report.paper.body import TwinPicture, body_figure
+from neuspring.report.paper.cells import DrawingStyle, Error, Painter, Style
 from neuspring.report.paper.film import write_film
-from neuspring.report.paper.look import broad_side, seen_from
-from neuspring.report.paper.scene import Scene, Take, shown_points
+from neuspring.report.paper.scene import Prediction, Scene, broad_side, seen_from, shown_points
 from neuspring.report.paper.strip import caption, strip_figure
 
 ELEVATION = 25.0
@@ -134,7 +133,7 @@ class Chosen:
 
     found: Found
     runs: list[Run]
-    takes: list[Take]
+    takes: list[Prediction]
     images: Images
     device: str
 
@@ -184,7 +183,7 @@ def draw_twin(picture: TwinOptions) -> None:
     scene = _scene(picture, chosen, [picture.frame], chosen.takes)
     if picture.background == "image" and scene.photo(picture.frame) is None:
         raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
-    body = Body(
+    body = TwinPicture(
         scene,
         chosen.takes,
         picture.frame,
@@ -227,12 +226,12 @@ def _named(a: RunOptions, found: Found) -> list[Run]:
     return [run for run in chosen if run is not None]
 
 
-def _take(run: Run, label: str, positions: bool) -> Take:
+def _take(run: Run, label: str, positions: bool) -> Prediction:
     if run.trajectory is None or not len(run.trajectory.positions):
         if positions or run.twin is None:
             raise InputError(f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Name another run.")
-        return Take(label, run.twin.topology.nodes[None], run.twin)
-    return Take(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
+        return Prediction(label, run.twin.topology.nodes[None], run.twin)
+    return Prediction(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
 
 
 def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") -> list[int]:
@@ -271,7 +270,7 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
         raise InputError("--most", "must be above 0", a.most)
     if a.background == "image" and scene.capture is None:
         raise InputError("--background image", "needs a camera of a capture", scene.camera.name, "Leave it out.")
-    manner = Manner(
+    manner = DrawingStyle(
         style=style,
         error=(error if a.error == "best" else a.error) or ("color" if comparable else "distance"),
         ground=a.background or ("image" if style == "nodes" else "white"),
@@ -280,7 +279,7 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
     return Painter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
 
 
-def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Take]) -> Scene:
+def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Prediction]) -> Scene:
     """The scene from the camera that is asked for. Raises InputError."""
     found, observations = chosen.found, chosen.found.observations
     cameras = found.capture.cameras if found.capture else {}

@@ -2,7 +2,7 @@
 Nothing here raises for bad content.
 
 What cannot work is an error, what is only unusual a warning with the next move; see `plausible_world`. `neuspring check-data` adds
-the comparison with the released results: `neuspring.scores.released.check_data`.
+the comparison with the released results: `neuspring.scores.released.run`.
 """
 
 from __future__ import annotations

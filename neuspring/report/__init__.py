@@ -1,7 +1,8 @@
 """What people look at.
 
-- `tables`: the summary of a benchmark, the paper's tables beside ours, perception against the truth.
-- `page`: report.html; `gallery`: pictures.html; `blocks`, `render`: what pages are made of, and how they become HTML.
-- `figures`, `video`: PNG figures and H.264 videos.
-- `explain`, `explain_text`: from a cell of a table to its runs.
+- `table`: a table as one value; `blocks`: what pages are made of; both become Markdown and HTML.
+- `benchmark`, `study_cells`, `study`, `notes`, `perception`: the tables, built once for files and for the page.
+- `page`: report.html; `gallery`: pictures.html.
+- `figures`, `paper`, `video`: PNG figures of runs, pictures for papers, H.264 videos.
+- `explain`: from a cell of a table to its runs.
 """

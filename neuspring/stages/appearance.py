@@ -237,7 +237,7 @@ def _quality(shot: Shot, drawn: np.ndarray) -> float:
     """PSNR of a training view, dB."""
     import torch
 
-    from neuspring.scores.images import psnr
+    from neuspring.scores.pictures import psnr
 
     splats = torch.tensor(drawn[..., :3].astype(np.float32) / 255) * shot.known.cpu()[..., None]
     return float(psnr(splats.permute(2, 0, 1), shot.color.cpu().permute(2, 0, 1)))

@@ -77,7 +77,7 @@ def render(
     splats, frames = posed(appearance, rollout, trajectory, images, device)
     predicted = len(trajectory.positions)
     rows: list[dict[str, Any]] = []
-    strip, film = figures.Strip(scenario, predicted), figures.Film(scenario)
+    strip, film = figures.Strip(scenario, predicted), figures.FilmLayout(scenario)
     first = next(iter(scored.views))
     files = run.beside(**{role: f"{role}.mp4" for role in (VIDEOS if images.video else ())})
     progress = Progress("render", scenario.frame_count)

@@ -29,7 +29,7 @@ from neuspring.core.errors import InputError
 from neuspring.data import hub as fetch_hub
 from neuspring.data import phystwin
 from neuspring.data.fetch import LOCK, RECORD, fetch
-from neuspring.scores.released.check_data import check
+from neuspring.scores.released.run import check
 from tests.support.phystwin_case import write_case
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -14,7 +14,7 @@ from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RunRecord
-from neuspring.report import explain_text
+from neuspring.report import explain as explain_text
 from neuspring.report import study as tables_paper
 from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.scores import paper
@@ -246,7 +246,9 @@ def test_the_key_is_that_of_a_real_run(tmp_path):
     named = {"trajectory": ["trajectory.npz", digest_file(folder / "trajectory.npz")]}
     records = {"search": folder / "search.json", "rollout": folder / "rollout.json"}
     StageRecord(stage="search", status="ok", settings={"seed": 0}, started=STARTED).save(records["search"])
-    StageRecord(stage="rollout", status="ok", files=named, started=STARTED).save(records["rollout"])
+    StageRecord(stage="rollout", status="ok", files=named, started=STARTED, inputs={"observations": digest_file(seen)}).save(
+        records["rollout"]
+    )
     score(observations=seen, **records, method="search_only", variant={"fit": "none"}, seed=0, output=folder / "run.json")
     record = RunRecord.load(folder / "run.json")
     assert check_files(folder / "run.json", record, seen) == (3, [])

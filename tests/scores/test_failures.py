@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.report import benchmark as tables
 from neuspring.report import study as tables_paper
 from neuspring.report.explain import explain
-from neuspring.report.explain_text import text as explained
+from neuspring.report.explain import text as explained
 from neuspring.scores import failures
 from neuspring.scores.metrics import COLUMNS
 from neuspring.scores.runs import DAMAGED, Collected, collect, comparable, read_scores

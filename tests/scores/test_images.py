@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.scores.images import iou, masked_pair, psnr, silhouettes
-from neuspring.scores.pictures import _ssim_on_black
+from neuspring.scores.pictures import _ssim_on_black, iou, masked_pair, psnr, silhouettes
 from neuspring.splats.losses import ssim, ssim_map
 from tests.support.devices import DEVICES
 

@@ -11,9 +11,8 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
 from neuspring.play.results import find
-from neuspring.report.paper.cells import Manner, Painter
-from neuspring.report.paper.look import broad_side, seen_from
-from neuspring.report.paper.scene import Scene, Take, shown_points
+from neuspring.report.paper.cells import DrawingStyle, Painter
+from neuspring.report.paper.scene import Prediction, Scene, broad_side, seen_from, shown_points
 from neuspring.splats.draw import COVERED, picture, view_of
 from tests.support.filmed import rows
 from tests.support.played import dressed, results
@@ -25,10 +24,10 @@ CORNER = 12
 METHODS = ("baseline", "neuspring")
 
 
-def takes(scenario: Path) -> list[Take]:
+def takes(scenario: Path) -> list[Prediction]:
     """The runs of a scenario: that of METHODS[0] moves as the object does."""
     found = {run.method: run for run in find([scenario]).runs}
-    return [Take(name, found[name].trajectory.positions, found[name].twin, found[name].splats) for name in METHODS]
+    return [Prediction(name, found[name].trajectory.positions, found[name].twin, found[name].splats) for name in METHODS]
 
 
 def observed(scenario: Path) -> Observations:
@@ -74,4 +73,4 @@ def painter(scenario: Path, frames: Sequence[int], **manner: object) -> Painter:
         points = shown_points(seen, shown, frames)
         scene = Scene.of(seen, seen_from(points, seen.scenario.up, 250.0, 20.0), shown, frames)
     plain = {"style": "nodes", "error": "distance", "ground": "white"}
-    return Painter(scene, shown, frames, Manner(**(plain | manner)), Images(), "cpu")
+    return Painter(scene, shown, frames, DrawingStyle(**(plain | manner)), Images(), "cpu")

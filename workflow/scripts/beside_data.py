@@ -18,8 +18,7 @@ from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
-from neuspring.scores.images import iou
-from neuspring.scores.pictures import Scored
+from neuspring.scores.pictures import Scored, iou
 from neuspring.splats.draw import picture
 from neuspring.stages.render import posed
 from workflow.scripts.footage import Points, truths

@@ -14,8 +14,7 @@ from matplotlib import pyplot as plt
 from neuspring.core.artifacts import Scenario
 from neuspring.report.figures.run import chosen_frames
 from neuspring.report.figures.views import save
-from neuspring.scores.images import psnr
-from neuspring.scores.pictures import Pair
+from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.losses import Shot
 
 WORST = 0.5
@@ -92,7 +91,7 @@ class Strip:
         return save(figure, path)
 
 
-class Film:
+class FilmLayout:
     """Lays out the frames of two videos: observed, predicted and difference side by side; the twin from all around."""
 
     def __init__(self, scenario: Scenario) -> None:

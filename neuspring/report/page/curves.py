@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
-from neuspring.report.page.material import UNREADABLE, Material, Run
+from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
 COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
@@ -90,7 +90,7 @@ class Plot:
 
     title: str
     about: str
-    collect: Callable[[Material, str], Curves]
+    collect: Callable[[ReportData, str], Curves]
     """Reads the curves of a scenario."""
     of_methods: bool = True
     """Whether its lines are methods, which have the same style in all plots."""
@@ -98,7 +98,7 @@ class Plot:
     """Shown without a click, however many panels there are."""
 
 
-def curves_section(material: Material) -> Section:
+def curves_section(material: ReportData) -> Section:
     """Error, search, fit and training curves of the shown methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
@@ -107,7 +107,7 @@ def curves_section(material: Material) -> Section:
     return Section(key="curves", title="Curves", about=_about(material), blocks=blocks)
 
 
-def _plot(material: Material, plot: Plot, scenarios: Iterable[str]) -> list[Block]:
+def _plot(material: ReportData, plot: Plot, scenarios: Iterable[str]) -> list[Block]:
     """A panel per scenario; nothing if no scenario has such curves."""
     panels = {scenario: plot.collect(material, scenario) for scenario in scenarios}
     panels = {scenario: curves for scenario, curves in panels.items() if curves.by_name}
@@ -122,19 +122,19 @@ def _plot(material: Material, plot: Plot, scenarios: Iterable[str]) -> list[Bloc
     return [Fold(summary=plot.title, blocks=inner, open=plot.open or len(pictures) <= MOST_OPEN)]
 
 
-def _about(material: Material) -> str:
+def _about(material: ReportData) -> str:
     shown, methods = material.choice.shown, material.choice.methods
     return "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {', '.join(shown)}."
 
 
-def _search_row(run: Run) -> str:
+def _search_row(run: FinishedRun) -> str:
     """Name of the search that a run started from."""
     place = run.record.histories.get("search", "")
     parts = [part for part in Path(place).parts if part.startswith("search-")]
     return parts[0].removeprefix("search-") if parts else ""
 
 
-def _history(material: Material, run: Run, stage: str, metric: str) -> pd.Series | None:
+def _history(material: ReportData, run: FinishedRun, stage: str, metric: str) -> pd.Series | None:
     """Values of a metric by step; None if the run has none."""
     name = run.record.histories.get(stage)
     if not name:
@@ -149,7 +149,7 @@ def _history(material: Material, run: Run, stage: str, metric: str) -> pd.Series
     return values if len(values) else None
 
 
-def _search(material: Material, scenario: str) -> Curves:
+def _search(material: ReportData, scenario: str) -> Curves:
     by_name: dict[str, dict[int, pd.Series]] = {}
     for run in (run for method in material.choice.shown for run in material.runs_of(scenario, method)):
         name = _search_row(run)
@@ -162,10 +162,10 @@ def _search(material: Material, scenario: str) -> Curves:
     return Curves(by_name=by_name)
 
 
-def _losses(stage: str) -> Callable[[Material, str], Curves]:
+def _losses(stage: str) -> Callable[[ReportData, str], Curves]:
     """Collects the losses of a stage."""
 
-    def collect(material: Material, scenario: str) -> Curves:
+    def collect(material: ReportData, scenario: str) -> Curves:
         by_name: dict[str, dict[int, pd.Series]] = {}
         for method in material.choice.shown:
             for run in material.runs_of(scenario, method):
@@ -177,10 +177,10 @@ def _losses(stage: str) -> Callable[[Material, str], Curves]:
     return collect
 
 
-def _errors(metric: str) -> Callable[[Material, str], Curves]:
+def _errors(metric: str) -> Callable[[ReportData, str], Curves]:
     """Collects a track error of the first run of every method, from its trajectory."""
 
-    def collect(material: Material, scenario: str) -> Curves:
+    def collect(material: ReportData, scenario: str) -> Curves:
         runs = {method: run for method, run in material.first_runs(scenario).items() if run.record.ok}
         place = material.results / scenario / "observations.npz"
         if not runs or not place.is_file():
@@ -201,7 +201,7 @@ def _errors(metric: str) -> Callable[[Material, str], Curves]:
     return collect
 
 
-def _track_error(material: Material, run: Run, tracks: np.ndarray, metric: str) -> np.ndarray | None:
+def _track_error(material: ReportData, run: FinishedRun, tracks: np.ndarray, metric: str) -> np.ndarray | None:
     record = run.file("records", "rollout")
     if record is None:
         return None

@@ -48,7 +48,7 @@ class Choice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class FinishedRun:
     """A finished run (ok, or failed numerically)."""
 
     folder: Path
@@ -76,7 +76,7 @@ class Run:
 
 
 @dataclass(kw_only=True)
-class Material:
+class ReportData:
     """Everything that the sections read."""
 
     results: Path
@@ -86,7 +86,7 @@ class Material:
     settings: Config | None
     studies: Mapping[str, Study]
     collected: Collected
-    runs: list[Run]
+    runs: list[FinishedRun]
     """The runs whose records could be read."""
     transfers: Collected
     jobs: list[JobRecord]
@@ -101,11 +101,11 @@ class Material:
         """Remember a damaged file, once."""
         self.damaged.setdefault(self.relative(path), one_line(reason) if isinstance(reason, Exception) else reason)
 
-    def runs_of(self, scenario: str, method: str) -> list[Run]:
+    def runs_of(self, scenario: str, method: str) -> list[FinishedRun]:
         """All seeds of a method on a scenario."""
         return [run for run in self.runs if run.scenario == scenario and run.method == method]
 
-    def first_runs(self, scenario: str) -> dict[str, Run]:
+    def first_runs(self, scenario: str) -> dict[str, FinishedRun]:
         """Shown method to its first run of a scenario, finished ones before failed ones."""
         runs = {method: self.runs_of(scenario, method) for method in self.choice.shown}
         return {method: min(own, key=lambda run: not run.record.ok) for method, own in runs.items() if own}

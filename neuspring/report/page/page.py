@@ -28,7 +28,17 @@ from neuspring.report.benchmark import (
 from neuspring.report.blocks import Block, Facts, Fold, Grid, Picture, Section, Text, Verdict, html_page
 from neuspring.report.figures.benchmark import CLUSTERS, RATIOS
 from neuspring.report.page.curves import curves_section
-from neuspring.report.page.material import Choice, Material, Run, damaged_records, hours, job_records, listed, on_disk, several
+from neuspring.report.page.material import (
+    Choice,
+    FinishedRun,
+    ReportData,
+    damaged_records,
+    hours,
+    job_records,
+    listed,
+    on_disk,
+    several,
+)
 from neuspring.report.page.pictures import Media, embedded_png, pictures_section, wanted_pictures
 from neuspring.report.page.setup import perception_section, setup_section, tuning_section
 from neuspring.report.page.work import failures_section, findings_section, gpu_hours, work_section
@@ -100,7 +110,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     return material.output
 
 
-def _studies(material: Material) -> dict[str, StudyNumbers]:
+def _studies(material: ReportData) -> dict[str, StudyNumbers]:
     known = material.studies
     return {
         name: StudyNumbers(name=name, study=study, collected=material.collected, beside=known.get(study.beside or ""))
@@ -108,20 +118,20 @@ def _studies(material: Material) -> dict[str, StudyNumbers]:
     }
 
 
-def _last(material: Material, studies: Studies) -> dict[str, Section]:
+def _last(material: ReportData, studies: Studies) -> dict[str, Section]:
     """The sections that list damaged files; they are made last, because every other section may find some."""
     verdicts = [_verdict(numbers) for numbers in studies.values() if numbers.study.reference]
     return {"failures": failures_section(material), "verdict": _summary(material, verdicts)}
 
 
-def gather(results: Path, output: Path, options: Options) -> Material:
+def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
     jobs, damaged = job_records(results)
     choice = _choice(results, options, on_disk(results, jobs))
     collected = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
     transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)
     damaged |= damaged_records(collected.runs, RUN_RECORD) | damaged_records(transfers.runs, "transfer.json")
-    return Material(
+    return ReportData(
         results=results,
         output=output,
         choice=choice,
@@ -129,7 +139,7 @@ def gather(results: Path, output: Path, options: Options) -> Material:
         settings=options.settings,
         studies=options.studies,
         collected=collected,
-        runs=[Run(folder=results / record.name, record=record) for record in collected.records.values()],
+        runs=[FinishedRun(folder=results / record.name, record=record) for record in collected.records.values()],
         transfers=transfers,
         jobs=jobs,
         damaged=damaged,
@@ -165,7 +175,7 @@ def _choice(results: Path, options: Options, there: tuple[list[str], list[str], 
     )
 
 
-def _sections(material: Material, studies: Studies) -> dict[str, Section]:
+def _sections(material: ReportData, studies: Studies) -> dict[str, Section]:
     """All in order, by key; those that depend on the others are empty."""
     parts = [
         _empty("verdict"),
@@ -187,7 +197,7 @@ def _empty(key: str) -> Section:
     return Section(key=key, title=key, blocks=[])
 
 
-def _summary(material: Material, verdicts: Sequence[Block]) -> Section:
+def _summary(material: ReportData, verdicts: Sequence[Block]) -> Section:
     runs, choice = material.collected.runs, material.choice
     title = "Did it reproduce?"
     if not choice.size:
@@ -263,7 +273,7 @@ def _study_section(studies: Studies) -> Section:
     return Section(key="studies", title="The paper's tables", blocks=folds, about=about)
 
 
-def _score_section(material: Material) -> Section:
+def _score_section(material: ReportData) -> Section:
     """The benchmark's own tables and pictures, as `neuspring tables` writes them."""
     config = material.settings or Config()
     judging = Judging(objects=config.objects, aims=config.aims)
@@ -294,7 +304,7 @@ def _figures(benchmark: Benchmark) -> list[Block]:
     return blocks
 
 
-def _page(material: Material, sections: Sequence[Section], written: str) -> str:
+def _page(material: ReportData, sections: Sequence[Section], written: str) -> str:
     choice = material.choice
     seeds = f"seeds {listed([str(seed) for seed in choice.seeds])}" if choice.seeds else "no seeds"
     numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"

@@ -17,7 +17,7 @@ import numpy as np
 from neuspring.core.artifacts import Observations
 from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video
 from neuspring.report.figures.run import chosen_frames
-from neuspring.report.page.material import UNREADABLE, Material, Run, several
+from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData, several
 
 QUALITY = 75
 """Quality of WebP pictures, of 100."""
@@ -155,12 +155,12 @@ ADDRESS = "http://127.0.0.1:8080/"
 """Where `neuspring play` listens unless it is told otherwise."""
 
 
-def play_command(material: Material, runs: Iterable[Run]) -> str:
+def play_command(material: ReportData, runs: Iterable[FinishedRun]) -> str:
     """What shows these runs of one scenario side by side."""
     return shlex.join(["neuspring", "play", *(str(material.results / material.relative(run.folder)) for run in runs)])
 
 
-def frame_links(material: Material, scenario: str) -> tuple[tuple[str, str], ...]:
+def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], ...]:
     """Text and address of each frame that pictures of motion show; none where the observations cannot be read."""
     path = material.results / scenario / "observations.npz"
     try:
@@ -207,7 +207,7 @@ FILMS = {"video": ("Films: observed, predicted, difference", 40), "turntable": (
 APPEARANCE = "appearance"
 
 
-def wanted_pictures(material: Material) -> list[Wanted]:
+def wanted_pictures(material: ReportData) -> list[Wanted]:
     """All pictures that the section would show, the most telling first."""
     files: list[Wanted] = []
     for place, scenario in enumerate(material.choice.scenarios):
@@ -221,7 +221,7 @@ def wanted_pictures(material: Material) -> list[Wanted]:
     return files
 
 
-def pictures_section(material: Material, media: Media) -> Section:
+def pictures_section(material: ReportData, media: Media) -> Section:
     """A fold per scenario."""
     folds: list[Block] = []
     for scenario in material.choice.scenarios:
@@ -241,7 +241,7 @@ def pictures_section(material: Material, media: Media) -> Section:
     return Section(key="pictures", title="Pictures", about=about, blocks=folds)
 
 
-def _scenario(runs: dict[str, Run], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
+def _scenario(runs: dict[str, FinishedRun], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
     blocks: list[Block] = []
     for kind in KINDS:
         figures: list[Block] = []
@@ -265,7 +265,7 @@ def _scenario(runs: dict[str, Run], media: Media, frames: Sequence[tuple[str, st
     return [*blocks, Fold(summary="Splats of frame 0", blocks=figures)] if figures else blocks
 
 
-def _splats(runs: dict[str, Run]) -> dict[Path, list[str]]:
+def _splats(runs: dict[str, FinishedRun]) -> dict[Path, list[str]]:
     """Picture of splats to the methods that use them: most methods share splats, some have their own."""
     methods: dict[Path, list[str]] = {}
     for method, run in runs.items():
@@ -275,7 +275,7 @@ def _splats(runs: dict[str, Run]) -> dict[Path, list[str]]:
     return methods
 
 
-def _filmed(runs: dict[str, Run], media: Media) -> list[Block]:
+def _filmed(runs: dict[str, FinishedRun], media: Media) -> list[Block]:
     blocks: list[Block] = []
     for film, (title, least) in FILMS.items():
         paths = {method: run.file("images", film) for method, run in runs.items()}

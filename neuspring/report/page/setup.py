@@ -18,7 +18,7 @@ from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import flat
 from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Picture, Prose, Section, Text
-from neuspring.report.page.material import UNREADABLE, Material, Run, listed, several
+from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData, listed, several
 from neuspring.report.page.pictures import embedded_png, link
 from neuspring.report.page.work import machines
 from neuspring.report.table import Cell, Table
@@ -52,7 +52,7 @@ def render(text: str, picture: Callable[[str], str]) -> Markup:
     return Markup(parser.renderer.render(tokens, parser.options, {}))
 
 
-def file(material: Material, path: Path) -> tuple[Prose | None, set[Path]]:
+def file(material: ReportData, path: Path) -> tuple[Prose | None, set[Path]]:
     """A Markdown file, and the pictures in it that were embedded; None if it is not there or cannot be read."""
     shown: set[Path] = set()
 
@@ -73,7 +73,7 @@ def file(material: Material, path: Path) -> tuple[Prose | None, set[Path]]:
         return None, shown
 
 
-def tuning_section(material: Material) -> Section | None:
+def tuning_section(material: ReportData) -> Section | None:
     """The sweeps under results/tune; None without any."""
     folds: list[Block] = []
     for path in sorted((material.results / "tune").glob("*/summary.md")):
@@ -91,7 +91,7 @@ def _picture(path: Path, uri: str, size: tuple[int, int]) -> Block:
     return Picture(caption=name, alt=f"{name}, study {path.parent.name}", data=uri, size=size, paper=True)
 
 
-def files(material: Material) -> list[tuple[str, str]]:
+def files(material: ReportData) -> list[tuple[str, str]]:
     """Files of the tables' folder beside the report: text and link."""
     folder, here = material.results / material.tables, material.output.resolve()
     paths = (path for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.resolve() != here)
@@ -99,7 +99,7 @@ def files(material: Material) -> list[tuple[str, str]]:
     return [(material.relative(path), link(path, here.parent)) for path in paths]
 
 
-def perception_section(material: Material) -> Section | None:
+def perception_section(material: ReportData) -> Section | None:
     """Perception against the truth of synthetic captures; None where it was not judged."""
     text, _ = file(material, material.results / material.tables / "perception.md")
     return Section(key="perception", title="Perception", blocks=[text]) if text else None
@@ -123,7 +123,7 @@ SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")
 """Sections of the configuration that the records of search and fit hold."""
 
 
-def setup_section(material: Material) -> Section:
+def setup_section(material: ReportData) -> Section:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
     if warning := mixed_settings(material.collected.runs):
@@ -140,7 +140,7 @@ def setup_section(material: Material) -> Section:
     return Section(key="setup", title="Configuration and versions", blocks=blocks)
 
 
-def _commits(runs: Iterable[Run]) -> Text:
+def _commits(runs: Iterable[FinishedRun]) -> Text:
     """The code that made the runs, with a warning if it was not the same for all."""
     own = Counter(run.record.commit or "unknown" for run in runs)
     names = [f"{_short(name)} ({several(count, 'run')})" for name, count in sorted(own.items())]
@@ -159,7 +159,7 @@ def _short(name: str) -> str:
     return name[:12] + (DIRTY if name.endswith(DIRTY) else "")
 
 
-def _settings(material: Material) -> list[Block]:
+def _settings(material: ReportData) -> list[Block]:
     defaults = flat(config.plain(Config()))
     if material.settings is not None:
         settings = config.plain(material.settings)
@@ -177,7 +177,7 @@ def _settings(material: Material) -> list[Block]:
     return [Text(text=text, tone="mute"), _changes("Settings that differ from the defaults", changed, defaults)]
 
 
-def _used(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
+def _used(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
     """Setting to method to value, from the records of search, fit and baselines' training."""
     used: dict[str, dict[str, Any]] = defaultdict(dict)
     for run in runs:
@@ -214,7 +214,7 @@ def _by_method(values: Mapping[str, Any]) -> str:
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in groups.items())
 
 
-def _variants(runs: Iterable[Run]) -> Table | None:
+def _variants(runs: Iterable[FinishedRun]) -> Table | None:
     """The switches of each method, as its runs record them."""
     variants: dict[str, Mapping[str, Any]] = {}
     for run in runs:
@@ -245,7 +245,7 @@ def _versions() -> Table:
     return Table(caption="Versions where this page was written", header=["Package", "Version"], rows=rows)
 
 
-def _machines(runs: Iterable[Run]) -> list[Block]:
+def _machines(runs: Iterable[FinishedRun]) -> list[Block]:
     counts = machines(runs)
     rows = [[Cell(text=name), Cell(text=str(count))] for name, count in counts.items()]
     return [] if not rows else [Table(caption="Machines of the runs", header=["Machine; device", "Runs"], rows=rows)]

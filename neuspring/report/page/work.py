@@ -12,7 +12,7 @@ import pandas as pd
 from neuspring.core.findings import Level, findings_of
 from neuspring.core.job_records import JobRecord
 from neuspring.report.blocks import Block, Fold, Section, Text
-from neuspring.report.page.material import METHOD_RULES, Material, Run, duration, hours, memory, several
+from neuspring.report.page.material import METHOD_RULES, FinishedRun, ReportData, duration, hours, memory, several
 from neuspring.report.page.pictures import link
 from neuspring.report.table import Cell, Chip, Table, Tone
 from neuspring.scores.metrics import DASH
@@ -52,7 +52,7 @@ def _splats(folder: str) -> str:
     return folder.removeprefix("appearance").removeprefix("-") or "shared"
 
 
-def gpu_hours(material: Material) -> tuple[float | None, str]:
+def gpu_hours(material: ReportData) -> tuple[float | None, str]:
     """GPU-hours (None where nothing is known), and where they are from: job records, else run records."""
     if material.jobs:
         return _gpu_seconds(material.jobs) / 3600, "job records"
@@ -61,7 +61,7 @@ def gpu_hours(material: Material) -> tuple[float | None, str]:
     return sum(seconds for _, _, seconds, device, _ in _stages(material.runs) if device.startswith("cuda")) / 3600, "run records"
 
 
-def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
+def _stages(runs: Iterable[FinishedRun]) -> list[tuple[str, str, float, str, float]]:
     """Rule, method, seconds, device and MiB of every stage. Shared stages count once: for `shared`, or the method of the splats."""
     seen, rows = set(), []
     for run in runs:
@@ -82,7 +82,7 @@ def _stages(runs: Iterable[Run]) -> list[tuple[str, str, float, str, float]]:
     return rows
 
 
-def work_section(material: Material) -> Section:
+def work_section(material: ReportData) -> Section:
     """Tables of hours."""
     title = "Time and hardware"
     if material.jobs:
@@ -161,7 +161,7 @@ def _hours(seconds: float) -> Cell:
     return Cell(text=hours(seconds) if seconds else DASH, value=seconds)
 
 
-def _from_runs(runs: Sequence[Run]) -> Table:
+def _from_runs(runs: Sequence[FinishedRun]) -> Table:
     groups: dict[tuple[str, str], list[tuple[float, str, float]]] = defaultdict(list)
     for stage, method, seconds, device, peak in _stages(runs):
         groups[stage, method].append((seconds, device, peak))
@@ -186,7 +186,7 @@ def _from_runs(runs: Sequence[Run]) -> Table:
     return Table(caption="By step and method", header=header, rows=rows, stub=2, sortable=True)
 
 
-def machines(runs: Iterable[Run]) -> dict[str, int]:
+def machines(runs: Iterable[FinishedRun]) -> dict[str, int]:
     """Machine and device to the number of runs."""
     counts: dict[str, int] = defaultdict(int)
     for run in runs:
@@ -198,7 +198,7 @@ MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 
 
-def failures_section(material: Material) -> Section:
+def failures_section(material: ReportData) -> Section:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
     left = [job for job in material.jobs if job.last.outcome == "running"]
@@ -234,7 +234,7 @@ def _rest(count: int) -> str:
     return f" {count - MOST_ROWS} more are not listed." if count > MOST_ROWS else ""
 
 
-def _jobs(caption: str, jobs: Sequence[JobRecord], material: Material) -> Table:
+def _jobs(caption: str, jobs: Sequence[JobRecord], material: ReportData) -> Table:
     rows = []
     for job in jobs[:MOST_ROWS]:
         last, log = job.last, material.results / job.log
@@ -307,7 +307,7 @@ def _matrix(runs: pd.DataFrame) -> Fold:
 TONES: dict[Level, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 
 
-def findings_section(material: Material) -> Section | None:
+def findings_section(material: ReportData) -> Section | None:
     """A table of warnings, and one of notes to unfold; None where perception found nothing worth saying, or did not run."""
     found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
     if not found:

@@ -23,8 +23,7 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Twin
 from neuspring.report.figures.twin import COLORS, CONTROLLER, region_colors, stiffness_limits
 from neuspring.report.figures.views import place, sample
-from neuspring.report.paper.look import finer
-from neuspring.report.paper.scene import Scene, Take, faded, over_white
+from neuspring.report.paper.scene import Prediction, Scene, faded, finer, over_white
 from neuspring.report.paper.sheet import TEXT, color_bar, points_across
 from neuspring.splats.draw import picture, view_of
 from neuspring.splats.harmonics import C0
@@ -54,11 +53,11 @@ def node_stiffness(twin: Twin) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class TwinPicture:
     """Twins of one scene in one frame, and what their colors say."""
 
     scene: Scene
-    takes: Sequence[Take]
+    takes: Sequence[Prediction]
     frame: int
     quantities: Sequence[Quantity]
     style: Literal["springs", "splats"] = "springs"
@@ -72,7 +71,7 @@ class Body:
         values = [_twin(take).material.stiffness[: _twin(take).topology.object_spring_count] for take in self.takes]
         return LogNorm(*stiffness_limits(np.concatenate(values)))
 
-    def node_colors(self, take: Take, quantity: Quantity) -> np.ndarray:
+    def node_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [N, 4]."""
         twin = _twin(take)
         if quantity == "stiffness":
@@ -80,7 +79,7 @@ class Body:
         names, region = np.unique(twin.topology.labels, return_inverse=True)
         return np.asarray(region_colors(len(names))[region])
 
-    def spring_colors(self, take: Take, quantity: Quantity) -> np.ndarray:
+    def spring_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""
         twin, count = _twin(take), _twin(take).topology.object_spring_count
         if quantity == "stiffness":
@@ -94,7 +93,7 @@ class Body:
         # A stiffness of 0 has no color on a log scale; it takes that of the lower end.
         return np.asarray(colormaps[COLORS](self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))))
 
-    def paint(self, axis: Axes, take: Take, quantity: Quantity) -> None:
+    def paint(self, axis: Axes, take: Prediction, quantity: Quantity) -> None:
         """One panel."""
         view, photo = self.scene.view, self.scene.photo(self.frame)
         axis.set(xticks=[], yticks=[], xlim=(-0.5, view.width - 0.5), ylim=(view.height - 0.5, -0.5), facecolor="white")
@@ -115,7 +114,7 @@ class Body:
         style: dict[str, Any] = {"marker": "D", "color": CONTROLLER, "edgecolors": "white", "linewidths": 0.3, "zorder": 5}
         axis.scatter(hands[depth > 0, 0], hands[depth > 0, 1], s=7, **style)
 
-    def _lines(self, axis: Axes, take: Take, quantity: Quantity) -> None:
+    def _lines(self, axis: Axes, take: Prediction, quantity: Quantity) -> None:
         """Springs and nodes, the farthest first, so that the nearest are on top."""
         twin, nodes = _twin(take), take.positions[self.frame].astype(float)
         flat, depth = self.scene.view.project(nodes)
@@ -136,7 +135,7 @@ class Body:
         size = float(np.clip((0.2 * width) ** 2 / max(len(nodes), 1), 1.0, 14.0))
         axis.scatter(flat[near, 0], flat[near, 1], c=self.node_colors(take, quantity)[near], s=size, linewidths=0, zorder=3)
 
-    def _surface(self, take: Take, quantity: Quantity) -> np.ndarray:
+    def _surface(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
         assert take.splats is not None
         outer = take.positions[0][: self.scene.observations.surface_count]
@@ -149,7 +148,7 @@ class Body:
         return picture(painted, view, choose_backend(self.images.backend, self.device))
 
 
-def body_figure(body: Body, width: float) -> Figure:
+def body_figure(body: TwinPicture, width: float) -> Figure:
     """The picture, `width` inches wide: methods from left to right, quantities from top to bottom, each with its legend."""
     view, columns = body.scene.view, len(body.takes)
     across = (width - 2 * EDGE - BAR - GAP * (columns - 1)) / columns
@@ -175,7 +174,7 @@ def body_figure(body: Body, width: float) -> Figure:
     return figure
 
 
-def _regions(figure: Figure, body: Body, left: float, middle: float) -> None:
+def _regions(figure: Figure, body: TwinPicture, left: float, middle: float) -> None:
     """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
     count = max(len(np.unique(_twin(take).topology.labels)) for take in body.takes)
     width, height = figure.get_size_inches()
@@ -188,6 +187,6 @@ def _regions(figure: Figure, body: Body, left: float, middle: float) -> None:
     figure.legend(dots, names, loc="center left", bbox_to_anchor=(left / width, middle / height), labelspacing=0.25, **style)
 
 
-def _twin(take: Take) -> Twin:
+def _twin(take: Prediction) -> Twin:
     assert take.twin is not None
     return take.twin

@@ -15,10 +15,9 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.report.figures.images import WORST
 from neuspring.report.figures.twin import CONTROLLER
-from neuspring.report.paper.scene import Scene, Take, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.paper.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
 from neuspring.report.paper.sheet import points_across
-from neuspring.scores.images import psnr
-from neuspring.scores.pictures import Pair
+from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.draw import COVERED, picture, view_of
 from neuspring.splats.rasterize import choose_backend
 
@@ -54,7 +53,7 @@ class Drawn:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Manner:
+class DrawingStyle:
     """How predictions and errors are drawn."""
 
     style: Style
@@ -64,7 +63,7 @@ class Manner:
     """Upper end of the range of errors: of 1 for colors, mm for distances; None: from the data."""
 
 
-def distances(take: Take, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+def distances(take: Prediction, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [P] whose point is seen in a frame, and their distances [P], m, to it. Node i is tracked point i."""
     seen = np.flatnonzero(observations.object_visibility[frame])
     gap = take.positions[frame][seen].astype(float) - observations.object_points[frame][seen]
@@ -75,14 +74,14 @@ class Painter:
     """Paints panels of one scene; all panels share the range of errors."""
 
     def __init__(
-        self, scene: Scene, takes: Sequence[Take], frames: Sequence[int], manner: Manner, images: Images, device: str
+        self, scene: Scene, takes: Sequence[Prediction], frames: Sequence[int], manner: DrawingStyle, images: Images, device: str
     ) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
         self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
         self.norm = Normalize(0, self._most())
         self._corner = self._free_corner()
 
-    def _splats(self, take: Take, images: Images, device: str) -> dict[int, Drawn]:
+    def _splats(self, take: Prediction, images: Images, device: str) -> dict[int, Drawn]:
         view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
         made = {}
         for frame, gaussians in take.gaussians(self.frames, images, device):
@@ -120,7 +119,7 @@ class Painter:
         """For the color bar."""
         return "color difference" if self.manner.error == "color" else "distance to observed points [mm]"
 
-    def observed(self, axis: Axes, frame: int) -> None:
+    def draw_observed(self, axis: Axes, frame: int) -> None:
         """The photo, or the observed points where the camera has none."""
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         self._empty(axis)
@@ -134,7 +133,7 @@ class Painter:
         self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
         self._hands(axis, frame)
 
-    def predicted(self, axis: Axes, which: int, frame: int) -> None:
+    def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
         """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
         take, photo = self.takes[which], self.scene.photo(frame)
         self._empty(axis)
@@ -154,7 +153,7 @@ class Painter:
         self._points(axis, take.positions[frame], PREDICTED)
         self._hands(axis, frame)
 
-    def error(self, axis: Axes, which: int, frame: int) -> None:
+    def draw_error(self, axis: Axes, which: int, frame: int) -> None:
         """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
         self._empty(axis)
         take = self.takes[which]

@@ -150,11 +150,11 @@ def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
         for column, axis in enumerate(axes):
             axis.clear()
             if row:
-                painter.error(axis, column, frame)
+                painter.draw_error(axis, column, frame)
             elif column:
-                painter.predicted(axis, column - 1, frame)
+                painter.draw_predicted(axis, column - 1, frame)
             else:
-                painter.observed(axis, frame)
+                painter.draw_observed(axis, frame)
 
 
 def _tell(painter: Painter, clock: Axes, frame: int) -> None:

@@ -74,11 +74,11 @@ def strip_figure(painter: Painter, width: float) -> Figure:
 
 def _paint(painter: Painter, axis: Axes, row: Row, frame: int) -> None:
     if row.which is None:
-        painter.observed(axis, frame)
+        painter.draw_observed(axis, frame)
     elif row.error:
-        painter.error(axis, row.which, frame)
+        painter.draw_error(axis, row.which, frame)
     else:
-        painter.predicted(axis, row.which, frame)
+        painter.draw_predicted(axis, row.which, frame)
 
 
 def _row_label(figure: Figure, row: Row, middle: float, high: float) -> None:
@@ -117,16 +117,16 @@ def caption(painter: Painter) -> str:
     """Words for the text below the picture: what is shown, and the mean error of each method over its frames."""
     scene, scenario, manner = painter.scene, painter.scene.observations.scenario, painter.manner
     future = [frame for frame in painter.frames if frame >= scenario.train_end]
-    told = f"{scenario.name}, camera {scene.camera.name}, frames {_listed(painter.frames)}"
-    told += f"; future (from frame {scenario.train_end}): {_listed(future)}." if future else "; all of training."
+    text = f"{scenario.name}, camera {scene.camera.name}, frames {_listed(painter.frames)}"
+    text += f"; future (from frame {scenario.train_end}): {_listed(future)}." if future else "; all of training."
     if manner.style == "nodes" or scene.capture is None:
-        told += " Dark: predicted nodes. Blue: observed points. Red: controllers, where the hands hold."
+        text += " Dark: predicted nodes. Blue: observed points. Red: controllers, where the hands hold."
     if manner.error == "color":
-        told += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
+        text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
     elif manner.error == "distance":
-        told += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen; in panels: the mean."
-        told += f" Mean of these frames: {', '.join(f'{t.label} {_mean(painter, k):.1f} mm' for k, t in enumerate(painter.takes))}."
-    return told
+        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen; in panels: the mean."
+        text += f" Mean of these frames: {', '.join(f'{t.label} {_mean(painter, k):.1f} mm' for k, t in enumerate(painter.takes))}."
+    return text
 
 
 def _mean(painter: Painter, which: int) -> float:

@@ -1,4 +1,4 @@
-"""Conformance checks over scenarios, and their report: verify.md, verify.csv, and verify_frames.csv with distances per frame."""
+"""Conformance with PhysTwin's release: the checks in their order, `neuspring check-data` and `verify-released`, and the report."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
+from neuspring.core.findings import Finding, note, refusal
 from neuspring.core.text import Progress, markdown
 from neuspring.data import phystwin
+from neuspring.data.check import check_layout, find_cases
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.lpips_weights import configured
-from neuspring.scores.released import images, physics
+from neuspring.scores.released import checks
 from neuspring.scores.released.findings import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
 
 CHECKS = {
@@ -146,12 +148,12 @@ def read_observations(case: Released) -> Observations:
 
 _Check = Callable[[Released, Observations, Tools], list[Comparison]]
 _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
-    1: (physics.sizes, physics.first_frame),
-    2: (physics.topology,),
-    3: (physics.evaluator,),
-    4: (images.deprojection,),
-    5: (images.renderer,),
-    6: (physics.simulator,),
+    1: (checks.sizes, checks.first_frame),
+    2: (checks.topology,),
+    3: (checks.evaluator,),
+    4: (checks.deprojection,),
+    5: (checks.renderer,),
+    6: (checks.simulator,),
 }
 
 
@@ -254,3 +256,64 @@ def _verdict(findings: Sequence[Comparison]) -> str:
     if failed:
         return f"{counts}. Failed: {', '.join(failed)}."
     return f"{counts}." if outcomes["passed"] else f"{counts}. Nothing could be compared."
+
+
+OF_RESULTS, OF_DATA = (1, 2, 3, 4), (1, 4)
+"""Checks of a case with a root, and of one without: it has no released results."""
+
+
+def check(folder: Path) -> list[Finding]:
+    """Every departure of `folder` from its layout and from the release; nothing is raised for bad content.
+
+    A failed check is an error, a measurement or a skipped check a note. Raises InputError if `folder` holds no data of a known
+    layout.
+    """
+    findings, compared = check_layout(folder), list[Comparison]()
+    tools = Tools(published=Published.load())
+    cases = find_cases(folder)
+    for case in cases:
+        of_case, more = _check_case(case, tools)
+        compared += of_case
+        # What a reader refuses is an error of the layout already.
+        findings += [one for one in more if not (one.level == "error" and _is_among(one, findings))]
+    if len(cases) > 1:
+        findings += [_finding(mean, Path(folder)) for mean in of_means(compared, tools.published)]
+    return findings
+
+
+def _check_case(case: Released, tools: Tools) -> tuple[list[Comparison], list[Finding]]:
+    findings = []
+    if case.loose:
+        findings.append(note(case.folder, "no experiments folder is known for this case: conformance checks 2 and 3 skipped"))
+    try:
+        observations = read_observations(case)
+    except (Absent, InputError) as error:
+        reason = [refusal(error)] if isinstance(error, InputError) else []
+        return [], [*reason, note(case.folder, "the reader refuses this case: conformance checks 1 to 4 skipped")]
+    compared = check_case(case, observations, OF_DATA if case.loose else OF_RESULTS, tools)
+    return compared, findings + [_finding(one, one.file or case.folder) for one in compared]
+
+
+def _is_among(error: Finding, findings: list[Finding]) -> bool:
+    """Whether `findings` hold this error; the text of a reader's error goes on with the next move."""
+    return any(error.where == one.where and error.message.startswith(one.message) for one in findings)
+
+
+def _finding(compared: Comparison, file: Path) -> Finding:
+    if compared.outcome == "failed" and compared.ours is None:  # a file that cannot be read
+        return refusal(compared.note)
+    check = f"check {compared.check}"
+    if compared.outcome == "skipped":
+        return note(file, f"{check} skipped, {compared.quantity}: {compared.note}")
+    parts = [f"{check}, {f'{compared.task} {compared.quantity}'.strip()}: {_with_unit(compared.ours, compared.unit)}"]
+    if compared.published is not None:
+        verdict = "as" if compared.outcome == "passed" else "differs from"
+        parts.append(f"{verdict} the released {_with_unit(compared.published, compared.unit)}")
+    if compared.frames:
+        parts.append(f"over {compared.frames} frames")
+    text = ", ".join([*parts, *filter(None, [compared.note])])
+    return Finding(name="", level="error" if compared.outcome == "failed" else "note", where=str(file), text=text)
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return f"{value:.6f} {unit}" if unit else f"{value:g}"

@@ -66,8 +66,8 @@ def test_distances_are_zero_for_the_twin_that_moves_as_was_observed(plain):
     exact, softer = ([distances(take, observed(plain), frame)[1].max() * MM for frame in FRAMES] for take in paints.takes)
     assert max(exact) < EXACT < softer[-1]
     panels = grid(strip_figure(paints, 6.0), 5, len(FRAMES))
-    told = [[float(axis.texts[0].get_text().split()[0]) for axis in panels[row]] for row in (2, 4)]
-    assert told[0] == [0.0] * len(FRAMES) and told[1][0] == 0.0 < told[1][-1]
+    text = [[float(axis.texts[0].get_text().split()[0]) for axis in panels[row]] for row in (2, 4)]
+    assert text[0] == [0.0] * len(FRAMES) and text[1][0] == 0.0 < text[1][-1]
 
 
 def test_distances_are_those_of_points_that_are_seen(plain):
@@ -116,7 +116,7 @@ def test_hands_are_gray_and_not_compared(video):
     drawn = again._drawn[0][0]
     assert drawn.hands[:12, :12].all() and np.isnan(drawn.difference[:12, :12]).all()
     axis = plt.figure().add_axes((0, 0, 1, 1))
-    again.error(axis, 0, 0)
+    again.draw_error(axis, 0, 0)
     assert (axis.images[0].get_array()[2, 2] == 200).all()
 
 
@@ -125,7 +125,7 @@ def test_the_observed_row_shows_the_photo_masked_or_whole(video):
     pictures = []
     for paints in (cut, whole):
         axis = plt.figure().add_axes((0, 0, 1, 1))
-        paints.observed(axis, 0)
+        paints.draw_observed(axis, 0)
         pictures.append(np.asarray(axis.images[0].get_array()))
     photo = whole.scene.cut(whole.scene.photo(0))
     labels = whole.scene.cut(whole.scene.mask(0))
@@ -164,7 +164,7 @@ def test_a_far_prediction_does_not_shrink_the_picture(plain):
 
 
 def test_the_caption_names_frames_split_and_errors(plain):
-    told = caption(painter(plain, FRAMES))
-    assert "frames 0, 3, 5, 7; future (from frame 5): 5, 7." in told
-    assert "baseline 0.0 mm" in told and "Distance of nodes to their observed points" in told
+    text = caption(painter(plain, FRAMES))
+    assert "frames 0, 3, 5, 7; future (from frame 5): 5, 7." in text
+    assert "baseline 0.0 mm" in text and "Distance of nodes to their observed points" in text
     assert "all of training" in caption(painter(plain, (0, 1)))

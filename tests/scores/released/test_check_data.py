@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.scores.released.check_data import check
+from neuspring.scores.released.run import check
 from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, write_case, write_json, write_raw_frame, write_results
 
