@@ -12,6 +12,7 @@ import pytest
 from neuspring.core import lock as locks
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import GPU_NOTES, Attempt, JobRecord, begin_run, failure_lines, read_jobs
+from neuspring.core.records import RECORD_FORMAT
 from neuspring.experiments.jobs import gpus
 from neuspring.experiments.jobs import wrapper as job
 from neuspring.experiments.jobs.wrapper import alone
@@ -82,7 +83,7 @@ def test_a_stopped_wrapper_ends_its_command(results, tmp_path, number):
 def test_a_damaged_record_is_named_and_replaced_by_the_next_run(results):
     path = results / "jobs" / f"{NAME}.json"
     path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"format": 1, "rule": "search"}))
+    path.write_text(json.dumps({"format": RECORD_FORMAT, "rule": "search"}))
     with pytest.raises(InputError, match="must be a job record"):
         read_jobs(results)
     damaged: list[str] = []

@@ -274,7 +274,7 @@ def test_damaged_records_are_input_errors(results: Path) -> None:
 
     assert "run_key" in message(run_key="../../etc")
     assert "status" in message(status="fine") and "seed" in message(seed="0")
-    assert "format 1" in message(format=2)
+    assert "another format" in message(format=1)
     assert "no such file" in message(artifacts={"twin": ["gone.npz"]})
     assert "different file names" in message(artifacts={"twin": ["twin.npz", "../0/twin.npz"]})
     assert "Parquet" in message(histories={"fit": "twin.npz"}) and "columns step" in message(histories={"fit": "scores.parquet"})

@@ -44,10 +44,10 @@ def test_output_and_exit_status_are_those_of_the_command(server, tmp_path):
     assert status == 2 and "--scenario: must be a row" in text
     row = json.dumps(small.row().__dict__)
     settings = '{"toy": {"frames": 5}}'
-    status, text = ended(begin(server, "observe", "--row", row, "--settings", settings, "--output", str(output)))
+    status, text = ended(begin(server, "observe", "--scenario", row, "--settings", settings, "--output", str(output)))
     assert status == 0, text
     cold = tmp_path / "cold.npz"
-    command = [sys.executable, "-m", "neuspring", "observe", "--row", row, "--settings", settings, "--output", str(cold)]
+    command = [sys.executable, "-m", "neuspring", "observe", "--scenario", row, "--settings", settings, "--output", str(cold)]
     subprocess.run(command, check=True)
     assert output.read_bytes() == cold.read_bytes()
 

@@ -22,6 +22,7 @@ from typing import Any
 import pandas
 
 from neuspring.config import Tracking
+from neuspring.core.records import RECORD_FORMAT
 from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri
 
 STARTED, ENDED = "2026-11-21T10:00:00+00:00", "2026-11-21T10:05:30+00:00"
@@ -46,7 +47,7 @@ def write_run(results: Path, scenario: str = "rope", seed: int = 0, **changes: A
     (folder / "twin.npz").write_bytes(b"twin")
     (search / "coarse.npz").write_bytes(b"coarse")
     record = {
-        "format": 1,
+        "format": RECORD_FORMAT,
         "run_key": hashlib.sha256(f"{scenario} {seed}".encode()).hexdigest(),
         "scenario": scenario,
         "source": "toy",
