@@ -13,6 +13,7 @@ from neuspring.twin import hand_paths
 from neuspring.twin.candidates import Recording, SearchProblem, _motion, candidate
 from neuspring.twin.fit import FitProblem, TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
+from neuspring.twin.polish import products
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import colored, small
@@ -108,6 +109,8 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
     for k, outcome in enumerate(together):
         states = [(frame, x[frame - 1, k], v[frame - 1, k]) for frame in range(1, len(x) + 1)]
         assert small.rollout_loss(loss, states, start) == pytest.approx(outcome.cost, rel=1e-5)
+        costs, _, _ = products(loss, start, x[:, [k]], v[:, [k]], [True], np.zeros(0))
+        assert costs[0] == pytest.approx(outcome.cost, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["image_track", "silhouette"])
@@ -127,7 +130,7 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
         packed = run.stable_parameters()
         mean = run._simulate((run.rest, run.velocity, None), range(1, run.fitted_end), packed)[1]
         mean.backward()
-        return float(mean), float(run.parameters.factors["stiffness"].grad)
+        return float(mean.detach()), float(run.parameters.factors["stiffness"].grad)
 
     step = 0.0005
     central = (loss_at(step)[0] - loss_at(-step)[0]) / (2 * step)
