@@ -15,7 +15,7 @@ from neuspring.core.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from neuspring.data.check import Departure
+    from neuspring.core.findings import Finding
 
 SHOWN = 5
 """How many doubtful frames are named per camera."""
@@ -37,8 +37,8 @@ def fetch(
     from neuspring.data import fetch
     from neuspring.scores.released.run import check
 
-    departures = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
-    return 0 if dry_run else _tell(departures)
+    findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
+    return 0 if dry_run else _tell(findings)
 
 
 def check_data(folder: Positional[Path]) -> int:
@@ -48,11 +48,11 @@ def check_data(folder: Positional[Path]) -> int:
     return _tell(check(folder))
 
 
-def _tell(departures: list[Departure]) -> int:
+def _tell(findings: list[Finding]) -> int:
     from neuspring.data.check import render
 
-    print(render(departures))
-    return 2 if any(departure.level == "error" for departure in departures) else 0
+    print(render(findings))
+    return 2 if any(finding.level == "error" for finding in findings) else 0
 
 
 def verify_released(

@@ -54,7 +54,7 @@ def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, op
 
 def number(unit: str, doc: str, **default: float) -> Any:
     """Declare a number: unit, meaning, and a `default` where it may be left out."""
-    return field(metadata={"unit": unit, "doc": doc}, **default)
+    return field(metadata={"unit": unit, "doc": doc}, **default)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -249,7 +249,8 @@ class Graph:
         rows: dict[str, dict[str, Any]] = {}
         for member in self._members(scenario):
             method = self.benchmark.fits[member.method]
-            row = {"kind": method.fit, "settings": self.settings(STAGES["fit"], member), "oracle": method.oracle, "fits": {}}
+            row: dict[str, Any] = {"kind": method.fit, "oracle": method.oracle, "fits": {}}
+            row["settings"] = self.settings(STAGES["fit"], member)
             made = self._output("fit", scenario=scenario, method=member.method, seed=member.seed)
             rows.setdefault(member.method, row)["fits"][made] = self._search(member)
         return _json(list(rows.values()))
@@ -257,7 +258,7 @@ class Graph:
     def variant(self, job: Any) -> dict[str, Any]:
         """The switches of a method, for the record of its run."""
         method = self.benchmark.methods[job.method]
-        settings = plain(method)["settings"]
+        settings: dict[str, Any] = plain(method)["settings"]
         if method.model:
             return {"model": method.model, **settings}
         row = self.benchmark.searches[method.searched]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -264,7 +264,7 @@ def aim_table(aims: pd.DataFrame) -> list[Table]:
     """A line per aim: what was aimed at, what was measured, reached or missed. Nothing without aims."""
     tones = {ratios.REACHED: "good", ratios.MISSED: "bad"}
     rows = []
-    for row in aims.itertuples():
+    for row in cast("Any", aims.itertuples()):
         what = f"{SHORT.get(str(row.task), 'Transfer')} {METRICS[str(row.metric)].heading}"
         wanted = f"<= {row.aim:.2f}, interval below {row.below:g}"
         ratio = f"{row.ratio:.3f}" if np.isfinite(row.ratio) else DASH

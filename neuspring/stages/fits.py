@@ -88,7 +88,7 @@ def fits(
 
 
 def _jobs(observations: Path, row: Row, device: str) -> Iterator[FitJob]:
-    given = {"settings": read_settings(row.settings), "kind": row.kind, "oracle": row.oracle, "device": device}
+    given: dict[str, Any] = {"settings": read_settings(row.settings), "kind": row.kind, "oracle": row.oracle, "device": device}
     for output, search in row.fits.items():
         job = alone.fit.job(output=Path(output), observations=observations, search=Path(search), **given)
         if not (job.failed or _is_done(job)):

@@ -44,7 +44,8 @@ Reads = Callable[[Config, Mapping[str, Any]], Sequence[str]]
 """From the settings and the values of all parameters."""
 
 
-MayFail = Annotated[Before, "may have failed"]
+MAY_FAIL = "may have failed"
+MayFail = Annotated[Before, MAY_FAIL]
 """A record that the function wants also of a stage that failed."""
 
 
@@ -211,7 +212,7 @@ class Stage:
     @cached_property
     def may_fail(self) -> frozenset[str]:
         """Inputs that it wants also where they failed."""
-        return frozenset(name for name, parameter in self.inputs.items() if parameter.note == MayFail.__metadata__[0])
+        return frozenset(name for name, parameter in self.inputs.items() if parameter.note == MAY_FAIL)
 
     @property
     def _settings(self) -> str | None:
