@@ -23,6 +23,21 @@ LIGHT = (
     ".experiments.benchmark",
     ".experiments.tracking.log",
 )
+OTHERS = (
+    "scipy",
+    "sklearn",
+    "pandas",
+    "pyarrow",
+    "matplotlib",
+    "cma",
+    "optuna",
+    "mlflow",
+    "cv2",
+    "trimesh",
+    "snakemake",
+    "newton",
+    "av",
+)
 HEAVY = ("torch", "warp", "mlflow", "matplotlib", "cma", "optuna")
 
 
@@ -54,6 +69,29 @@ def test_only_the_tracking_package_imports_mlflow():
 def test_what_the_workflow_imports_at_its_start_is_light(module):
     code = f"import sys, neuspring{module}; print([name for name in {HEAVY} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_the_twin_and_the_simulator_import_torch_warp_and_numpy_alone():
+    """Of what computes or draws; settings and records need pydantic, PyYAML and filelock, which are small."""
+    code = f"""
+import importlib, sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {OTHERS}:
+            raise ImportError(name)
+sys.meta_path.insert(0, Blocked())
+for name in {twin_and_simulator()}:
+    importlib.import_module(name)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def twin_and_simulator() -> list[str]:
+    """Modules of both rooms, but the float64 reference, and what moves a twin to another recording: these stand on SciPy."""
+    paths = [path for room in ("physics", "twin") for path in sorted((PACKAGE / room).glob("*.py"))]
+    names = [".".join(["neuspring", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in paths]
+    return [name.removesuffix(".__init__") for name in names if not name.endswith((".reference", ".register", ".transfer"))]
 
 
 def test_no_test_imports_another_test_or_a_conftest():

@@ -15,8 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
@@ -78,6 +76,9 @@ def rest_spectrum(
     mass: np.ndarray = UNIT,
 ) -> Spectrum:
     """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
     ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
     offset = ends[:, 1] - ends[:, 0]
     direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
@@ -96,6 +97,7 @@ def rest_spectrum(
     transpose = incidence.T.tocsr()
 
     def largest(weights: np.ndarray) -> tuple[float, int]:
+
         if not weights.any():
             return 0.0, 0
         operator = LinearOperator((3 * count, 3 * count), matvec=lambda u: transpose @ (weights * (incidence @ u)))  # type: ignore[call-arg]

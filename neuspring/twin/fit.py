@@ -17,10 +17,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from neuspring import config
@@ -37,6 +36,10 @@ from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.parameters import TwinParameters, median_gradient, movement, watched
 from neuspring.twin.rest_shape import topology_spacing
 from neuspring.twin.rollout import initial_velocity
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates of the first and the second moment, as released."""
@@ -340,6 +343,8 @@ def fit(
     `lane` the simulation shares launches with other fits (batch.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
     several recordings (pool.py). Raises NumericalFailure if no epoch could be completed.
     """
+    import pandas as pd
+
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(lane.batch.lanes) if lane else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)

@@ -23,8 +23,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
-from scipy.spatial.transform import Rotation
 
 from neuspring import config
 from neuspring.core.artifacts import ImageObservations, Observations, Twin
@@ -98,6 +96,8 @@ def plane_depths(image: ImageObservations, tilt: float, up: float) -> np.ndarray
 
 def knot_curve(factors: np.ndarray, train_end: int, frames: int) -> np.ndarray:
     """k(t) [frames, H] of factors [H, K] at the knots i (train_end - 1) / K, i = 1 to K."""
+    from scipy.interpolate import PchipInterpolator
+
     count = factors.shape[1]
     if not count:
         return np.ones((frames, len(factors)))
@@ -119,6 +119,8 @@ def place(image: ImageObservations, first: np.ndarray, depths: np.ndarray) -> np
     In camera axes, with the grip's point g(t) at depth z(t) on the ray through u(t): x(t) = g(t) + R(a(t)) (x(0) - g(0)), R a turn
     about that ray.
     """
+    from scipy.spatial.transform import Rotation
+
     pose = image.camera_to_world
     local = (first - pose[:3, 3]) @ pose[:3, :3]
     result = np.empty((len(depths), *local.shape))

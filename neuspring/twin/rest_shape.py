@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import nn
 
 from neuspring.core.artifacts import Topology
@@ -32,6 +31,8 @@ def topology_spacing(topology: Topology) -> float:
 
 def blending(points: np.ndarray, count: int) -> np.ndarray:
     """Matrix [P, 4 H] that takes (t_k, columns of A_k) of H = min(count, P) handles to u / h at points [P, 3], m."""
+    from scipy.spatial import cKDTree
+
     centers = points[farthest(points, count)]
     away = points[:, None] - centers  # [P, H, 3]
     gaps = cKDTree(centers).query(centers, k=2)[0][:, 1]

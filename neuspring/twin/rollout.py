@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
-from scipy.interpolate import RBFInterpolator
 
 from neuspring.core.artifacts import InitialVelocity, Observations, Trajectory, Twin
 from neuspring.physics import stability
@@ -100,6 +99,8 @@ SPREAD_SMOOTHING = 1e-6
 
 def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Values [N, 3] at nodes [N, 3], from values [P, 3] at points [P, 3], by linear radial basis functions; P >= 1."""
+    from scipy.interpolate import RBFInterpolator
+
     places, first = np.unique(points.astype(np.float64), axis=0, return_index=True)
     values = values[first].astype(np.float64)
     if len(places) == 1:

@@ -13,11 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cma
 import numpy as np
-import pandas as pd
 import torch
 
 from neuspring.core.artifacts import Twin
@@ -27,6 +25,11 @@ from neuspring.core.text import Progress
 from neuspring.twin.candidates import CMAES, PENALTY, UNSTABLE, Map, SearchProblem, candidate, evaluate
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
+
+if TYPE_CHECKING:
+    import cma
+    import pandas as pd
+
 
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
@@ -80,6 +83,8 @@ class Proposals:
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
     # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
+    import cma
+
     no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
     options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
@@ -105,6 +110,8 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
+    import pandas as pd
+
     clock = time.perf_counter()
     rows, attempts, earlier = recorded_trace(record, key)
     trace = [row for row in rows if row["stage"] == CMAES]
@@ -210,6 +217,8 @@ def _threads(count: int) -> Iterator[Map]:
 
 def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
     """Write the rows of a trace, with what they were made from."""
+    import pandas as pd
+
     table = pd.DataFrame(trace)
     table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
     write_atomically(path, lambda p: table.to_parquet(p))
@@ -217,6 +226,8 @@ def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int,
 
 def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
     """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
+    import pandas as pd
+
     fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
     if path is None or not path.is_file():
         return fresh
