@@ -103,8 +103,7 @@ def explain(
     json: bool = False,
 ) -> int:
     """A cell of a study's table -> the runs behind it, and how to make them again; 1 if a run behind it has changed."""
-    from neuspring.report.explain import explain
-    from neuspring.report.explain_text import text
+    from neuspring.report.explain import explain, text
 
     explanation = explain(cell, results, results / tables / "studies", configfile)
     print(explanation.as_json() if json else text(explanation), end="")

@@ -144,9 +144,7 @@ MARKED = (
 )  # fmt: skip
 """Of points that were marked in images, where there is color alone (image_points.py)."""
 METRICS = {metric.name: metric for metric in (*_ALL, *MARKED)}
-"""By name, in the order of summaries. Tolerances of distances are those of single precision and its order of summation. Pictures
-agree within 1e-6 dB with a drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU. Other rasterizers
-lie between."""
+"""By name, in the order of summaries."""
 IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
 """The metrics of the paper's tables, in its order."""
 IN_STUDIES = IN_PAPER | {"track_error_bound": METRICS["track_error_bound"]}

@@ -94,11 +94,6 @@ def judged_aims(scores: pd.DataFrame, transfers: pd.DataFrame, aims: Iterable[Ai
     return pd.DataFrame(rows, columns=[*COLUMNS, *AIM_COLUMNS])
 
 
-def _judgment(aim: Aim, ratio: float, high: float) -> str:
-    """An aim without an interval is missed: nothing shows that it is reached."""
-    return REACHED if ratio <= aim.ratio and high < aim.below else MISSED
-
-
 def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
     """A row per method, task and distance: standard deviation of the log error over seeds, mean over scenarios of several seeds.
 
