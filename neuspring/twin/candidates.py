@@ -52,7 +52,7 @@ class Recording:
     hands: torch.Tensor
     """Waypoints of the controllers (controllers.py), [train_end, C, 3], m."""
     velocity: torch.Tensor
-    """Of the nodes in frame 0 [N, 3], m/s."""
+    """Velocity of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
 
     @classmethod

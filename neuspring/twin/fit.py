@@ -68,7 +68,7 @@ class FitProblem:
     device: str = "cpu"
     kind: Kind = "springs"
     seed: int = 0
-    """Of the field's first weights."""
+    """Seed of the field's first weights."""
     oracle: bool = False
     """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
 

@@ -28,7 +28,7 @@ from neuspring import config
 from neuspring.core.artifacts import ImageObservations, Observations, Twin
 
 KNOTS = 3
-"""Of each hand's depth, spread evenly over the training frames after frame 0."""
+"""Knots of each hand's depth, spread evenly over the training frames after frame 0."""
 LEVEL = 90.0
 """Tilt of the level plane, degrees."""
 NEAREST, FARTHEST = 0.5, 2.0

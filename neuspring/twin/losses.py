@@ -297,7 +297,7 @@ class FrameLoss:
     weights: Losses
     frozen_counts: bool = False
     image: ImageEvidence | None = None
-    """Of captures without depth."""
+    """Evidence of captures without depth."""
 
     @classmethod
     def of(

@@ -31,7 +31,7 @@ SLOPES, POLISH = "slopes", "polish"
 RESIDUAL, PRODUCT = "product.residual", "product."
 """Columns of the trace: J_k'r and J_k'J_l in the row of the neighbor in variable k."""
 STEP = 0.01
-"""Of the finite differences, in normalized variables."""
+"""Step of the finite differences, in normalized variables."""
 TOLERANCE = 1e-3
 """A round whose step lowers the cost by less than this fraction of it is the last."""
 REACH = 0.25
@@ -53,7 +53,7 @@ class Polish:
     cost: float
     damping: float = FIRST_DAMPING
     stage: str = SLOPES
-    """Of the candidates that are asked for now."""
+    """Stage of the candidates that are asked for now."""
     rounds: int = 0
     """Rounds that are done."""
     finished: bool = False

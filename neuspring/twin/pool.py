@@ -58,7 +58,7 @@ class PooledFit(TwinFit):
 
     @property
     def collision_overflow(self) -> int:
-        """Of all recordings."""
+        """The sum over all recordings."""
         return sum(member.collision_overflow for member in self._members)
 
     def use_substeps(self, count: int) -> None:

@@ -23,7 +23,7 @@ FLOOR = 0.75
 BEND_WIDTHS = (0.3, 0.2, 0.12, 0.08)
 """Widths of the smooth displacement, one after the other, as fractions of the extent."""
 STRETCH_NEIGHBORS = 6
-"""Of a point, whose distances tell how much was stretched."""
+"""Nearest points of a point, whose distances tell how much was stretched."""
 BEND_STEPS = 8
 """Steps with each width."""
 

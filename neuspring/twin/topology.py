@@ -18,7 +18,7 @@ from neuspring.core.errors import InputError
 TREE_NEIGHBORS = 16
 """Nearest nodes among which the tree is looked for: more than a ring or a voxel's corner has."""
 TREE_QUANTILE = 0.9
-"""Of the tree's edges, the spacing."""
+"""Quantile of the tree's edges that is the spacing."""
 
 
 def node_spacing(nodes: np.ndarray) -> float:

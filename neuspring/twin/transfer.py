@@ -129,7 +129,7 @@ LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.15
 """Beyond these shapes do not fit: the residual of the rigid motion, as a fraction of the extent, and the stretch of the bending,
 which could lay any shape onto any other. Filmed recordings of one plush have at most 0.06; another animal of its size has 0.16."""
 MARGIN = 1 + 1e-6
-"""Of radii, so that the longest spring is made again."""
+"""Factor on radii, so that the longest spring is made again."""
 
 
 def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
