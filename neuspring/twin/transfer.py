@@ -20,17 +20,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from neuspring import config
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.twin.field import midpoints
-from neuspring.twin.register import Registration, register, spacing
 from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology, unloaded
+
+if TYPE_CHECKING:
+    from neuspring.twin.register import Registration
 
 SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
@@ -140,6 +142,10 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     where nodes have any, are those of the nearest nodes. Substeps and scenario are still the twin's. Raises InputError if the
     shapes do not fit, or no hand reaches a node.
     """
+    from scipy.spatial import cKDTree
+
+    from neuspring.twin.register import register
+
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
     nodes, count = len(old.nodes), len(observations.nodes)
     there = observations.canonical
@@ -179,6 +185,8 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
 
 def scale_between(topology: Topology, nodes: np.ndarray) -> float:
     """Spacing of other nodes over that of a topology: distances to the neighbor whose rank is the mean number of springs."""
+    from neuspring.twin.register import spacing
+
     before = topology.canonical[: len(topology.nodes)].astype(np.float64)
     rank = max(round(2 * topology.object_spring_count / len(before)), 1)
     rank = min(rank, len(before) - 1, len(nodes) - 1)
@@ -191,6 +199,8 @@ def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
     They are the largest that a spring within the region shows: its length, and the lower of its ends' ranks for each other. Springs
     of nodes that repair has joined show nothing; a region without springs of its own takes the values of all.
     """
+    from scipy.spatial import cKDTree
+
     points = topology.canonical[: len(topology.nodes)].astype(np.float64)
     springs = topology.springs[: topology.object_spring_count]
     if not len(springs):
@@ -268,6 +278,8 @@ def _sum(topology: Topology, part: slice, values: np.ndarray, lengths: np.ndarra
 
 def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """How numbers [S] >= 0 at places [S, 3] are carried to [P, 3]: geometric means of the nearest, by inverse distance."""
+    from scipy.spatial import cKDTree
+
     k = min(NEAREST_SPRINGS, len(places))
     distance, index = cKDTree(places).query(at, k=k)
     distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
