@@ -31,7 +31,7 @@ def tiny(folder: Path) -> list[str]:
     subprocess.run([*run, *make], check=True, stdout=subprocess.DEVNULL)
     make = ["search", "--observations", str(observations), *options, "--device", "cpu", "--output", str(search)]
     subprocess.run([*run, *make], check=True, capture_output=True)
-    return ["rollout", "--observations", str(observations), "--twin", str(search), "--device", "cpu", "--output"]
+    return ["rollout", "--observations", str(observations), "--learned", str(search), "--device", "cpu", "--output"]
 
 
 def alone(folder: Path, command: list[str], times: int) -> list[float]:

@@ -171,7 +171,7 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(project):
     scores = pd.read_parquet(project / "results" / "film" / "search_only" / "0" / "scores.parquet")
     assert scores.loc[scores["metric"] == "psnr", "value"].min() > 12
     masks = json.loads((project / "results" / "film" / "perception" / "0" / "masks.json").read_text())
-    assert masks["settings"]["Segmentation"]["backend"] == "given"
+    assert masks["settings"]["perception"]["segment"]["backend"] == "given"
     # Without its images the case has no pictures, and the rest runs.
     shutil.rmtree(case / "color")
     assert "appearance" not in plan(project, changes | {"results": "other"})

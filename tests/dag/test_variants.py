@@ -106,7 +106,7 @@ def test_fits_that_share_launches_end_as_they_would_one_by_one(project):
     run(project, changes, "--", *targets)
     results = project / "results" / SCENE
     record = json.loads((results / "fits.json").read_text())
-    assert record["facts"]["companies"] == [targets]
+    assert record["facts"]["batches"] == [targets]
     assert record["facts"]["errors"] == {}
     twins = {seed: (results / "baseline" / seed / "twin.npz").read_bytes() for seed in "012"}
     assert all(json.loads((project / path).read_text())["facts"]["epochs_together"] == 2 for path in targets)

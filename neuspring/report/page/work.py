@@ -18,7 +18,7 @@ from neuspring.report.table import Cell, Chip, Table, Tone
 from neuspring.scores.metrics import DASH
 
 ORDER = (
-    *("capture", "synthesize", "segment", "track", "lift", "judge", "observe", "search", "fits", "fit", "rollout"),
+    *("capture", "segment", "track", "lift", "judge", "observe", "search", "fits", "fit", "rollout"),
     *("train", "predict", "transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
 )
 """Rules in the order of the workflow."""
