@@ -175,6 +175,11 @@ class Stage:
         """What tells its jobs apart."""
         return tuple(re.findall(r"{(\w+)}", self.output))
 
+    @property
+    def job_name(self) -> str:
+        """The pattern that names its jobs in logs and job records."""
+        return "/".join(f"{{{name}}}" for name in self.wildcards)
+
     @cached_property
     def _hints(self) -> dict[str, Any]:
         return typing.get_type_hints(self.function, include_extras=True)

@@ -20,7 +20,7 @@ for STAGE in STAGES.values():
         output:
             f"{RESULTS}/{STAGE.output}",
         log:
-            log_of(STAGE.name, "/".join(f"{{{name}}}" for name in STAGE.wildcards)),
+            log_of(STAGE.name, STAGE.job_name),
         wildcard_constraints:
             **GRAPH.constraints(STAGE),
         priority: GPU_FIRST if STAGE.gpu != "never" else 0
