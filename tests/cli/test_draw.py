@@ -162,7 +162,7 @@ def test_what_a_run_lacks_is_named(plain, tmp_path, capsys):
     assert main([*twin, "baseline"]) == 2
     assert "--methods baseline/0: must have a twin; received no twin" in capsys.readouterr().err
     assert main([*strip, "neuspring"]) == 2
-    assert "--methods neuspring/0: must have a prediction; received no trajectory" in capsys.readouterr().err
+    assert "--methods neuspring/0: must have a prediction; received no prediction" in capsys.readouterr().err
     # A strip needs no twin, and a twin in frame 0 no prediction.
     assert main([*strip, "baseline", "--dpi", "60"]) == 0
     assert main([*twin, "neuspring", "--dpi", "60"]) == 0
