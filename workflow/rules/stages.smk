@@ -1,6 +1,8 @@
 # One rule per stage. What a job reads stands in the signature of its function, neuspring/stages/<rule>.py; where that lies, what its
 # options are and what makes it run again: neuspring/experiments/graph.py.
 for STAGE in STAGES.values():
+    # Snakemake reads the text of a command once more when a job runs, where `rule` is the job's and STAGE the last one.
+    globals()["rule"] = STAGE.name
 
     rule:
         name:
@@ -34,4 +36,4 @@ for STAGE in STAGES.values():
             command=GRAPH.command(STAGE),
             stamp=GRAPH.stamp(STAGE),
         shell:
-            stage_job(STAGE)
+            stage_job(STAGES[rule])
