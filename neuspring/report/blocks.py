@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
+import jinja2
 from markupsafe import Markup
 
-from neuspring.report.table import SYMBOLS, TEMPLATES, Chip, Table, Tone, template
+from neuspring.core.table import Chip, Table, Tone
+
+TEMPLATES = Path(__file__).parent / "templates"
+SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +179,9 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
 
 def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written: str = "", embedded: bool = True) -> str:
     """The page as text. `embedded`: nothing but what it contains may be loaded; otherwise files beside it are shown too."""
-    return template("page.html.j2").render(
+    loader = jinja2.FileSystemLoader(TEMPLATES)
+    template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template("page.html.j2")
+    return template.render(
         title=title,
         subtitle=subtitle,
         written=written,

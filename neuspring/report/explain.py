@@ -26,7 +26,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.core.run_folder import RESULTS
 from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from neuspring.report.study import StudyRecord, our_change, paper_change
 from neuspring.report.study_cells import accounted, cells, counted, restricted
 from neuspring.scores import paper
@@ -360,7 +360,7 @@ def _runs(runs: Sequence[Behind]) -> list[str]:
         ]
         for run in runs
     ]
-    lines = [f"{len(runs)} runs behind it:", "", *markdown(header, rows)]
+    lines = [f"{len(runs)} runs behind it:", "", *Table.of_texts(header, rows).markdown()]
     for run in groups.values():
         changed = [f"  {name}: {json.dumps(value)}" for name, value in run.settings.items()]
         lines += ["", f"Settings {_digest(run)} that differ from the defaults:", *(changed or ["  none"])]

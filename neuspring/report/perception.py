@@ -9,7 +9,7 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.records import StageRecord
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 
 COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),
@@ -65,7 +65,7 @@ def write(table: pd.DataFrame, folder: Path) -> str:
             f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.",
             "Lifted: of the same points in the world; trusted: of those that move as their neighbors do, which losses use.",
             "",
-            *markdown(header, lines),
+            *Table.of_texts(header, lines).markdown(),
             "",
         ]
     )

@@ -26,6 +26,7 @@ from neuspring.config import parse
 from neuspring.config.parse import STRICT, Name
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, read_json
+from neuspring.core.table import LATEX_PREAMBLE, Cell, Chip, Table, Tone
 from neuspring.report import study_cells
 from neuspring.report.benchmark import failure_table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
@@ -45,7 +46,6 @@ from neuspring.report.study_cells import (
     in_order,
     restricted,
 )
-from neuspring.report.table import LATEX_PREAMBLE, Cell, Chip, Table, Tone
 from neuspring.scores import paper
 from neuspring.scores.failures import (
     DASHES,

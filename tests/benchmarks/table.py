@@ -11,7 +11,7 @@ from typing import Any
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = "results/published/bench"
@@ -105,7 +105,7 @@ def text(rows: Sequence[Row], committed: dict[str, Any] | None) -> str:
     """The table as it is printed."""
     before = medians(committed) if committed else {}
     cells = [[*_facts(row), *_shares(row), _signed(change(row, before))] for row in rows]
-    return "\n".join(markdown(HEADER, cells))
+    return "\n".join(Table.of_texts(HEADER, cells).markdown())
 
 
 def _facts(row: Row) -> list[str]:

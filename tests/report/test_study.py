@@ -12,11 +12,11 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
+from neuspring.core.table import tex
 from neuspring.data.phystwin import released_cases
 from neuspring.report import benchmark as tables
 from neuspring.report import study as tables_paper
 from neuspring.report import study_cells as tables_cells
-from neuspring.report.table import tex
 from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, averages
 from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores

@@ -12,9 +12,9 @@ import pandas as pd
 
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import key_of
+from neuspring.core.table import Cell, Table
 from neuspring.report.benchmark import Benchmark, summary_text
 from neuspring.report.blocks import Block, Fold
-from neuspring.report.table import Cell, Table
 from neuspring.scores.metrics import COLUMNS, UNITS
 from neuspring.scores.runs import Collected
 from tests.support.runs import run_record

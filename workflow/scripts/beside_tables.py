@@ -13,7 +13,7 @@ from scipy import stats
 from neuspring.config.parse import read_yaml
 from neuspring.core.job_records import read_jobs
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from workflow.scripts.beside_data import LEFT_OUT, METHODS, PHYSTWIN, STILL, Run
 
 COLUMNS = ("case", "method", "seed", "part", "frame", "metric", "value", "key")
@@ -111,11 +111,11 @@ def _labeled(table: pd.DataFrame, metric: str) -> list[str]:
         own = own_rows[own_rows["method"] == method]
         cells = [cell(select(own, metric, part), DIGITS[metric]) for part in PARTS]
         rows.append([method, str(mean_and_spread(select(own, metric, PARTS[-1]))[2]), *cells])
-    lines = [f"## {LABELED[metric]}", "", *markdown(["method", "cases", *PARTS], rows), ""]
+    lines = [f"## {LABELED[metric]}", "", *Table.of_texts(["method", "cases", *PARTS], rows).markdown(), ""]
     rows = []
     for (case, method), own in _by_case(own_rows):
         rows.append([case, method, *(cell(select(own, metric, part, all_cases=True), DIGITS[metric]) for part in PARTS[1:])])
-    return [*lines, *markdown(["case", "method", *PARTS[1:]], rows), ""]
+    return [*lines, *Table.of_texts(["case", "method", *PARTS[1:]], rows).markdown(), ""]
 
 
 def _means(table: pd.DataFrame) -> list[str]:
@@ -128,12 +128,16 @@ def _means(table: pd.DataFrame) -> list[str]:
         own = own_rows[own_rows["method"] == method]
         cells = [cell(select(own, metric, part), DIGITS[metric]) for part, metric in keys]
         rows.append([method, str(mean_and_spread(select(own, "iou", "future"))[2]), *cells])
-    lines = ["## Means over frames, against carried masks", "", *markdown(["method", "cases", *header], rows), ""]
+    lines = ["## Means over frames, against carried masks", "", *Table.of_texts(["method", "cases", *header], rows).markdown(), ""]
     keys = [key for key in keys if key[1] != "ssim"]
     rows = []
     for (case, method), own in _by_case(own_rows):
         rows.append([case, method, *(cell(select(own, metric, part, all_cases=True), DIGITS[metric]) for part, metric in keys)])
-    return [*lines, *markdown(["case", "method", *(f"{SHORT[part]} {HEADINGS[metric]}" for part, metric in keys)], rows), ""]
+    return [
+        *lines,
+        *Table.of_texts(["case", "method", *(f"{SHORT[part]} {HEADINGS[metric]}" for part, metric in keys)], rows).markdown(),
+        "",
+    ]
 
 
 def _points(table: pd.DataFrame) -> list[str]:
@@ -155,7 +159,7 @@ def _points(table: pd.DataFrame) -> list[str]:
         "Pixels; points marked surely in frame 0 and in the frame. PhysTwin's particles cannot be told apart in its video.",
         "On the table: points of flat things, in all later frames in which they touch it.",
     ]
-    return ["## Points marked by hand", "", *about, "", *markdown(["case", "method", "points", *header], rows), ""]
+    return ["## Points marked by hand", "", *about, "", *Table.of_texts(["case", "method", "points", *header], rows).markdown(), ""]
 
 
 def _paired(table: pd.DataFrame) -> list[str]:
@@ -175,7 +179,7 @@ def _paired(table: pd.DataFrame) -> list[str]:
         return []
     about = "First minus second, paired by case, means over seeds, with 95 % t intervals over cases."
     header = ["quantity", "first", "second", "difference", "95 % interval", "cases"]
-    return ["## Paired differences", "", about, "", *markdown(header, rows)]
+    return ["## Paired differences", "", about, "", *Table.of_texts(header, rows).markdown()]
 
 
 def _by_case(rows: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:
@@ -284,10 +288,10 @@ def cost_lines(table: pd.DataFrame) -> list[str]:
         return []
     lines = ["", "## Cost: processor minutes of one run", ""]
     lines += ["Mean over runs. What runs share (perception, a search, splats) counts in each of them.", ""]
-    lines += markdown(["method", "runs", *GROUPS, "sum"], _minutes(table, "method"))
+    lines += Table.of_texts(["method", "runs", *GROUPS, "sum"], _minutes(table, "method")).markdown()
     shown = COSTED if (table["method"] == COSTED).any() else table["method"].iloc[-1]
     lines += ["", f"The same of `{shown}`, by scenario:", ""]
-    lines += markdown(["scenario", "runs", *GROUPS, "sum"], _minutes(table[table["method"] == shown], "scenario"))
+    lines += Table.of_texts(["scenario", "runs", *GROUPS, "sum"], _minutes(table[table["method"] == shown], "scenario")).markdown()
     return lines
 
 

@@ -44,7 +44,7 @@ from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from neuspring.data.synthetic import toy
 from neuspring.experiments.benchmark import read_scenarios
 from neuspring.report.figures import twin as figures_twin
@@ -196,7 +196,7 @@ def report(table: pd.DataFrame) -> list[str]:
             cells = [cell(metric, values[of == metric].dropna(), sign) for metric in METRICS]
             rows.append([str(scene), f"{1e3 * float(noise):g}", str(kind), *cells])
     headings = [heading for heading, _, _ in METRICS.values()]
-    lines = markdown(["scene", "noise [mm]", "kind", *headings], rows)
+    lines = Table.of_texts(["scene", "noise [mm]", "kind", *headings], rows).markdown()
     fits = table[table["kind"].isin(list(RATES))].rename(columns={"scene": "scenario", "kind": "method"})
     both = pd.concat([fits.assign(task=[f"{1e3 * noise:g}" for noise in fits["noise"]]), fits.assign(task="all")])
     differences, rows = paired_differences(both, "springs"), []
@@ -207,7 +207,7 @@ def report(table: pd.DataFrame) -> list[str]:
             cells.append("{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*(factor * of[["difference", "low", "high"]]), d=digits))
         rows.append(cells)
     lines += ["", "Field − springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
-    return lines + markdown(["noise [mm]", *headings], rows)
+    return lines + Table.of_texts(["noise [mm]", *headings], rows).markdown()
 
 
 def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from neuspring.data.capture import Capture, Writer
 from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.truth import Truth, truth_of
@@ -133,7 +133,7 @@ def summary(errors: pd.DataFrame) -> str:
         for (metric, method), row in zip(means.index, means.to_numpy(), strict=True)
     ]
     scenes = errors["scene"].nunique()
-    lines = markdown(["mean over scenes, mm", "method", "three RGBD", "one RGBD", "one color"], rows)
+    lines = Table.of_texts(["mean over scenes, mm", "method", "three RGBD", "one RGBD", "one color"], rows).markdown()
     return "\n".join([f"{scenes} scenes.", "", *lines]) + "\n"
 
 

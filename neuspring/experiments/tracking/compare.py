@@ -18,7 +18,7 @@ import pandas as pd
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from neuspring.experiments.tracking.store import LoggedRun, logged_runs
 from neuspring.scores.metrics import METRICS, TASKS, UNITS
 from neuspring.scores.statistics import paired_differences
@@ -151,7 +151,14 @@ def _score_lines(differences: pd.DataFrame, first: str, second: str) -> list[str
     timed = differences["task"] == SECONDS
     for title, part in (("Scores", differences[~timed]), ("Time of the stages that ran again", differences[timed])):
         if len(part):
-            lines += ["", f"## {title}", "", what, "", *markdown(heads, [_cells(row) for row in part.itertuples()])]
+            lines += [
+                "",
+                f"## {title}",
+                "",
+                what,
+                "",
+                *Table.of_texts(heads, [_cells(row) for row in part.itertuples()]).markdown(),
+            ]
     return lines
 
 
@@ -192,7 +199,7 @@ def _parameter_lines(pairs: list[Pair], first: str, second: str) -> list[str]:
     if not changed:
         return ["", "## Changed parameters", "", "None."] if pairs else []
     rows = [[name, _cut(a), _cut(b), ", ".join(of), str(of.total())] for (name, a, b), of in sorted(changed.items())]
-    return ["", "## Changed parameters", "", *markdown(["Parameter", first, second, "Methods", "Pairs"], rows)]
+    return ["", "## Changed parameters", "", *Table.of_texts(["Parameter", first, second, "Methods", "Pairs"], rows).markdown()]
 
 
 def _list(title: str, names: list[str]) -> list[str]:

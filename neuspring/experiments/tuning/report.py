@@ -31,7 +31,7 @@ from neuspring.config.tuning import Tune
 from neuspring.core.files import write_atomically, write_table, write_text
 from neuspring.core.records import canonical
 from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
-from neuspring.core.text import markdown
+from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan, labels
 from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, Store, slots
@@ -205,7 +205,9 @@ def summary(findings: Findings, folder: Path) -> str:
     lines += _best_lines(findings, folder)
     lines += ["## Importance", ""]
     if findings.importances:
-        lines += markdown(["Setting", "Importance"], [[name, f"{value:.2f}"] for name, value in findings.importances.items()])
+        lines += Table.of_texts(
+            ["Setting", "Importance"], [[name, f"{value:.2f}"] for name, value in findings.importances.items()]
+        ).markdown()
         lines += ["", "PED-ANOVA over finished trials. With few trials it says little.", ""]
     else:
         lines += ["Not computable: too few trials have finished, or they do not differ.", ""]
@@ -213,7 +215,7 @@ def summary(findings: Findings, folder: Path) -> str:
     rows = [
         [str(row["trial"]), f"{row['loss']:.4e}", *(_shown(row[name]) for name in tune.space)] for row in done.to_dict("records")
     ]
-    table = markdown(["Trial", "Loss [m²]", *tune.space], rows) if rows else ["None."]
+    table = Table.of_texts(["Trial", "Loss [m²]", *tune.space], rows).markdown() if rows else ["None."]
     lines += [f"## The best {SHOWN} finished trials", "", *table, "", "All trials: `trials.csv`.", ""]
     if failed := [f"- trial {slot.number}: {slot.reason}" for slot in findings.slots if slot.state == "failed"]:
         lines += ["## Failed", "", *failed, ""]
@@ -241,7 +243,9 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
         compared,
         "The smallest of many losses on the same few frames is optimistic: compare the two methods on test frames.",
         "",
-        *markdown(["Setting", "Best", "Unchanged"], [[name, _shown(values[name]), _shown(unchanged[name])] for name in values]),
+        *Table.of_texts(
+            ["Setting", "Best", "Unchanged"], [[name, _shown(values[name]), _shown(unchanged[name])] for name in values]
+        ).markdown(),
         "",
         f"`{folder / 'best.yaml'}` is an overlay with both as rows, `{plan.tune.method}` and `{tuned_name(plan.tune)}`:",
         "",

@@ -15,6 +15,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import now
 from neuspring.core.run_record import RUN_RECORD
+from neuspring.core.table import Tone
 from neuspring.report import study_cells
 from neuspring.report.benchmark import (
     Benchmark,
@@ -44,7 +45,6 @@ from neuspring.report.page.setup import perception_section, setup_section, tunin
 from neuspring.report.page.work import failures_section, findings_section, gpu_hours, work_section
 from neuspring.report.study import StudyNumbers, kind, study_blocks, verdict_chip
 from neuspring.report.study_cells import BETTER, WITHIN, WORSE
-from neuspring.report.table import Tone
 from neuspring.scores import paper
 from neuspring.scores.failures import LeftOut
 from neuspring.scores.runs import collect, collect_transfers

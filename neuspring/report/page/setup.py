@@ -17,11 +17,11 @@ from markupsafe import Markup, escape
 from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import flat
+from neuspring.core.table import Cell, Table
 from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Picture, Prose, Section, Text
 from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData, listed, several
 from neuspring.report.page.pictures import embedded_png, link
 from neuspring.report.page.work import machines
-from neuspring.report.table import Cell, Table
 from neuspring.scores.runs import mixed_settings
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")

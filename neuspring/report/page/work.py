@@ -11,10 +11,10 @@ import pandas as pd
 
 from neuspring.core.findings import Level, findings_of
 from neuspring.core.job_records import JobRecord
+from neuspring.core.table import Cell, Chip, Table, Tone
 from neuspring.report.blocks import Block, Fold, Section, Text
 from neuspring.report.page.material import METHOD_RULES, FinishedRun, ReportData, duration, hours, memory, several
 from neuspring.report.page.pictures import link
-from neuspring.report.table import Cell, Chip, Table, Tone
 from neuspring.scores.metrics import DASH
 
 ORDER = (

@@ -16,7 +16,8 @@ from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.findings import Finding, note, refusal
-from neuspring.core.text import Progress, markdown
+from neuspring.core.table import Table
+from neuspring.core.text import Progress
 from neuspring.data import phystwin
 from neuspring.data.check import check_layout, find_cases
 from neuspring.data.phystwin import released_cases
@@ -216,7 +217,7 @@ def _counts(findings: Sequence[Comparison]) -> list[str]:
         outcomes = Counter(finding.outcome for finding in findings if finding.check == check)
         if outcomes:
             rows.append([f"{check}: {title}", *(str(outcomes[name]) for name in OUTCOMES)])
-    return markdown(["Check", *(name.capitalize() for name in OUTCOMES)], rows)
+    return Table.of_texts(["Check", *(name.capitalize() for name in OUTCOMES)], rows).markdown()
 
 
 def _table(findings: Sequence[Comparison]) -> list[str]:
@@ -225,8 +226,8 @@ def _table(findings: Sequence[Comparison]) -> list[str]:
     for f in findings:
         numbers = [_number(value) for value in (f.ours, f.published, f.difference, f.tolerance)]
         quantity = f"{f.task} {f.quantity}".strip()
-        rows.append([f.scenario, quantity, *numbers, f.unit, f.outcome, f.note.replace("|", "/").replace("\n", " ")])
-    return markdown(header, rows)
+        rows.append([f.scenario, quantity, *numbers, f.unit, f.outcome, f.note])
+    return Table.of_texts(header, rows).markdown()
 
 
 def _conventions(findings: Sequence[Comparison]) -> list[str]:

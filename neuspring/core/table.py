@@ -1,22 +1,13 @@
-"""A table is one value: cells of text, marks and sorting keys, drawn as Markdown, LaTeX or HTML."""
+"""A table is one value: cells of text, marks and sorting keys, as Markdown and LaTeX; the report's page draws it as HTML."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
-from typing import Any, ClassVar, Literal
-
-import jinja2
-from markupsafe import Markup
-
-from neuspring.core.text import markdown
+from typing import ClassVar, Literal
 
 Tone = Literal["", "good", "bad", "warn", "mute"]
-SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
-TEMPLATES = Path(__file__).parent / "templates"
 LONG_GROUPS = {"Recon.": "Reconstruction & Resimulation", "Future": "Future Prediction"}
 """Groups of columns as LaTeX names them, which has room above the columns."""
 MARKDOWN_MARKS = {"": "{}", "best": "**{}**", "second": "<ins>{}</ins>"}
@@ -65,15 +56,20 @@ class Table:
     """A table; the first `stub` cells of every row are its headings."""
 
     kind: ClassVar[str] = "table"
-    caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
+    caption: str = ""
     groups: Sequence[str] = ()
     """What each column behind the stub belongs to, for example a task; empty: columns are not grouped."""
     stub: int = 1
     sortable: bool = False
     note: str = ""
     """One paragraph."""
+
+    @classmethod
+    def of_texts(cls, header: Sequence[str], rows: Iterable[Iterable[str]], caption: str = "") -> Table:
+        """A table of plain texts."""
+        return cls(caption=caption, header=header, rows=[[Cell(text=text) for text in row] for row in rows])
 
     @property
     def headings(self) -> list[str]:
@@ -84,12 +80,15 @@ class Table:
 
     def markdown(self) -> list[str]:
         """Lines in which a row with a first cell alone is a heading, which widens no column."""
-        rows = [[MARKDOWN_MARKS[cell.mark].format(cell.plain.replace("|", "\\|")) for cell in row] for row in self.rows]
-        alone = {index: row[0] for index, row in enumerate(rows) if row[0] and not any(row[1:])} if len(self.header) > 1 else {}
-        head, rule, *lines = markdown(self.headings, [row for index, row in enumerate(rows) if index not in alone])
-        for index, text in alone.items():
-            lines.insert(index, f"| *{text}* |{' |' * (len(self.header) - 1)}")
-        return [head, rule, *lines]
+        rows = [[MARKDOWN_MARKS[cell.mark].format(_in_markdown(cell.plain)) for cell in row] for row in self.rows]
+        several = len(self.header) > 1
+        alone = [several and bool(row[0]) and not any(row[1:]) for row in rows]
+        widening = [self.headings, *(row for row, heading in zip(rows, alone, strict=True) if not heading)]
+        widths = [max(map(len, column)) for column in zip(*widening, strict=True)]
+        lines = ["|" + "|".join("-" * (width + 2) for width in widths) + "|"]
+        for row, heading in zip(rows, alone, strict=True):
+            lines.append(f"| *{row[0]}* |{' |' * (len(row) - 1)}" if heading else _markdown_row(row, widths))
+        return [_markdown_row(self.headings, widths), *lines]
 
     def latex(self, label: str, title: str) -> str:
         """A float to \\input; `LATEX_PREAMBLE` says what it needs. A table with groups is as wide as the lines of the page."""
@@ -115,18 +114,24 @@ class Table:
         lines += ["\\bottomrule", f"\\end{{tabular}}{tail}", caption, f"\\label{{tab:{label}}}", "\\end{table*}"]
         return "\n".join(lines) + "\n"
 
-    def html(self) -> Markup:
-        """For a page, which is narrower than paper on its side: a table below the other for each group of columns."""
-        module: Any = template("table.html.j2").module
-        parts = [self.of_group(group) for group in dict.fromkeys(self.groups)] or [self]
-        return Markup("").join([module.table(part) for part in parts] + [module.note(self.note)])
+    @property
+    def parts(self) -> list[Table]:
+        """A table for each group of columns, for a page, which is narrower than paper on its side."""
+        return [self._of_group(group) for group in dict.fromkeys(self.groups)] or [self]
 
-    def of_group(self, group: str) -> Table:
-        """The columns of one group."""
+    def _of_group(self, group: str) -> Table:
         kept = [*range(self.stub), *(self.stub + k for k, name in enumerate(self.groups) if name == group)]
         caption = f"{self.caption}: {LONG_GROUPS.get(group, group)}"
         rows = [[row[k] for k in kept] for row in self.rows]
         return replace(self, caption=caption, header=[self.header[k] for k in kept], rows=rows, groups=())
+
+
+def _in_markdown(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _markdown_row(cells: Sequence[str], widths: Sequence[int]) -> str:
+    return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
 
 
 def tex(text: str) -> str:
@@ -137,10 +142,3 @@ def tex(text: str) -> str:
 
 def _tex_row(cells: Sequence[str]) -> str:
     return " & ".join(cells) + r" \\"
-
-
-@cache
-def template(name: str) -> jinja2.Template:
-    """A template of this package; every text in it is escaped."""
-    loader = jinja2.FileSystemLoader(TEMPLATES)
-    return jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template(name)
