@@ -7,35 +7,21 @@ import difflib
 import fnmatch
 import shlex
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from neuspring.baselines import BASELINES, REFERENCES
-from neuspring.config import (
-    Config,
-    Fit,
-    Losses,
-    Method,
-    ReleasedQuirks,
-    ScenarioRow,
-    Search,
-    SearchRow,
-    merge,
-    parse,
-    plain,
-    read_yaml,
-)
-from neuspring.config.images import Appearance
+from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain, read_yaml
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, read_scenarios
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips_weights import configured
-from neuspring.scores.studies import Study, read_studies
+from neuspring.scores.studies import read_studies
 
+T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
 LEAST_TOGETHER = 3
@@ -77,110 +63,78 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
         names = {"scenario": "scenarios", "category": "scenarios", "method": "methods", "seed": "seeds"}
         if key not in names or not text:
             raise InputError(where, rule, term)
-        for pattern in text.split(","):
-            known = [_word(entry, key, scenarios) for entry in kept[names[key]]]
-            if not fnmatch.filter(known, pattern):
-                raise InputError(where, f"{key} {pattern!r} matches none of the configuration's", ", ".join(dict.fromkeys(known)))
-        kept[names[key]] = tuple(
-            entry
-            for entry in kept[names[key]]
-            if any(fnmatch.fnmatchcase(_word(entry, key, scenarios), pattern) for pattern in text.split(","))
-        )
-    return dataclasses.replace(config, scenarios=kept["scenarios"], methods=kept["methods"], seeds=kept["seeds"])
+        words = {each: scenarios[each].category if key == "category" else str(each) for each in kept[names[key]]}
+        patterns = text.split(",")
+        for pattern in patterns:
+            if not fnmatch.filter(words.values(), pattern):
+                known = ", ".join(dict.fromkeys(words.values()))
+                raise InputError(where, f"{key} {pattern!r} matches none of the configuration's", known)
+        kept[names[key]] = tuple(each for each, word in words.items() if any(fnmatch.fnmatchcase(word, one) for one in patterns))
+    return dataclasses.replace(config, **kept)
 
 
-def _word(entry: Any, key: str, scenarios: Mapping[str, ScenarioRow]) -> str:
-    return scenarios[entry].category if key == "category" else str(entry)
-
-
-def fit_of(config: Config, method: Method, name: str) -> Fit:
-    """The fit settings of a method: the configuration's, with the method's own on top. Raises InputError for unknown keys."""
-    return parse(Fit, _overlaid(config.fit, method.settings), f"method {name}, settings")
-
-
-def search_of(config: Config, row: SearchRow, name: str) -> Search:
-    """The search settings of a row: the configuration's, with the row's own on top. Raises InputError for unknown keys."""
-    return parse(Search, _overlaid(config.search, row.settings), f"search {name}, settings")
-
-
-def quirks_of(config: Config, row: SearchRow, name: str) -> ReleasedQuirks:
-    """The quirks of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
-    return parse(ReleasedQuirks, _overlaid(config.released_quirks, row.released_quirks), f"search {name}, released_quirks")
-
-
-def losses_of(config: Config, row: SearchRow, name: str) -> Losses:
-    """The losses of a search and of the fits that start from it: the row's own on top of the configuration's. Raises InputError."""
-    return parse(Losses, _overlaid(config.losses, row.losses), f"search {name}, losses")
-
-
-def section_of(config: Config, method: Method, name: str) -> Any:
-    """The settings of a trained baseline: its section, with the method's own on top. Raises InputError for unknown keys."""
-    assert method.model
-    section = getattr(config.baselines, BASELINES[method.model].section)
-    return parse(type(section), _overlaid(section, method.settings), f"method {name}, settings")
-
-
-def appearance_of(config: Config, method: Method, name: str) -> Appearance:
-    """How a method's splats are trained: as all, with the method's own settings on top. Raises InputError for unknown keys."""
-    return parse(Appearance, _overlaid(config.images.appearance, method.appearance or {}), f"method {name}, appearance")
-
-
-def _overlaid(settings: Any, own: Mapping[str, Any]) -> dict[str, Any]:
+def overlaid(settings: T, own: Mapping[str, Any], where: str) -> T:
+    """A section of the settings with a row's own on top. Raises InputError for unknown keys."""
     values = plain(settings)
     merge(values, own)
-    return values
+    return parse(type(settings), values, where)
 
 
-@dataclass(frozen=True)
+def with_search(config: Config, row: SearchRow, name: str) -> Config:
+    """The configuration of a search: with the row's settings, quirks and losses on top; those hold for its fits too."""
+    own = {"search": row.settings, "released_quirks": row.released_quirks, "losses": row.losses}
+    keys = {section: "settings" if section == "search" else section for section in own}
+    return dataclasses.replace(
+        config, **{key: overlaid(getattr(config, key), own[key], f"search {name}, {keys[key]}") for key in own}
+    )
+
+
+def with_method(config: Config, method: Method, name: str) -> Config:
+    """The configuration of a method: its settings on top of `fit`, or of its model's section; how its own splats are trained."""
+    where = f"method {name}, settings"
+    if method.search:
+        config = dataclasses.replace(config, fit=overlaid(config.fit, method.settings, where))
+    elif method.model and BASELINES[method.model].trained:
+        section = BASELINES[method.model].section
+        own = overlaid(getattr(config.baselines, section), method.settings, where)
+        config = dataclasses.replace(config, baselines=dataclasses.replace(config.baselines, **{section: own}))
+    if method.appearance:
+        looks = overlaid(config.images.appearance, method.appearance, f"method {name}, appearance")
+        config = dataclasses.replace(config, images=dataclasses.replace(config.images, appearance=looks))
+    return config
+
+
+def section_of(config: Config, method: Method) -> Any:
+    """The settings of a trained baseline, in the configuration of its method."""
+    return getattr(config.baselines, BASELINES[method.model or ""].section)
+
+
 class Benchmark:
-    """A validated configuration with the rows it names."""
+    """A configuration with the rows that it names, after everything that can be checked before a job starts.
 
-    config: Config
-    """With what `only` leaves of scenarios, methods and seeds."""
-    whole: Config
-    """As it was given: what tables are laid out for, whatever part of it is run now."""
-    scenarios: dict[str, ScenarioRow]
-    """Chosen ones, those that twins are transferred to, those of the sweep."""
-    whole_scenarios: dict[str, ScenarioRow]
-    """Those of the whole configuration."""
-    methods: dict[str, Method]
-    searches: dict[str, SearchRow]
-    fits: dict[str, Method]
-    """The methods whose fits are made: of all rows of the table with the same fit, the first."""
-    fit_of_method: dict[str, str]
-    """Chosen method -> the method in whose folder its fit lies."""
-    transfers: dict[str, tuple[str, ...]]
-    """Chosen scenario -> those that its twins are transferred to."""
-    pictured: frozenset[str]
-    """Methods of the whole configuration that are trained on pictures, so that scenarios without any are left out."""
-    splats: dict[str, Method]
-    """Methods whose own splats are made: of all rows of the table with the same settings, the first."""
-    splats_of_method: dict[str, str]
-    """Chosen method with splats of its own -> the method in whose name they are made."""
-    studies: dict[str, Study]
-    """All rows of the study table; `config.studies` names those that are made without being asked for."""
-    pools: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    """Scenario of the whole configuration -> the other recordings of its pool, where a method has one."""
-    pooled: frozenset[str] = frozenset()
-    """Methods of the whole configuration that are judged on a pool, so that scenarios without any are left out."""
-    on_gpu: bool = False
-    """Whether jobs take GPUs. `twins_per_launch: auto` lets no fits share launches there: nobody has measured whether it pays."""
+    Tables are read relative to `root`. Raises InputError.
+    """
 
-    @classmethod
-    def of(cls, values: Mapping[str, Any], root: Path) -> Benchmark:
-        """Check everything that can be checked before a job starts. Tables are read relative to `root`. Raises InputError."""
-        whole = parse(Config, values, "configuration")
+    def __init__(self, values: Mapping[str, Any], root: Path) -> None:
+        self.root, whole = root, parse(Config, values, "configuration")
         scenarios, methods = read_scenarios(root / whole.scenario_table), read_methods(root / whole.method_table)
-        studies = read_studies(root / whole.study_table)
-        _require_known("studies", whole.studies, studies, whole.study_table)
+        self.studies = read_studies(root / whole.study_table)
+        """All rows of the study table; `config.studies` names those that are made without being asked for."""
+        _require_known("studies", whole.studies, self.studies, whole.study_table)
         _require_known("methods", whole.methods, methods, whole.method_table)
-        whole = _with_methods_of_studies(whole, studies, methods)
+        # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
+        implied = {method for study in whole.studies for method in self.studies[study].rows.values() if method in methods}
+        if not implied <= set(whole.methods):
+            union = implied | set(whole.methods)
+            whole = dataclasses.replace(whole, methods=tuple(name for name in methods if name in union))
         for name in ("scenarios", "methods", "seeds"):
             if not getattr(whole, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
         _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
-        whole = _with_references(whole, scenarios, methods)
-        config = chosen_part(whole, scenarios)
+        self.whole = whole = with_references(whole, scenarios, methods)
+        """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
+        self.config = config = chosen_part(whole, scenarios)
+        """With what `only` leaves of scenarios, methods and seeds."""
         searches = read_searches(root / config.search_table)
         wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
         _require_known("methods' search", wanted, searches, config.search_table)
@@ -188,63 +142,66 @@ class Benchmark:
         pairs = config.transfers or {}
         everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
         _require_known("transfers", everyone, scenarios, config.scenario_table)
-        transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
-        targets = tuple(name for names in transfers.values() for name in names)
-        pools = _pools(whole, scenarios, methods, searches)
-        targets += tuple(other for name in config.scenarios for other in pools.get(name, ()))
-        _require_alike(config, scenarios, transfers)
+        self.transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
+        """Chosen scenario -> those that its twins are transferred to."""
+        _require_alike(config, scenarios, self.transfers)
+        self.pools = _pools(whole, scenarios, methods, searches)
+        """Scenario of the whole configuration -> the other recordings of its pool, where a method has one."""
+        targets = tuple(name for names in self.transfers.values() for name in names)
+        targets += tuple(other for name in config.scenarios for other in self.pools.get(name, ()))
+        self.tuned = whole.tune.scenarios or whole.scenarios if whole.tune else ()
+        """The scenarios of the sweep: it keeps them, whatever part of the runs is made now."""
         if whole.tune:
             of = "this configuration's scenarios"
             _require_known("tune.scenarios", whole.tune.scenarios, dict.fromkeys(whole.scenarios + targets), of)
-        owners = {name: owner for name, owner in _fit_owners(config, methods).items() if name in config.methods}
-        looks = {name: owner for name, owner in _splat_owners(config, methods).items() if name in config.methods}
-        chosen = cls(
-            config,
-            whole,
-            {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + _tuned(whole))},
-            {n: scenarios[n] for n in whole.scenarios},
-            {n: methods[n] for n in config.methods},
-            {row.searched: searches[row.search] for n in config.methods if (row := methods[n]).search},
-            {n: methods[n] for n in owners.values()},
-            owners,
-            transfers,
-            frozenset(name for name in whole.methods if _trained_on_pictures(whole, methods[name], name)),
-            {n: methods[n] for n in looks.values()},
-            looks,
-            studies,
-            pools,
-            frozenset(name for name in whole.methods if methods[name].pool),
-        )
-        for name in [*chosen.scenarios, *chosen.methods]:
+        self.scenarios = {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + self.tuned)}
+        """Chosen ones, those that twins are transferred to, those of the sweep."""
+        self.whole_scenarios = {n: scenarios[n] for n in whole.scenarios}
+        """Those of the whole configuration."""
+        self.methods = {n: methods[n] for n in config.methods}
+        self.searches = {row.searched: searches[row.search] for row in self.methods.values() if row.search}
+        fitted = {n: m for n, m in methods.items() if m.fit}
+        own = {n: (m.search, m.pool, m.fit, m.oracle, with_method(config, m, n).fit) for n, m in fitted.items()}
+        self.fit_of_method = _owners(own, config.methods)
+        """Chosen method -> the method in whose folder its fit lies: the first row of the table with the same fit."""
+        looks = {n: with_method(config, m, n).images.appearance for n, m in methods.items() if m.appearance is not None}
+        self.splats_of_method = _owners(looks, config.methods)
+        """Chosen method with splats of its own -> the first row of the table with the same settings of theirs."""
+        self.fits = {n: methods[n] for n in self.fit_of_method.values()}
+        self.splats = {n: methods[n] for n in self.splats_of_method.values()}
+        self.pictured = frozenset(name for name in whole.methods if _trained_on_pictures(whole, methods[name], name))
+        """Methods of the whole configuration that are trained on pictures, so that scenarios without any are left out."""
+        self.pooled = frozenset(name for name in whole.methods if methods[name].pool)
+        """Methods of the whole configuration that are judged on a pool, so that scenarios without any are left out."""
+        self.on_gpu = False
+        """Whether jobs take GPUs. There `twins_per_launch: auto` lets no fits share launches: nobody has measured if it pays."""
+        for name in [*self.scenarios, *self.methods]:
             if name in (*RESERVED, config.tables) or name.startswith("search-"):
                 rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
-        for name, method in chosen.methods.items():
-            chosen._check_settings(name, method)
-        chosen._require_data()
-        chosen._require_applying()
-        return chosen
+        for name, method in self.methods.items():
+            self._check_settings(name, method)
+        self._require_data()
+        if not any(self.applies(method, scenario) for method in self.methods for scenario in config.scenarios):
+            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"
+            remedy = "Choose scenarios with images (and images.enabled), name pools, or choose another method."
+            raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
 
     def _check_settings(self, name: str, method: Method) -> None:
         """Settings of a method's own, before any job starts."""
-        if method.model:
-            if BASELINES[method.model].trained:
-                section = section_of(self.config, method, name)
-                if name in self.pictured:
-                    # Named weights that are missing or wrong are an error before the first job.
-                    BASELINES[method.model].features(section)
-            appearance_of(self.config, method, name)
-        if method.search:
-            quirks_of(self.config, self.searches[method.searched], method.search)
-            losses_of(self.config, self.searches[method.searched], method.search)
-        if not (method.search and method.fit):
+        config = with_method(self.config, method, name)
+        if name in self.pictured:
+            # Named weights that are missing or wrong are an error before the first job.
+            BASELINES[method.model or ""].features(section_of(config, method))
+        if not method.search:
             return
-        wanted = search_of(self.config, self.searches[method.searched], method.search).variables.stiffness
-        fit = fit_of(self.config, method, name)
-        if method.oracle and fit.selection == "tail":
+        wanted = with_search(self.config, self.searches[method.searched], method.search).search.variables.stiffness
+        if not method.fit:
+            return
+        if method.oracle and config.fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
             raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")
-        low, high = fit.stiffness_range
+        low, high = config.fit.stiffness_range
         if not low <= wanted.low < wanted.high <= high:
             rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
@@ -273,12 +230,7 @@ class Benchmark:
     @cached_property
     def _steps(self) -> dict[str, tuple[int, bool]]:
         """Of each fit: frames per step, and whether it goes over all frames (an oracle) or over those before the split."""
-        return {name: (fit_of(self.config, method, name).horizon, method.oracle) for name, method in self.fits.items()}
-
-    @property
-    def tuned(self) -> tuple[str, ...]:
-        """The scenarios of the sweep: it keeps them, whatever part of the runs is made now."""
-        return _tuned(self.whole)
+        return {name: (with_method(self.config, m, name).fit.horizon, m.oracle) for name, m in self.fits.items()}
 
     @property
     def compared_with(self) -> str:
@@ -321,13 +273,6 @@ class Benchmark:
         without = {n: tuple(s for s in self.whole_scenarios if not self.applies(n, s)) for n in self.whole.methods if n in some}
         return {name: scenarios for name, scenarios in without.items() if scenarios}
 
-    def _require_applying(self) -> None:
-        """Raise InputError if nothing of what was asked for can be run."""
-        if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
-            rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"
-            remedy = "Choose scenarios with images (and images.enabled), name pools, or choose another method."
-            raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
-
     def capture_folder(self, name: str) -> Path:
         """Where a scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
         own = None if self.source(name).write_capture else self.data_path(name)
@@ -359,16 +304,7 @@ class Benchmark:
                 BACKENDS["segment"][self.config.perception.segment.backend].require(path)
 
 
-def _with_methods_of_studies(config: Config, studies: Mapping[str, Study], methods: Mapping[str, Method]) -> Config:
-    """The configuration with the methods in the rows of its studies. If they add any, all are in the order of the method table."""
-    implied = {method for study in config.studies for method in studies[study].rows.values() if method in methods}
-    if implied <= set(config.methods):
-        return config
-    union = implied | set(config.methods)
-    return dataclasses.replace(config, methods=tuple(name for name in methods if name in union))
-
-
-def _with_references(config: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method]) -> Config:
+def with_references(config: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method]) -> Config:
     """The configuration with the methods that learn nothing first, if it has scenarios that users filmed."""
     if not any(SOURCES[scenarios[name].source].own for name in config.scenarios):
         return config
@@ -376,18 +312,11 @@ def _with_references(config: Config, scenarios: Mapping[str, ScenarioRow], metho
     return dataclasses.replace(config, methods=beside + config.methods) if beside else config
 
 
-def _tuned(whole: Config) -> tuple[str, ...]:
-    """The scenarios of the sweep; none without one."""
-    return whole.tune.scenarios or whole.scenarios if whole.tune else ()
-
-
-def _fit_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
-    """Method with a fit -> the first row of the table with the same search, stage, frames (all for an oracle) and settings."""
-    first: dict[tuple[Any, ...], str] = {}
-    fitted = {name: method for name, method in methods.items() if method.fit}
-    return {
-        name: first.setdefault((m.search, m.pool, m.fit, m.oracle, fit_of(config, m, name)), name) for name, m in fitted.items()
-    }
+def _owners(keys: Mapping[str, Any], chosen: Sequence[str]) -> dict[str, str]:
+    """Chosen row -> the first row of the table with the same key."""
+    first: dict[Any, str] = {}
+    owners = {name: first.setdefault(key, name) for name, key in keys.items()}
+    return {name: owner for name, owner in owners.items() if name in chosen}
 
 
 def _pools(
@@ -406,16 +335,9 @@ def _pools(
     return pools
 
 
-def _splat_owners(config: Config, methods: Mapping[str, Method]) -> dict[str, str]:
-    """Method with splats of its own -> the first row of the table with the same settings of theirs."""
-    first: dict[Any, str] = {}
-    own = {name: method for name, method in methods.items() if method.appearance is not None}
-    return {name: first.setdefault(appearance_of(config, method, name), name) for name, method in own.items()}
-
-
 def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
     baseline = BASELINES.get(method.model or "")
-    return bool(baseline and baseline.trained and baseline.takes_pictures(section_of(config, method, name)))
+    return bool(baseline and baseline.trained and baseline.takes_pictures(section_of(with_method(config, method, name), method)))
 
 
 def _require_alike(
@@ -430,18 +352,18 @@ def _require_alike(
         SOURCES[here.source].require_alike(config)
 
 
-def _with_hint(name: str, known: Mapping[str, Any]) -> str:
-    """An unknown row, and what to name in its place: its name now, or one that is spelled alike."""
-    if now := RENAMED_ROWS.get(name):
-        return f"{name!r} ({now if ' ' in now else f'now {now!r}'})"
-    alike = difflib.get_close_matches(name, known, n=1)
-    return f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}"
-
-
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        hints = [_with_hint(name, known) for name in unknown]
+    """Raise InputError for unknown rows, with what to name in their place: their name now, or one that is spelled alike."""
+    hints = []
+    for name in names:
+        if name in known:
+            continue
+        if now := RENAMED_ROWS.get(name):
+            hints.append(f"{name!r} ({now if ' ' in now else f'now {now!r}'})")
+        else:
+            alike = difflib.get_close_matches(name, known, n=1)
+            hints.append(f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}")
+    if hints:
         raise InputError(
             f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
         )

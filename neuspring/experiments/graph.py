@@ -19,21 +19,19 @@ from typing import Any
 
 from neuspring.baselines import BASELINES
 from neuspring.config import Config, Search, SpringField, plain
-from neuspring.config.images import Appearance
+from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import code_digest
 from neuspring.data.sources import SOURCES
-from neuspring.experiments import benchmark as benchmarks
-from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips_weights import configured
 from neuspring.stages import STAGES
 from neuspring.stages.stage import Stage
 
+TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-REGIONS_ONLY = ("tied_rollouts",)
-"""Settings of the search that concern nothing where there is one region."""
 Files = str | list[str]
 
 
@@ -47,7 +45,11 @@ class Graph:
 
     def __init__(self, benchmark: Benchmark) -> None:
         self.benchmark, self.config = benchmark, benchmark.config
-        self.results = benchmark.config.results
+        self.results, self.root, self.whole = benchmark.config.results, benchmark.root, benchmark.whole
+        self.folder = f"{self.results}/{self.config.tables}"
+        """Of tables and report."""
+        tune = self.config.tune
+        self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
         self._texts: dict[tuple[str, str, str], str] = {}
 
     # --- which jobs there are
@@ -299,41 +301,21 @@ class Graph:
             return dataclasses.replace(config, perception=dataclasses.replace(config.perception, segment=given))
         if stage.name == "search":
             row = rows.searches[job.search]
-            search = benchmarks.search_of(config, row, job.search)
-            if row.clusters == 1:
-                search = dataclasses.replace(search, **{name: getattr(Search(), name) for name in REGIONS_ONLY})
-            return dataclasses.replace(
-                config,
-                search=search,
-                released_quirks=benchmarks.quirks_of(config, row, job.search),
-                losses=benchmarks.losses_of(config, row, job.search),
-            )
+            config = with_search(config, row, job.search)
+            # These concern nothing where there is one region.
+            alone = {"tied_rollouts": Search().tied_rollouts} if row.clusters == 1 else {}
+            return dataclasses.replace(config, search=dataclasses.replace(config.search, **alone))
         if stage.name == "fit":
             method = rows.fits[job.method]
-            fit, name = benchmarks.fit_of(config, method, job.method), method.searched
-            row = rows.searches[name]
-            return dataclasses.replace(
-                config,
-                fit=dataclasses.replace(fit, field=SpringField()) if method.fit == "springs" else fit,
-                released_quirks=benchmarks.quirks_of(config, row, name),
-                losses=benchmarks.losses_of(config, row, name),
-            )
+            config = with_search(with_method(config, method, job.method), rows.searches[method.searched], method.searched)
+            unread = {"field": SpringField()} if method.fit == "springs" else {}
+            return dataclasses.replace(config, fit=dataclasses.replace(config.fit, **unread))
         if stage.name == "train":
-            method = rows.methods[job.method]
-            section = BASELINES[method.model or ""].section
-            own = benchmarks.section_of(config, method, job.method)
-            return dataclasses.replace(config, baselines=dataclasses.replace(config.baselines, **{section: own}))
-        if stage.name == "appearance":
-            images = dataclasses.replace(config.images, appearance=self.splat_settings(job.looks))
-            return dataclasses.replace(config, images=images)
+            return with_method(config, rows.methods[job.method], job.method)
+        if stage.name == "appearance" and job.looks != SPLATS:
+            name = job.looks.removeprefix(f"{SPLATS}-")
+            return with_method(config, rows.splats[name], name)
         return config
-
-    def splat_settings(self, folder: str) -> Appearance:
-        """How the splats of a folder are trained: those of all methods, or a method's own."""
-        name = folder.removeprefix(f"{SPLATS}-")
-        if name == SPLATS:
-            return self.config.images.appearance
-        return benchmarks.appearance_of(self.config, self.benchmark.splats[name], name)
 
     # --- what makes a job run again beside its command
 
@@ -354,8 +336,7 @@ class Graph:
                 parts.append("absent" if isinstance(configured(self.config.images.lpips), str) else "found")
             if stage.name == "train" and self.pictured(wildcards):
                 method = self.benchmark.methods[wildcards.method]
-                section = benchmarks.section_of(self.config, method, wildcards.method)
-                parts.append(BASELINES[method.model or ""].features(section))
+                parts.append(BASELINES[method.model or ""].features(section_of(config, method)))
             return " ".join(parts)
 
         return digest
@@ -374,6 +355,79 @@ class Graph:
             return int(self.benchmark.on_gpu and stage.gpu == "always")
 
         return taken
+
+    # --- what commands are told that look at many runs: those of the whole benchmark, whatever part runs now
+
+    def tables(self, output: str = "") -> list[str]:
+        """Of `neuspring tables`; into `output` instead of the folder of tables."""
+        objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
+        aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
+        compared = ["--baseline", self.benchmark.compared_with]
+        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims]
+
+    def study(self, name: str) -> list[str]:
+        """Of `neuspring study`."""
+        return ["--study", name, "--table", str(self.root / self.config.study_table), *self._runs(f"{self.folder}/studies")]
+
+    def perception(self) -> list[str]:
+        """Of `neuspring perception-table`."""
+        return ["--results", self.results, "--scenarios", json.dumps(self.judged(self.whole.scenarios))]
+
+    def report(self, output: str = "") -> list[str]:
+        """Of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
+        values = plain(self.whole) | {"only": ""}
+        # Where MLflow lies concerns nothing that the report shows.
+        del values["tracking"]
+        return [
+            *("--results", self.results, "--output", output or f"{self.folder}/report.html", "--settings", _json(values)),
+            *("--table", str(self.root / self.config.study_table), "--tables", self.config.tables),
+            *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
+        ]
+
+    def _runs(self, output: str) -> list[str]:
+        whole = self.whole
+        runs = ["--scenarios", *whole.scenarios, "--methods", *whole.methods, "--seeds", *map(str, whole.seeds)]
+        return ["--results", self.results, "--output", output, *runs, *self._left_out()]
+
+    def _transfers(self) -> list[str]:
+        sources = [name for name in self.whole.transfers or {} if name in self.whole.scenarios]
+        return ["--transfers", *sources] if sources else []
+
+    def _left_out(self) -> list[str]:
+        """Which methods do not apply to which scenarios, so that nothing is missing there."""
+        left_out = self.benchmark.whole_left_out
+        return ["--left-out", _json(left_out)] if left_out else []
+
+    def report_stamp(self) -> list[str]:
+        """Digests of the report's templates, which that of its code does not hold, and of the sweep's summary, if it is there.
+
+        A sweep costs much: it is no input of the report, so that changed settings do not run it again.
+        """
+        summary = Path(self.sweep_folder) / "summary.md"
+        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATES.iterdir()))]
+        texts += [summary.read_bytes()] if self.sweep_folder and summary.exists() else []
+        return [hashlib.sha256(text).hexdigest()[:16] for text in texts]
+
+    def sweep_targets(self) -> list[str]:
+        """Files of the target `sweep`. Raises InputError if the configuration has none."""
+        if not self.sweep_folder:
+            remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
+            raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
+        logged = [f"{self.sweep_folder}/mlflow.txt"] if self.config.tracking.enabled else []
+        return [f"{self.sweep_folder}/summary.md", *logged]
+
+    def sweep(self) -> str:
+        """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
+        values = select(self.config, ("simulation", "losses", "search", "fit", "released_quirks", "tune"))
+        tables = {name: str(self.root / getattr(self.config, name)) for name in ("method_table", "search_table")}
+        return _json(values | tables | {"scenarios": list(self.whole.scenarios)})
+
+    def tuned_rows(self) -> str:
+        """The rows of the method that is varied, so that changed ones are tuned again."""
+        assert self.config.tune
+        method = read_methods(self.root / self.config.method_table)[self.config.tune.method]
+        search = read_searches(self.root / self.config.search_table)[method.search or ""]
+        return _json([plain(method), plain(search)])
 
 
 def _paths(files: Any, many: bool) -> Any:

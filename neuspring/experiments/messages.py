@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 import subprocess
@@ -16,8 +17,7 @@ from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import findings_of
 from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
-from neuspring.experiments.arguments import Arguments
-from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.graph import Graph
 
 MOST_FINDINGS = 20
 """Warnings that are printed at the end of a run."""
@@ -89,16 +89,16 @@ class Overview:
             print(f"\r\x1b[K{text}", end="", file=self._stream, flush=True)
 
 
-def failed(benchmark: Benchmark, arguments: Arguments) -> None:
+def failed(graph: Graph) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
-    results = Path(benchmark.config.results)
+    results = Path(graph.config.results)
     print("\nThe run did not finish. What is done so far:", flush=True)
     # In a folder of their own: otherwise Snakemake would take the tables as finished.
-    so_far = f"{arguments.folder}/so_far"
+    so_far = f"{graph.folder}/so_far"
     command = [sys.executable, "-m", "neuspring"]
-    subprocess.run([*command, "tables", *arguments.tables(so_far)], check=False)
+    subprocess.run([*command, "tables", *graph.tables(so_far)], check=False)
     page = f"{so_far}/report.html"
-    subprocess.run([*command, "report", *arguments.report(page)], check=False, stdout=subprocess.DEVNULL)
+    subprocess.run([*command, "report", *graph.report(page)], check=False, stdout=subprocess.DEVNULL)
     damaged: list[str] = []
     jobs = read_jobs(results, damaged)
     lines = failure_lines([record for record in jobs if record.last.run == this_run(results)], results) + damaged
@@ -108,29 +108,36 @@ def failed(benchmark: Benchmark, arguments: Arguments) -> None:
     print(f"Report so far: {page}. The same command continues where this one stopped.", flush=True)
 
 
-def finished(benchmark: Benchmark, arguments: Arguments, logged: Sequence[str], seconds: float) -> None:
+def finished(graph: Graph, seconds: float) -> None:
     """After success: a table, what to open, where the runs are in MLflow, how long it took."""
-    config, folder = benchmark.config, arguments.folder
-    results = shlex.quote(config.results)
+    config, folder = graph.config, graph.folder
     begun = (Path(config.results) / FOLDER / RUN).stat().st_mtime
-    for study in benchmark.studies:
+    for study in graph.benchmark.studies:
         path = Path(folder) / "studies" / f"{study}.md"
         if path.exists() and path.stat().st_mtime >= begun:
-            cell = f"neuspring explain {study}/ROW/future/chamfer --results {results}"
+            cell = f"neuspring explain {study}/ROW/future/chamfer --results {shlex.quote(config.results)}"
             print(f"{study}: {path}; the runs behind a number: {cell}")
     summary = Path(folder) / "summary.md"
     if not summary.exists():
         return
     print(f"\n{first_table(summary.read_text())}\n")
-    _tell_findings(results=Path(config.results), scenarios=config.scenarios)
+    tell_findings(Path(config.results), config.scenarios)
     print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (videos of every method)")
     if config.tracking.enabled:
-        _tell_tracking(benchmark, results, logged)
+        neuspring = Path(sys.executable).parent / "neuspring"
+        tracking = json.dumps({"tracking": plain(config.tracking)}, sort_keys=True)
+        place = ["--results", config.results, *(["--settings", tracking] if config.tracking.uri else [])]
+        waiting = [path for path in map(Path, graph.logged_runs()) if path.exists() and "logged" not in path.read_text()]
+        if waiting:
+            reason = waiting[0].read_text().strip()
+            print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
+            print(f"  {neuspring} sync {shlex.join(place)}")
+        print(f"Look at the runs in MLflow: {neuspring} ui {shlex.join(place)}", flush=True)
     print(f"It took {seconds / 60:.1f} minutes." if seconds >= 60 else f"It took {seconds:.0f} s.", flush=True)
 
 
-def _tell_findings(results: Path, scenarios: Sequence[str]) -> None:
+def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
     """What the steps of perception noticed: warnings of all scenarios; notes are in the report."""
     found = [(name, one) for name in scenarios for one in findings_of(results, name) if one.level != "note"]
     if found:
@@ -143,19 +150,6 @@ def _tell_findings(results: Path, scenarios: Sequence[str]) -> None:
 
 def first_table(summary: str) -> str:
     """The first table of a summary, with the lines above it but not the heading."""
-    lines = summary.splitlines()
-    rows = [index for index, line in enumerate(lines) if line.startswith("|")]
-    end = next((index for index in rows if index + 1 not in rows), len(lines) - 1)
-    return "\n".join(line for line in lines[: end + 1] if not line.startswith("#")).strip()
-
-
-def _tell_tracking(benchmark: Benchmark, results: str, logged: Sequence[str]) -> None:
-    neuspring = Path(sys.executable).parent / "neuspring"
-    tracking = json.dumps({"tracking": plain(benchmark.config.tracking)}, sort_keys=True)
-    settings = f" --settings {shlex.quote(tracking)}" if benchmark.config.tracking.uri else ""
-    waiting = [path for path in map(Path, logged) if path.exists() and "logged" not in path.read_text()]
-    if waiting:
-        reason = waiting[0].read_text().strip()
-        print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
-        print(f"  {neuspring} sync --results {results}{settings}")
-    print(f"Look at the runs in MLflow: {neuspring} ui --results {results}{settings}", flush=True)
+    before, bar, rest = summary.partition("\n|")
+    rows = "".join(itertools.takewhile(lambda line: line.startswith("|"), (bar[1:] + rest).splitlines(keepends=True)))
+    return "\n".join(line for line in f"{before}\n{rows}".splitlines() if not line.startswith("#")).strip()

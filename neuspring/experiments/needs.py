@@ -56,7 +56,7 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
 
 def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmark:
     """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
-    benchmark = Benchmark.of(values, root)
+    benchmark = Benchmark(values, root)
     if benchmark.config.tune:
         Plan.of(benchmark.config, benchmark.config.tune, root)
         check_storage(benchmark.config.tune, cluster=cluster)

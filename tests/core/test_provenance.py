@@ -85,7 +85,7 @@ def test_modules_that_are_imported_by_name_count(copy):
     """Backends, readers and baselines: the registries name them, and the workflow adds them to the stage that uses them."""
     values = config.read_yaml(ROOT / "config" / "config.yaml")
     config.merge(values, config.read_yaml(ROOT / "config" / "data" / "demo.yaml"))
-    graph = Graph(Benchmark.of(values, ROOT))
+    graph = Graph(Benchmark(values, ROOT))
     job = SimpleNamespace(scenario=graph.config.scenarios[0], camera="0", method=graph.config.methods[0], seed=0)
 
     def now(stage: str) -> str:

@@ -67,11 +67,11 @@ def test_methods(tmp_path: Path) -> None:
     assert list(found) == ["full", "coarse", "long", "ours"]
     assert [method.fit for method in found.values()] == ["springs", None, "springs", "field"]
     made = load("fit: {epochs: 3, learning_rate: 0.5}")
-    merged = tables.fit_of(made, found["long"], "long")
+    merged = tables.with_method(made, found["long"], "long").fit
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
-    assert tables.fit_of(made, found["full"], "full") == made.fit
+    assert tables.with_method(made, found["full"], "full").fit == made.fit
     assert made.fit.epochs == 3
-    ours = tables.fit_of(load("fit: {epochs: 3, field: {hidden: 8}}"), found["ours"], "ours")
+    ours = tables.with_method(load("fit: {epochs: 3, field: {hidden: 8}}"), found["ours"], "ours").fit
     assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
 
 
@@ -79,10 +79,10 @@ def test_searches(tmp_path: Path) -> None:
     found = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
     made = load("search: {rollouts: 44, sigma: 0.25, polish: {share: 0.5}}")
-    merged = tables.search_of(made, found["pieces"], "pieces")
+    merged = tables.with_search(made, found["pieces"], "pieces").search
     assert (merged.rollouts, merged.sigma) == (33, 0.25)
     assert (merged.polish.rounds, merged.polish.share) == (1, 0.5)
-    assert tables.search_of(made, found["uniform"], "uniform") == made.search
+    assert tables.with_search(made, found["uniform"], "uniform").search == made.search
 
 
 BAD_SEARCHES = {
@@ -98,7 +98,7 @@ BAD_SEARCHES = {
 def test_bad_search_settings(settings: dict[str, Any]) -> None:
     row = SearchRow(clusters=2, description="x", settings=settings)
     with pytest.raises(InputError, match="search pieces, settings: "):
-        tables.search_of(load(""), row, "pieces")
+        tables.with_search(load(""), row, "pieces")
 
 
 BAD_METHODS = {
@@ -129,7 +129,7 @@ def test_bad_tables_of_searches_and_methods(read: Callable[[Path], Any], text: s
 def test_bad_method_settings(settings: dict[str, Any]) -> None:
     method = Method(search="uniform", fit=None, description="x", settings=settings)
     with pytest.raises(InputError, match="method long, settings: "):
-        tables.fit_of(load(""), method, "long")
+        tables.with_method(load(""), method, "long")
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def benchmark(root: Path, **values: Any) -> Benchmark:
     write(root / "studies.yaml", "both: {title: t, reference: null, baseline: Plain, rows: {Plain: full, Later: not_there}}")
     tables = {"scenario_table": "scenarios.tsv", "method_table": "methods.yaml", "search_table": "searches.yaml"}
     tables["study_table"] = "studies.yaml"
-    return Benchmark.of({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
+    return Benchmark({"scenarios": ["rope"], "methods": ["full"]} | tables | values, root)
 
 
 def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
@@ -327,7 +327,7 @@ def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(t
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
     values["method_table"] = str(tmp_path / "methods.yaml")
     values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
-    made = Benchmark.of(values, ROOT)
+    made = Benchmark(values, ROOT)
     assert made.pictured == {"spring_gaus", "spring_gaus_few"}
     assert made.applies("spring_gaus", "synthetic_single_lift_rope")
     assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
@@ -337,7 +337,7 @@ def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(t
     # The same splats are made once; who trains on points draws with those of all methods.
     assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}
     assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
-    blind = Benchmark.of(values | {"images": {"enabled": False}}, ROOT)
+    blind = Benchmark(values | {"images": {"enabled": False}}, ROOT)
     assert blind.whole_left_out["spring_gaus"] == tuple(values["scenarios"])
 
 
@@ -438,11 +438,11 @@ def test_the_tables_of_the_project_are_valid_together() -> None:
     root = ROOT
     methods = tuple(tables.read_methods(root / "config" / "methods.yaml"))
     values = config.read_yaml(root / "config" / "data" / "demo.yaml")
-    made = Benchmark.of(values | {"methods": list(methods)}, root)
+    made = Benchmark(values | {"methods": list(methods)}, root)
     for name, method in made.methods.items():
         if method.search:
-            tables.fit_of(made.config, method, name)
-            tables.search_of(made.config, made.searches[method.searched], method.search)
+            tables.with_method(made.config, method, name)
+            tables.with_search(made.config, made.searches[method.searched], method.search)
     for name in methods:
         if name.startswith("clusters_"):
             assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))
@@ -483,7 +483,7 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
         elif row.source not in ("capture", "synthetic", "toy"):
             (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / row.path).touch()
-    benchmark = Benchmark.of(values | {"data_root": str(tmp_path)}, ROOT)
+    benchmark = Benchmark(values | {"data_root": str(tmp_path)}, ROOT)
     assert benchmark.compared_with in benchmark.methods
     assert set(benchmark.fits) <= set(tables.read_methods(ROOT / "config" / "methods.yaml"))
     if benchmark.config.tune:
@@ -503,7 +503,7 @@ def test_the_default_configuration_names_the_tables_alone():
     assert set(default) == {"scenario_table", "method_table", "search_table", "study_table"}
     assert config.parse(config.Config, default, "config.yaml") == config.Config()
     with pytest.raises(InputError, match=r"--configfile config/data/demo\.yaml"):
-        Benchmark.of(default, ROOT)
+        Benchmark(default, ROOT)
 
 
 def test_the_synthetic_benchmark_sees_what_the_demo_sees():
@@ -522,14 +522,14 @@ def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
 
 def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
     studies, methods = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("studies", "methods"))
-    made = Benchmark.of(shipped("toy", "paper"), ROOT).whole.methods
+    made = Benchmark(shipped("toy", "paper"), ROOT).whole.methods
     named = {method for study in studies.values() for method in study["rows"].values()}
     listed = set(shipped("toy", "paper")["methods"])
     assert made == tuple(name for name in methods if name in named | listed)
     # Methods that are all listed keep the order in which they are listed.
     some = shipped("toy") | {"studies": ["table3"], "methods": ["neuspring", "fixed_resolution", "no_triplane"]}
-    assert Benchmark.of(some, ROOT).whole.methods == ("neuspring", "fixed_resolution", "no_triplane")
-    assert Benchmark.of(shipped("toy") | {"studies": ["table3"], "methods": []}, ROOT).whole.methods == (
+    assert Benchmark(some, ROOT).whole.methods == ("neuspring", "fixed_resolution", "no_triplane")
+    assert Benchmark(shipped("toy") | {"studies": ["table3"], "methods": []}, ROOT).whole.methods == (
         "neuspring",
         "no_triplane",
         "fixed_resolution",
@@ -539,7 +539,7 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
 def test_every_method_that_is_shipped_is_valid():
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
-    benchmark = Benchmark.of(values, ROOT)
+    benchmark = Benchmark(values, ROOT)
     # No two rows are the same: each has a fit of its own, the oracle too.
     assert {name for name, owner in benchmark.fit_of_method.items() if name != owner} == set()
 
@@ -563,20 +563,21 @@ def test_every_row_that_is_shipped_is_named_somewhere():
 )
 def test_rows_of_older_tables_are_refused_with_what_became_of_them(name, hint):
     with pytest.raises(InputError, match=hint):
-        Benchmark.of(shipped("toy") | {"methods": [name]}, ROOT)
+        Benchmark(shipped("toy") | {"methods": [name]}, ROOT)
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     def pairs(**changes):
-        return Benchmark.of(shipped("toy") | changes, ROOT).fits_together("toy_rope_lift_smooth")
+        return Benchmark(shipped("toy") | changes, ROOT).fits_together("toy_rope_lift_smooth")
 
     # `baseline` takes a frame per step, `neuspring` ten: with two seeds each has one other in step.
     assert pairs(seeds=[0, 1]) == ()
     assert pairs(seeds=[0, 1, 2]) == (*(("baseline", k) for k in range(3)), *(("neuspring", k) for k in range(3)))
     assert pairs(seeds=[0, 1, 2], twins_per_launch=1) == ()
-    both = (Benchmark.of(shipped("toy") | {"seeds": [0, 1, 2], "twins_per_launch": most}, ROOT) for most in ("auto", 8))
-    on_gpu = [replace(one, on_gpu=True) for one in both]
-    assert [len(one.fits_together("toy_rope_lift_smooth")) for one in on_gpu] == [0, 6]
+    both = (Benchmark(shipped("toy") | {"seeds": [0, 1, 2], "twins_per_launch": most}, ROOT) for most in ("auto", 8))
+    for one, shared in zip(both, (0, 6), strict=True):
+        one.on_gpu = True
+        assert len(one.fits_together("toy_rope_lift_smooth")) == shared
     assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
     three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
     assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))
@@ -584,7 +585,7 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
 
 def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
     values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "released_search", "phystwin_released"], "seeds": [0]}
-    graph = Graph(Benchmark.of(values, ROOT))
+    graph = Graph(Benchmark(values, ROOT))
 
     def settings(stage: str, **job: str) -> dict[str, Any]:
         found = json.loads(graph.settings(STAGES[stage], SimpleNamespace(scenario="toy_rope_lift_smooth", seed="0", **job)))
@@ -603,15 +604,15 @@ def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
 
 
 def test_the_released_rows_have_the_released_search() -> None:
-    made = Benchmark.of({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
+    made = Benchmark({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
     for name, row in made.searches.items():
-        search = tables.search_of(made.config, row, name)
+        search = tables.with_search(made.config, row, name).search
         variables = config.plain(search.variables)
         assert {one["scale"] for name, one in variables.items() if name not in HANDS} == {"linear"}
         assert (search.lengths, search.polish_rounds, search.fixed) == ("meter", 0, ())
         assert search.variables.stiffness == config.Variable(0.0, 1e5, 3e4)
         assert search.variables.object_radius.start == 0.02
-    assert tables.search_of(made.config, made.searches["released_quirks"], "x").isolated_nodes == "allow"
+    assert tables.with_search(made.config, made.searches["released_quirks"], "x").search.isolated_nodes == "allow"
 
 
 def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
@@ -629,11 +630,11 @@ def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
 def test_methods_that_learn_nothing_stand_beside_on_own_recordings(source, methods):
     row = config.ScenarioRow(scenario="rope", source=source, category="rope", path="x", self_collision=False, ground=True)
     known = {name: Method(description="x", model="static") for name in ("static", "controller_lbs", "ours")}
-    assert tables._with_references(load(""), {"rope": row}, known).methods == methods
+    assert tables.with_references(load(""), {"rope": row}, known).methods == methods
     # A table without them has none, and none comes twice.
-    assert tables._with_references(load(""), {"rope": row}, {"ours": known["ours"]}).methods == ("ours",)
+    assert tables.with_references(load(""), {"rope": row}, {"ours": known["ours"]}).methods == ("ours",)
     every = replace(load(""), methods=("ours", "static", "controller_lbs"))
-    assert tables._with_references(every, {"rope": row}, known).methods == every.methods
+    assert tables.with_references(every, {"rope": row}, known).methods == every.methods
 
 
 def test_workers_on_several_machines_need_a_database_that_locks_across_them():
@@ -652,7 +653,7 @@ def test_only_takes_a_part_by_scenario_category_method_and_seed():
     all_of_it = {"scenarios": names, "methods": ["baseline", "clusters_2", "clusters_3"], "seeds": [0, 1, 2]}
 
     def chosen(only):
-        part = Benchmark.of(config_with(all_of_it | {"only": only}), ROOT).config
+        part = Benchmark(config_with(all_of_it | {"only": only}), ROOT).config
         return part.scenarios, part.methods, part.seeds
 
     assert chosen("category=rope method=clusters_* seed=0,2") == (tuple(names[:2]), ("clusters_2", "clusters_3"), (0, 2))
@@ -667,7 +668,7 @@ def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
         "compare_with": "baseline",
         "only": "method=search_only seed=1",
     }
-    made = Benchmark.of(config_with(part), ROOT)
+    made = Benchmark(config_with(part), ROOT)
     assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
     assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
 
@@ -683,7 +684,7 @@ def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
 )
 def test_a_part_that_is_not_there_is_explained(only, message):
     with pytest.raises(InputError, match=message):
-        Benchmark.of(config_with({"only": only}), ROOT)
+        Benchmark(config_with({"only": only}), ROOT)
 
 
 @pytest.mark.parametrize(
@@ -705,7 +706,7 @@ def test_a_part_that_is_not_there_is_explained(only, message):
 )
 def test_what_the_workflow_checks_first(changes, message):
     with pytest.raises(InputError) as error:
-        Benchmark.of(config_with(changes), ROOT)
+        Benchmark(config_with(changes), ROOT)
     assert message in str(error.value)
 
 

@@ -63,7 +63,7 @@ def test_a_plan_without_any_earlier_job_counts_jobs_alone():
 
 
 def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(tmp_path):
-    benchmark = Benchmark.of(config_with({"results": str(tmp_path), "methods": ["baseline"]}), ROOT)
+    benchmark = Benchmark(config_with({"results": str(tmp_path), "methods": ["baseline"]}), ROOT)
     rope, cloth = SimpleNamespace(seed=0, scenario="rope"), SimpleNamespace(scenario="cloth")
 
     def asked(wildcards, attempt, kind="cpu"):

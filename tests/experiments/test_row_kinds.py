@@ -24,7 +24,7 @@ SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth"]
 
 def benchmark(**changes: Any) -> Benchmark:
     values = config.read_yaml(ROOT / "config" / "data" / "toy.yaml") | {"methods": NAMES, "scenarios": SCENES, "studies": []}
-    return Benchmark.of(values | changes, ROOT)
+    return Benchmark(values | changes, ROOT)
 
 
 def job(name: str) -> SimpleNamespace:

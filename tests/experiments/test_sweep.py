@@ -72,13 +72,13 @@ def test_the_best_overlay_makes_the_best_trial_a_method_row(finished):
     folder, tune = finished
     values = BASE | {"scenarios": ["toy_rope_lift_smooth"], "methods": ["search_only"]}
     config.merge(values, config.read_yaml(folder / "best.yaml"))
-    bench = benchmark.Benchmark.of(values, Path(__file__).parents[2])
+    bench = benchmark.Benchmark(values, Path(__file__).parents[2])
     by_slot = slots(folder, tune)
     best = min(by_slot.values(), key=lambda slot: slot.trials[-1].value).trials[-1]
-    tuned = benchmark.fit_of(bench.config, bench.methods["baseline_small"], "baseline_small")
+    tuned = benchmark.with_method(bench.config, bench.methods["baseline_small"], "baseline_small").fit
     assert list(bench.methods) == ["baseline", "baseline_small"]
     assert (tuned.learning_rate, tuned.horizon, tuned.damping) == tuple(best.params[f"fit.{n}"] for n in NAMES)
-    assert benchmark.fit_of(bench.config, bench.methods["baseline"], "baseline") == settings().fit
+    assert benchmark.with_method(bench.config, bench.methods["baseline"], "baseline").fit == settings().fit
 
 
 NAMES = ("learning_rate", "horizon", "damping")

@@ -1,6 +1,5 @@
 # Checks the configuration before any job exists, and defines the helper functions of the rules.
 import atexit
-import dataclasses
 import gc
 import json
 import logging
@@ -16,7 +15,6 @@ from neuspring import config as settings
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import code_digest
 from neuspring.experiments import needs
-from neuspring.experiments.arguments import Arguments
 from neuspring.experiments.graph import Graph, one_of
 from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
@@ -58,7 +56,7 @@ POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
 GPU = int(
     CONFIG.device == "cuda" or (CONFIG.device == "auto" and (CLUSTER or bool(POOL)))
 )
-BENCHMARK = dataclasses.replace(BENCHMARK, on_gpu=bool(GPU))
+BENCHMARK.on_gpu = bool(GPU)
 GRAPH = Graph(BENCHMARK)
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
@@ -67,11 +65,9 @@ GPU_FIRST = 10 * GPU
 ENVIRONMENT = str(ROOT / "workflow" / "envs" / "neuspring.yaml")
 # Where jobs find the warm process of this run.
 WARM = Path(tempfile.gettempdir()) / f"neuspring-{uuid.uuid4().hex[:16]}" / "socket"
-TABLE_FOLDER = f"{RESULTS}/{CONFIG.tables}"
-TABLES = f"{TABLE_FOLDER}/summary.md"
-REPORT = f"{TABLE_FOLDER}/report.html"
-PERCEPTION_TABLE = f"{TABLE_FOLDER}/perception.md"
-ARGUMENTS = Arguments(BENCHMARK, ROOT)
+TABLES = f"{GRAPH.folder}/summary.md"
+REPORT = f"{GRAPH.folder}/report.html"
+PERCEPTION_TABLE = f"{GRAPH.folder}/perception.md"
 
 
 def job_prefix():

@@ -71,10 +71,10 @@ if workflow.is_main_process:
 def finish():
     end()
     messages.finished(
-        BENCHMARK, ARGUMENTS, GRAPH.logged_runs(), time.monotonic() - RUN.begun
+        GRAPH, time.monotonic() - RUN.begun
     )
 
 
 def give_up():
     end()
-    messages.failed(BENCHMARK, ARGUMENTS)
+    messages.failed(GRAPH)

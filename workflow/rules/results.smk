@@ -15,7 +15,7 @@ rule perception_table:
         mem_mb=NEEDS.memory("perception_table"),
         runtime=NEEDS.minutes("perception_table"),
     params:
-        arguments=ARGUMENTS.perception(GRAPH.judged(BENCHMARK.whole.scenarios)),
+        arguments=GRAPH.perception(),
         code=code_digest("neuspring.report.perception"),
     shell:
         common_job("perception-table {params.arguments:q} --output {output:q}")
@@ -35,7 +35,7 @@ rule tables:
         mem_mb=NEEDS.memory("tables"),
         runtime=NEEDS.minutes("tables"),
     params:
-        arguments=ARGUMENTS.tables(),
+        arguments=GRAPH.tables(),
         code=code_digest("neuspring.report.benchmark", "neuspring.report.gallery"),
     shell:
         common_job("tables {params.arguments:q}")
@@ -45,7 +45,7 @@ rule study:
     input:
         lambda wildcards: GRAPH.runs(BENCHMARK.methods_of(wildcards.study)),
     output:
-        f"{TABLE_FOLDER}/studies/{{study}}.md",
+        f"{GRAPH.folder}/studies/{{study}}.md",
     log:
         log_of("study", f"{CONFIG.tables}/{{study}}"),
     conda:
@@ -54,7 +54,7 @@ rule study:
         mem_mb=NEEDS.memory("study"),
         runtime=NEEDS.minutes("study"),
     params:
-        arguments=lambda wildcards: ARGUMENTS.study(wildcards.study),
+        arguments=lambda wildcards: GRAPH.study(wildcards.study),
         definition=lambda wildcards: json.dumps(
             settings.plain(BENCHMARK.studies[wildcards.study])
         ),
@@ -78,9 +78,8 @@ rule report:
         mem_mb=NEEDS.memory("report"),
         runtime=NEEDS.minutes("report"),
     params:
-        arguments=ARGUMENTS.report(),
-        templates=ARGUMENTS.template_digest(),
-        sweeps=ARGUMENTS.finished_sweeps(),
+        arguments=GRAPH.report(),
+        stamp=GRAPH.report_stamp(),
         code=code_digest("neuspring.report.page"),
     shell:
         common_job("report {params.arguments:q}")
@@ -139,5 +138,5 @@ for study_name in BENCHMARK.studies:
         name:
             study_name
         input:
-            f"{TABLE_FOLDER}/studies/{study_name}.md",
+            f"{GRAPH.folder}/studies/{study_name}.md",
             GRAPH.logged_runs(BENCHMARK.methods_of(study_name)),

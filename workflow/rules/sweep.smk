@@ -1,5 +1,5 @@
 # A sweep: workers share one Optuna study; each is a job, and the sweep is as long as the configuration says, however many there are.
-SWEEP = ARGUMENTS.sweep_folder
+SWEEP = GRAPH.sweep_folder
 if CONFIG.tune:
 
     rule tune:
@@ -21,8 +21,8 @@ if CONFIG.tune:
             mem_mb=NEEDS.memory("tune"),
             runtime=NEEDS.minutes("tune"),
         params:
-            settings=ARGUMENTS.sweep(),
-            rows=ARGUMENTS.tuned_rows(),
+            settings=GRAPH.sweep(),
+            rows=GRAPH.tuned_rows(),
             code=code_digest("neuspring.experiments.tuning.trial"),
         shell:
             common_job(
@@ -44,7 +44,7 @@ if CONFIG.tune:
             mem_mb=NEEDS.memory("sweep"),
             runtime=NEEDS.minutes("sweep"),
         params:
-            settings=ARGUMENTS.sweep(),
+            settings=GRAPH.sweep(),
             code=code_digest("neuspring.experiments.tuning.report"),
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")
@@ -74,4 +74,4 @@ if CONFIG.tune:
 
 rule sweep:
     input:
-        lambda wildcards: or_workflow_error(ARGUMENTS.sweep_targets),
+        lambda wildcards: or_workflow_error(GRAPH.sweep_targets),

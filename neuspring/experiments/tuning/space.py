@@ -12,8 +12,6 @@ import difflib
 import functools
 import itertools
 import math
-import types
-import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +23,7 @@ from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import canonical
 from neuspring.core.run_record import flat
-from neuspring.experiments.benchmark import fit_of, losses_of, quirks_of, read_methods, read_searches, search_of
+from neuspring.experiments.benchmark import read_methods, read_searches, with_method, with_search
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 """What a trial reads; observations are made before."""
@@ -57,15 +55,11 @@ class Plan:
         if method.oracle:
             raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
-        base = {name: config.plain(getattr(settings, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
-        base["fit"] = config.plain(fit_of(settings, method, tune.method))
-        base["search"] = config.plain(search_of(settings, row, method.search))
-        base["released_quirks"] = config.plain(quirks_of(settings, row, method.search))
-        base["losses"] = config.plain(losses_of(settings, row, method.search))
+        own = with_search(with_method(settings, method, tune.method), row, method.search)
+        base = {name: config.plain(getattr(own, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
         plan = cls(tune, method, row, base)
-        for name, dimension in tune.space.items():
+        for name in tune.space:
             plan._require_setting(name)
-            _require_kind(name, dimension)
         for values in plan._corners():
             plan.at(values, "tune.space, " + ", ".join(f"{name} = {value!r}" for name, value in values.items()))
         return plan
@@ -111,20 +105,34 @@ class Plan:
         """All settings of a trial under their dotted names."""
         return flat(self.base) | dict(values)
 
+    def is_whole(self, name: str) -> bool:
+        """Whether a setting takes whole numbers only."""
+        value, dimension = self.baseline[name], self.tune.space[name]
+        # A setting that may also be a number (null, auto) takes whole ones between whole ends.
+        return all(isinstance(one, int) for one in ([value] if isinstance(value, int | float) else [dimension.low, dimension.high]))
+
     def _require_setting(self, name: str) -> None:
         where, section = f"tune.space, {name}", name.partition(".")[0]
-        if name == CLUSTERS:
-            return
-        if section not in SECTIONS:
+        if name != CLUSTERS and section not in SECTIONS:
             raise InputError(
                 where, f"must begin with {', '.join(SECTIONS)}, or be {CLUSTERS}", None, _suggestion(section, SECTIONS)
             )
+        inside: Any = self.base
+        for part in name.split("."):
+            known = inside if isinstance(inside, dict) else {}
+            if part not in known:
+                raise InputError(where, f"{part} must be a setting", None, _suggestion(part, known))
+            inside = known[part]
+        if isinstance(inside, dict):
+            raise InputError(where, "must be one setting, not a section", list(inside))
         if name in FIXED:
             raise InputError(where, "must be the same in all trials: their losses are measured with it")
         if section == "fit" and self.method.fit is None:
             raise InputError(where, f"method {self.tune.method} has no first-order stage that would read it")
         if name.startswith("fit.field.") and self.method.fit != "field":
             raise InputError(where, f"method {self.tune.method} trains springs and reads no settings of a field")
+        if isinstance(self.tune.space[name].step, float) and self.is_whole(name):
+            raise InputError(f"{where}, step", "must be a whole number", self.tune.space[name].step)
 
     def _corners(self) -> Iterator[dict[str, Any]]:
         """The baseline, every end of every range by itself, then combinations of ends: all if they are few, else two."""
@@ -147,11 +155,6 @@ def labels(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: label(value) for name, value in values.items()}
 
 
-def is_whole(name: str) -> bool:
-    """Whether a setting takes whole numbers only."""
-    return name == CLUSTERS or float not in _kinds(_annotation(name))
-
-
 def holds(dimension: Dimension, value: Any) -> bool:
     """Whether a dimension can take a value."""
     if dimension.choices:
@@ -166,40 +169,6 @@ def holds(dimension: Dimension, value: Any) -> bool:
 
 def _ends(dimension: Dimension) -> list[Any]:
     return list(dimension.choices) or [dimension.low, dimension.high]
-
-
-def _require_kind(name: str, dimension: Dimension) -> None:
-    where, kinds = f"tune.space, {name}", {int} if name == CLUSTERS else _kinds(_annotation(name))
-    if dimension.choices:
-        return
-    if not kinds & {int, float}:
-        raise InputError(where, "is no number: choices are required", f"low {dimension.low}, high {dimension.high}")
-    for key in ("low", "high", "step"):
-        if float not in kinds and isinstance(value := getattr(dimension, key), float):
-            raise InputError(f"{where}, {key}", "must be a whole number", value)
-
-
-def _annotation(name: str) -> Any:
-    """The declared type of a setting. Raises InputError for unknown ones and for sections."""
-    where, kind = f"tune.space, {name}", Config
-    for part in name.split("."):
-        hints = typing.get_type_hints(kind, include_extras=True) if dataclasses.is_dataclass(kind) else {}
-        if part not in hints:
-            raise InputError(where, f"{part} must be a setting", None, _suggestion(part, hints))
-        kind = hints[part]
-    if dataclasses.is_dataclass(kind):
-        raise InputError(where, "must be one setting, not a section", [f.name for f in dataclasses.fields(kind)])
-    return kind
-
-
-def _kinds(annotation: Any) -> set[type]:
-    """The plain types that an annotation allows."""
-    origin, inside = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is typing.Annotated:
-        return _kinds(inside[0])
-    if origin in (typing.Union, types.UnionType):
-        return set().union(*map(_kinds, inside))
-    return set() if origin is not None else {annotation}
 
 
 def _suggestion(word: str, known: Any) -> str:

@@ -36,13 +36,13 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from neuspring.config import Config
-from neuspring.config.tuning import Dimension, Tune
+from neuspring.config.tuning import Tune
 from neuspring.core import provenance
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, canonical, now
 from neuspring.core.run_record import flat
-from neuspring.experiments.tuning.space import Plan, holds, is_whole, label, labels
+from neuspring.experiments.tuning.space import Plan, holds, label, labels
 from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
 
 DATABASE = "optuna.db"
@@ -207,15 +207,16 @@ def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
     return MedianOfStep(tune, warmup) if tune.pruner == "median" else NopPruner()
 
 
-def suggest(trial: Trial, name: str, dimension: Dimension) -> Any:
+def suggest(trial: Trial, name: str, plan: Plan) -> Any:
     """The trial's value of a setting."""
+    dimension = plan.tune.space[name]
     if dimension.choices:
         choices = [label(value) for value in dimension.choices]
         return dimension.choices[choices.index(trial.suggest_categorical(name, choices))]
     low, high, step, log = dimension.low, dimension.high, dimension.step, dimension.log
     assert low is not None
     assert high is not None
-    if is_whole(name):
+    if plan.is_whole(name):
         return trial.suggest_int(name, int(low), int(high), step=1 if step is None else int(step), log=log)
     return trial.suggest_float(name, float(low), float(high), step=step, log=log)
 
@@ -314,8 +315,8 @@ def _values(trial: Trial, plan: Plan) -> dict[str, Any]:
         values = plan.baseline
         for name, value in values.items():
             if holds(space[name], value):
-                suggest(trial, name, space[name])
+                suggest(trial, name, plan)
     else:
-        values = {name: suggest(trial, name, dimension) for name, dimension in space.items()}
+        values = {name: suggest(trial, name, plan) for name in space}
     trial.set_user_attr(VALUES, values)
     return values
