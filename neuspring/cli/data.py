@@ -168,6 +168,7 @@ def mask(
     from neuspring.data.capture import Capture
     from neuspring.perception import segment_sam2
     from neuspring.perception.marks import store
+    from neuspring.perception.marks.carry import carry_camera
     from neuspring.perception.marks.marks import MARKS, Marks
 
     read, path = Capture.load(capture), marks or capture / MARKS
@@ -182,7 +183,7 @@ def mask(
             raise InputError(f"{path}, cameras", f"camera {name} needs marks", sorted(marked.cameras))
     if not wanted:
         raise InputError(f"{path}, cameras", "a camera of the capture needs marks", sorted(marked.cameras))
-    made = store.Made.of(read)
+    made = store.MasksFile.of(read)
     for name in wanted:
         source = store.source_digest(read, name, marked.of(name), backend, own)
         if made.holds(read, name, source) and not again:
@@ -195,7 +196,7 @@ def mask(
                 carried = segment_sam2.carry(read, name, marked.of(name), segmentation.grounded_sam2, resolve_device(device))
             else:
                 bar = _bar(f"camera {name}")
-                carried = store.carry_camera(read, name, marked.of(name), segmentation.marks, progress=bar)
+                carried = carry_camera(read, name, marked.of(name), segmentation.marks, progress=bar)
             doubts = store.save_carried(read, name, carried, source, backend).doubt
             told = f"masks are in {capture / 'mask' / name}"
         print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")

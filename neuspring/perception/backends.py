@@ -1,4 +1,5 @@
-"""The backends of segmentation and tracking: `BACKENDS` declares them, and stages and workflow ask it.
+"""The backends of segmentation and tracking: `BACKENDS` declares them, and stages and workflow ask it. Masks of the capture itself
+and those from marks are made here.
 
 To add a backend: its module with the function `segment` or `track`; its name and its settings in neuspring/config/perception.py;
 its line here.
@@ -80,7 +81,7 @@ BACKENDS = {
         "opencv": Backend(module="neuspring.perception.track_opencv", section="opencv"),
         "cotracker3": Backend(module="neuspring.perception.track_cotracker", section="cotracker3", gpu=True),
         # The truth takes its count of points from the settings of opencv.
-        "truth": Backend(module="neuspring.perception.track_truth", section="opencv", truth=True),
+        "truth": Backend(module="neuspring.perception.judge", section="opencv", truth=True),
     },
 }
 

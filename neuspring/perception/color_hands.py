@@ -17,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.frames import gray
 
 CORNERS, LEAST, KEPT = 120, 6, 0.5
 """Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""
@@ -160,8 +161,7 @@ def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -
     """Gray image [H, W] uint8 of the hands alone."""
     if not capture.has(camera, frame):
         return np.full(labels.shape[1:], GRAY, np.uint8)
-    gray = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY)
-    return np.where(labels[frame] == HANDS, gray, GRAY).astype(np.uint8)
+    return np.where(labels[frame] == HANDS, gray(capture, camera, frame), GRAY).astype(np.uint8)
 
 
 def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:

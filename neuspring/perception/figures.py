@@ -11,6 +11,7 @@ import numpy as np
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.frames import frames_of, spread, write_png
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 FRAMES = 5
@@ -26,13 +27,13 @@ HAND_ARROW = 40.0
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
     """Frames of the video side by side: object tinted green, hands blue."""
     tiles = []
-    for frame in _frames(capture, camera):
+    for frame in spread(frames_of(capture, camera), FRAMES):
         image = capture.color(camera, frame).astype(float)
         for label, tint in TINTS.items():
             own = masks.labels[frame] == label
             image[own] = 0.5 * image[own] + 0.5 * tint
         tiles.append(image.astype(np.uint8))
-    return _save(tiles, path)
+    return write_png(path, np.hstack(tiles))
 
 
 def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path) -> Path:
@@ -43,7 +44,7 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
     shade = (hue - hue.min(initial=0.0)) / max(float(np.ptp(hue)) if count else 0.0, 1e-6)
     colors = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int).tolist()
     tiles = []
-    for frame in _frames(capture, camera):
+    for frame in spread(frames_of(capture, camera), FRAMES):
         image = np.ascontiguousarray(capture.color(camera, frame))
         recent = slice(max(frame - TRAIL, 0), frame + 1)
         for point, color in zip(shown, colors, strict=True):
@@ -52,13 +53,13 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
                 cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, color, 1, cv2.LINE_AA)
                 cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, color, -1, cv2.LINE_AA)
         tiles.append(image)
-    return _save(tiles, path)
+    return write_png(path, np.hstack(tiles))
 
 
 def hands_strip(capture: Capture, image: ImageObservations, path: Path) -> Path:
     """Frames of the video with the grip of each hand: its place, turn and size, and where it was."""
     tiles, camera = [], next(iter(capture.cameras))
-    for frame in _frames(capture, camera):
+    for frame in spread(frames_of(capture, camera), FRAMES):
         tile = np.ascontiguousarray(capture.color(camera, frame))
         for hand in range(image.hands):
             way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
@@ -67,7 +68,7 @@ def hands_strip(capture: Capture, image: ImageObservations, path: Path) -> Path:
             tip = way[-1] + np.round(size * np.array([np.cos(angle), np.sin(angle)])).astype(int)
             cv2.arrowedLine(tile, tuple(way[-1].tolist()), tuple(tip.tolist()), (255, 60, 60), 2, cv2.LINE_AA)
         tiles.append(tile)
-    return _save(tiles, path)
+    return write_png(path, np.hstack(tiles))
 
 
 def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) -> Path:
@@ -107,16 +108,3 @@ def _parts(prior: ShapePrior) -> list[tuple[np.ndarray, str, str]]:
     share = prior.facts.get("invented_share", float((~prior.seen).mean()))
     words = f"invented ({prior.backend}): {share:.0%} of the surface"
     return [(prior.vertices[prior.seen], "0.8", "seen by a camera"), (prior.vertices[~prior.seen], "#f0b070", words)]
-
-
-def _frames(capture: Capture, camera: str) -> list[int]:
-    """Frames that the camera has, spread over the video."""
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))]
-
-
-def _save(tiles: list[np.ndarray], path: Path) -> Path:
-    ok, data = cv2.imencode(".png", np.hstack(tiles)[..., ::-1])
-    assert ok, "a PNG of tiles can be encoded"
-    write_atomically(path, lambda temporary: temporary.write_bytes(data.tobytes()))
-    return path

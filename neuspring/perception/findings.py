@@ -7,6 +7,7 @@ on a table.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from neuspring.core.findings import Finding, Level, finding
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.plausible_masks import REMEDY, Shown, mask_findings
 from neuspring.data.plausible_world import Sample, depth_findings, hand_findings, place_findings, sampled
+from neuspring.perception.frames import frames_of, gray, spread
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 SAME_GRAY = 6
@@ -78,9 +80,8 @@ def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, f
 def shown_by(capture: Capture, camera: str, labels: np.ndarray) -> Shown:
     """Counts of labels [T, H, W], over the frames that the camera has."""
     shown = Shown(len(labels), (labels.shape[2], labels.shape[1]))
-    for frame in range(capture.frame_count):
-        if capture.has(camera, frame):
-            shown.see(frame, labels[frame])
+    for frame in frames_of(capture, camera):
+        shown.see(frame, labels[frame])
     return shown
 
 
@@ -92,10 +93,9 @@ def _median(values: Sequence[float] | np.ndarray) -> float:
 def _flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarray) -> float:
     """Pixels that change their label and not their color from one frame to the next, as part of object and hands."""
     flips = total = 0
-    for index in np.unique(np.linspace(0, max(len(frames) - 2, 0), min(PAIRS, max(len(frames) - 1, 0))).astype(int)):
-        here, there = frames[index], frames[index + 1]
-        gray = [cv2.cvtColor(np.ascontiguousarray(capture.color(camera, int(k))), cv2.COLOR_RGB2GRAY) for k in (here, there)]
-        still = cv2.blur(cv2.absdiff(*gray), (5, 5)) < SAME_GRAY
+    pairs = list(pairwise(frames.tolist()))
+    for here, there in spread(pairs, PAIRS) if pairs else []:
+        still = cv2.blur(cv2.absdiff(gray(capture, camera, here), gray(capture, camera, there)), (5, 5)) < SAME_GRAY
         flips += int((still & (labels[here] != labels[there])).sum())
         total += int((labels[here] > 0).sum())
     return flips / max(total, 1)

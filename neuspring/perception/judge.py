@@ -1,4 +1,7 @@
-"""Errors of perception on a synthetic capture: masks, tracks, lifted points, controllers and hull against the truth."""
+"""Synthetic captures, whose truth is known: errors of masks, tracks, lifted points, controllers and hull, and perfect tracks.
+
+The latter measure what perception costs; they are never a method's input otherwise.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from neuspring.config.perception import ShapePriorSettings
+from neuspring.config.perception import OpenCvTracking, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.synthetic.truth import Truth, at_points, under_pixels
+from neuspring.data.synthetic.truth import Truth, at_points, truth_of, under_pixels
+from neuspring.perception.frames import frames_of, overlap
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.perception.shape import visual_hull
-from neuspring.perception.track_truth import carried
+from neuspring.perception.track_opencv import Followed, choose
 
+DEPTH_TOLERANCE = 0.01
+"""m by which the depth image may differ from a point's depth for the point to count as seen."""
 MM = 1e3
 GRID = 0.003
 """m between the points on which volumes are compared."""
@@ -41,11 +48,11 @@ def judge(
 
 def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, float]:
     """Mean intersection over union with the true masks, over cameras and frames that show the thing."""
-    views = [(camera, frame) for camera in capture.cameras for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    views = [(camera, frame) for camera in capture.cameras for frame in frames_of(capture, camera)]
     facts = {}
     for name, label in (("object", OBJECT), ("hands", HANDS)):
         pairs = ((masks[camera].labels[frame] == label, capture.mask(camera, frame) == label) for camera, frame in views)
-        facts[f"mask_iou_{name}"] = float(np.mean([_overlap(own, true) for own, true in pairs if true.any()]))
+        facts[f"mask_iou_{name}"] = float(np.mean([overlap(own, true) for own, true in pairs if true.any()]))
     return facts
 
 
@@ -101,14 +108,9 @@ def hull_quality(
         vertices = np.concatenate([surface.vertices, hull.vertices])
         axes = [np.arange(low, high, GRID) for low, high in zip(vertices.min(axis=0), vertices.max(axis=0), strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        facts[f"hull_iou_{count}"] = _overlap(inside(hull, points), inside(surface, points))
+        facts[f"hull_iou_{count}"] = overlap(inside(hull, points), inside(surface, points))
         facts[f"hull_distance_{count}_mm"] = MM * _apart(hull.vertices, surface.vertices)
     return facts
-
-
-def _overlap(first: np.ndarray, second: np.ndarray) -> float:
-    """Intersection over union of two sets."""
-    return float((first & second).sum() / (first | second).sum())
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
@@ -123,3 +125,47 @@ def _spread(name: str, values: np.ndarray, unit: str) -> dict[str, float]:
     if not values.size:
         return {}
     return {f"{name}_median_{unit}": float(np.median(values)), f"{name}_p95_{unit}": float(np.percentile(values, 95))}
+
+
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
+    """Exact places [T, Q, 2] of up to `settings.points` pixels of the masks, and whether depth and mask show them there."""
+    truth, view = truth_of(capture), capture.cameras[camera]
+    start = choose(labels[0], settings.points, seed)
+    x, y = start.astype(int).T
+    material = under_pixels(truth, view, start)
+    traceable = (labels[0, y, x] == HANDS) | (material.face >= 0)
+    start, x, y = start[traceable], x[traceable], y[traceable]
+    own = labels[0, y, x]
+    in_hands = _with_nearest_hand(truth.hand_poses.astype(float), view.lift(start.astype(float), capture.depth(camera, 0)[y, x]))
+    pixels, distance = view.project(np.where((own == OBJECT)[:, None], material.places[:, traceable], in_hands))
+    visible = view.sees(pixels) & (distance > 0)
+    for frame, seen in enumerate(visible):
+        if capture.has(camera, frame):
+            x, y = np.round(pixels[frame, seen]).astype(int).T
+            near = np.abs(capture.depth(camera, frame)[y, x] - distance[frame, seen]) < DEPTH_TOLERANCE
+            seen[seen] = near & (labels[frame, y, x] == own[seen])
+        else:
+            seen[:] = False
+    pixels[0], visible[0] = start, True
+    return Followed(pixels.astype(np.float32), visible)
+
+
+def surface(capture: Capture) -> ShapePrior:
+    """The visible surface of frame 0."""
+    truth = truth_of(capture)
+    return ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
+
+
+def carried(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """[T, n, 3], m: where points [n, 3] of frame 0 go with a rigid body of poses [T, 7] (position, quaternion x y z w)."""
+    local = Rotation.from_quat(poses[0, 3:]).inv().apply(points - poses[0, :3])
+    return np.stack([Rotation.from_quat(pose[3:]).apply(local) + pose[:3] for pose in poses])
+
+
+def _with_nearest_hand(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[T, Q, 3], m: where points [Q, 3] of frame 0 go with the nearest of the hands, whose poses are [T, H, 7]."""
+    nearest = cKDTree(poses[0, :, :3]).query(points)[1]
+    places = np.zeros((len(poses), *points.shape))
+    for hand in range(poses.shape[1]):
+        places[:, nearest == hand] = carried(points[nearest == hand], poses[:, hand])
+    return places

@@ -221,12 +221,6 @@ def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.nd
     return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)
 
 
-def heights_above_table(camera: Camera, depth: np.ndarray, up_sign: float) -> np.ndarray:
-    """Height [H, W], m, above the table z = 0 of what an image of depth [H, W], m, shows; NaN where nothing was measured."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(float)
-    return np.where(depth > 0, up_sign * camera.lift(pixels, depth)[..., 2], np.nan)
-
-
 def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray, window: int) -> np.ndarray:
     """Median depth [n], m, of the pixels around (x, y) that belong to the same mask; (x, y) itself does."""
     reach = np.arange(window) - window // 2

@@ -6,6 +6,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Capture
+from neuspring.perception.frames import frames_of
 
 
 def require(capture: Capture) -> None:
@@ -22,7 +23,6 @@ def segment(capture: Capture, camera: str) -> np.ndarray:
     require(capture)
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
-    for frame in range(capture.frame_count):
-        if capture.has(camera, frame):
-            labels[frame] = capture.mask(camera, frame)
+    for frame in frames_of(capture, camera):
+        labels[frame] = capture.mask(camera, frame)
     return labels

@@ -7,8 +7,8 @@ import numpy as np
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
+from neuspring.perception.marks.carry import carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks
-from neuspring.perception.marks.store import carry_camera
 
 
 def require(capture: Capture) -> None:

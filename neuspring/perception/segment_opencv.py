@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import cv2
 import numpy as np
@@ -21,13 +20,14 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.perception.lift import heights_above_table
+from neuspring.perception.frames import frames_of, gray, heights, spread
+from neuspring.perception.marks.colors import bins_of, count, lab_of
 from neuspring.perception.marks.start import solve
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""
 SAMPLED_FRAMES = 24
-"""How many frames the histograms are made from."""
+"""How many frames the histograms are made from, and from which it is learned which pixels change."""
 BORDER = 0.08
 """Part of the image, at each side, that is taken for the table."""
 SMOOTHING = 1.0
@@ -57,8 +57,6 @@ THIN_HAND_PIECE = 0.03
 """HAND_PIECE where the object is a thin rope: no part of it is as large as what is seen of a hand."""
 THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
 """Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
-SAMPLED = 24
-"""Frames from which it is learned which pixels change."""
 CHANGES = 24
 """Range of gray over the video from which a pixel changes."""
 MOVING = 0.1
@@ -69,21 +67,6 @@ BREAK = 0.03
 """Step of depth, m, that divides pieces which touch in the image alone."""
 BORDER_RUN = 4
 """Pixels at the image's border from which a piece reaches it."""
-
-
-@dataclass(frozen=True)
-class Palette:
-    """Log ratios of the probabilities of colors, per bin."""
-
-    rise: np.ndarray
-    """What rises, to the table."""
-    hand: np.ndarray
-    """Hands, to the object."""
-
-    @classmethod
-    def of(cls, table: np.ndarray, risen: np.ndarray, hands: np.ndarray, body: np.ndarray) -> Self:
-        """From histograms."""
-        return cls(_log_probability(risen) - _log_probability(table), _log_probability(hands) - _log_probability(body))
 
 
 def require(capture: Capture) -> None:
@@ -97,31 +80,32 @@ def require(capture: Capture) -> None:
 def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.ndarray:
     """Labels [T, H, W]. Raises InputError without depth, or where nothing rises above the table."""
     require(capture)
-    palette = learn(capture, camera, settings)
+    rise, hand = learn(capture, camera, settings)
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
-    for frame in range(capture.frame_count):
-        if capture.has(camera, frame):
-            labels[frame] = _frame(capture, camera, frame, palette, settings)
+    for frame in frames_of(capture, camera):
+        labels[frame] = _frame(capture, camera, frame, rise, hand, settings)
     return sort_pieces(capture, camera, labels, settings)
 
 
-def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palette:
-    """The colors of table, risen things, hands and object, from frames of the whole video.
+def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
+    """Log ratios of the probabilities of colors [bins], from frames of the whole video: of what rises to the table's, and of hands
+    to the object's.
 
     Raises InputError where nothing rises above the table. Without the color of hands all that rises is the object.
     """
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
     table, above = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
     views = []
-    for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).astype(int)):
-        image, height = capture.color(camera, frames[index]), _heights(capture, camera, frames[index])
-        risen = (height > settings.height) & _region(capture, camera, frames[index], settings)
+    for frame in spread(frames_of(capture, camera), SAMPLED_FRAMES):
+        image, height = capture.color(camera, frame), heights(capture, camera, capture.depth(camera, frame))
+        risen = (height > settings.height) & _region(capture, camera, frame, settings)
         views.append((image, risen))
-        above += _count(_bins(image)[risen])
-        edge = _border(risen.shape) & ~(height > settings.height / 2)
+        above += count(_bins(image), risen, BINS)
+        edge = ~(height > settings.height / 2)
+        rows, columns = (max(int(BORDER * size), 2) for size in edge.shape)
+        edge[rows:-rows, columns:-columns] = False
         for shade in SHADES:
-            table += _count(_bins((shade * image).astype(np.uint8))[edge])
+            table += count(_bins((shade * image).astype(np.uint8)), edge, BINS)
     where = f"{capture.folder}, camera {camera}"
     if not above.sum():
         raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
@@ -129,9 +113,9 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> Palett
     if not hands.sum():
         skin = f"hue in {list(settings.hand_hue)} degrees, chroma in {list(settings.hand_chroma)} (Lab)"
         print(f"{where}: nothing above the table has the color of hands ({skin}); all of it is the object", flush=True)
-    first = Palette.of(table, above, hands, body)
-    hands, body = _divide([(image, risen, first.hand[_bins(image)] > 0) for image, risen in views], settings)
-    return Palette.of(table, above, hands, body)
+    first = _log_probability(hands) - _log_probability(body)
+    hands, body = _divide([(image, risen, first[_bins(image)] > 0) for image, risen in views], settings)
+    return _log_probability(above) - _log_probability(table), _log_probability(hands) - _log_probability(body)
 
 
 def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
@@ -139,33 +123,31 @@ def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: Op
     hands, body = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
     for image, risen, like_hand in views:
         labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8), settings)
-        hands += _count(_bins(image)[labels == HANDS])
-        body += _count(_bins(image)[labels == OBJECT])
+        hands += count(_bins(image), labels == HANDS, BINS)
+        body += count(_bins(image), labels == OBJECT, BINS)
     return hands, body
 
 
-def _heights(capture: Capture, camera: str, frame: int) -> np.ndarray:
-    return heights_above_table(capture.cameras[camera], capture.depth(camera, frame), capture.description.up_sign)
-
-
-def _frame(capture: Capture, camera: str, frame: int, palette: Palette, settings: OpenCvSegmentation) -> np.ndarray:
-    """Labels [H, W] of one frame."""
+def _frame(
+    capture: Capture, camera: str, frame: int, rise: np.ndarray, hand: np.ndarray, settings: OpenCvSegmentation
+) -> np.ndarray:
+    """Labels [H, W] of one frame, by the log ratios that `learn` gives."""
     image = capture.color(camera, frame)
-    bins, height = _bins(image), _heights(capture, camera, frame)
-    ratio = cv2.GaussianBlur(palette.rise[bins], (0, 0), 1.0)
+    bins, height = _bins(image), heights(capture, camera, capture.depth(camera, frame))
+    ratio = cv2.GaussianBlur(rise[bins], (0, 0), 1.0)
     flat = np.nan_to_num(height, nan=0.0) < settings.height
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
     region = _region(capture, camera, frame, settings)
     seeds &= region
     if settings.thin:
-        foreground = _thin(image, palette.rise[bins], height, settings) & region
+        foreground = _thin(image, rise[bins], height, settings) & region
     else:
         seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
         foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) & region if seeds.any() else seeds
     foreground |= _holes(foreground)
-    hand = cv2.GaussianBlur(palette.hand[bins], (0, 0), DECISION) > 0
-    labels = np.where(foreground, np.where(hand, HANDS, OBJECT), 0).astype(np.uint8)
+    in_hand = cv2.GaussianBlur(hand[bins], (0, 0), DECISION) > 0
+    labels = np.where(foreground, np.where(in_hand, HANDS, OBJECT), 0).astype(np.uint8)
     return _slim(_tidy(labels, settings)) if settings.thin else _tidy(labels, settings)
 
 
@@ -202,7 +184,7 @@ def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: Op
     odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
     high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
     logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
-    return np.asarray(solve(logs, _lab(image), THIN_SMOOTHNESS)[1] > 0.5)
+    return np.asarray(solve(logs, lab_of(image), THIN_SMOOTHNESS)[1] > 0.5)
 
 
 def _slim(labels: np.ndarray) -> np.ndarray:
@@ -256,9 +238,9 @@ def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     """Specks, and pieces of hand color much smaller than the hand, become what surrounds them: nothing, or the other label."""
     tidy = labels.copy()
     for label, share in ((HANDS, THIN_HAND_PIECE if settings.thin else HAND_PIECE), (OBJECT, 0.0)):
-        count, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
+        _, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
-        least = max(SMALLEST * labels.size, share * areas.max()) if count > 1 else 0.0
+        least = max(SMALLEST * labels.size, share * areas.max(initial=0))
         for piece in 1 + np.flatnonzero(areas < least):
             own = pieces == piece
             around = cv2.dilate(own.astype(np.uint8), SPECK).astype(bool) & ~own
@@ -270,36 +252,19 @@ def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
 
 def _skin(image: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
     """Where hue and chroma are those of hands [H, W]."""
-    a, b = _lab(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
+    a, b = lab_of(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
     hue, chroma = np.degrees(np.arctan2(b, a)), np.hypot(a, b)
     (least_hue, most_hue), (least_chroma, most_chroma) = settings.hand_hue, settings.hand_chroma
     return np.asarray((least_hue < hue) & (hue < most_hue) & (least_chroma < chroma) & (chroma < most_chroma))
 
 
-def _lab(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
-
-
 def _bins(image: np.ndarray) -> np.ndarray:
-    """The bin of every pixel's color [H, W]."""
-    indices = _lab(image).astype(int) * BINS // 256
-    return np.asarray(np.ravel_multi_index(tuple(indices.transpose(2, 0, 1)), BINS))
-
-
-def _count(bins: np.ndarray) -> np.ndarray:
-    return np.bincount(bins, minlength=int(np.prod(BINS))).astype(float)
+    return bins_of(lab_of(image), BINS)
 
 
 def _log_probability(counts: np.ndarray) -> np.ndarray:
     blurred = gaussian_filter(counts.reshape(BINS), SMOOTHING).ravel()
     return np.asarray(np.log(blurred / max(blurred.sum(), 1.0) + FLOOR))
-
-
-def _border(shape: tuple[int, ...]) -> np.ndarray:
-    edge = np.ones(shape, dtype=bool)
-    rows, columns = (max(int(BORDER * size), 2) for size in shape)
-    edge[rows:-rows, columns:-columns] = False
-    return edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,9 +287,7 @@ def sort_pieces(capture: Capture, camera: str, labels: np.ndarray, settings: Ope
         return labels
     result, changes = labels.copy(), changing(capture, camera)
     chosen: np.ndarray | None = None
-    for frame in range(len(labels)):
-        if not capture.has(camera, frame):
-            continue
+    for frame in frames_of(capture, camera):
         own = pieces_of(labels[frame], capture.depth(camera, frame), changes)
         if settings.sleeves:
             sleeves = [piece for piece in own if piece.at_border and piece.at_hand and piece.moving > MOVING]
@@ -344,11 +307,8 @@ def sort_pieces(capture: Capture, camera: str, labels: np.ndarray, settings: Ope
 
 def changing(capture: Capture, camera: str) -> np.ndarray:
     """Which pixels [H, W] bool change during the video: their range of gray, a little blurred."""
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    grays = []
-    for index in np.unique(np.linspace(0, len(frames) - 1, SAMPLED).astype(int)):
-        gray = cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frames[index])), cv2.COLOR_RGB2GRAY)
-        grays.append(cv2.GaussianBlur(gray, (0, 0), 1.0))
+    frames = spread(frames_of(capture, camera), SAMPLED_FRAMES)
+    grays = [cv2.GaussianBlur(gray(capture, camera, frame), (0, 0), 1.0) for frame in frames]
     return np.asarray(np.ptp(np.stack(grays), axis=0) > CHANGES)
 
 
@@ -357,21 +317,20 @@ def pieces_of(labels: np.ndarray, depth: np.ndarray, changes: np.ndarray) -> lis
     own = labels == OBJECT
     if not own.any():
         return []
-    kernel = np.ones((3, 3), np.uint8)
     # Unknown depth divides nothing.
-    far = cv2.dilate(np.where(depth > 0, depth, 0.0).astype(np.float32), kernel)
-    near = cv2.erode(np.where(depth > 0, depth, 100.0).astype(np.float32), kernel)
+    far = cv2.dilate(np.where(depth > 0, depth, 0.0).astype(np.float32), SPECK)
+    near = cv2.erode(np.where(depth > 0, depth, 100.0).astype(np.float32), SPECK)
     whole = own & ~(far - near > BREAK)
-    count, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
-    if count == 1:
+    number_of, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
+    if number_of == 1:
         whole = own
-        count, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
+        number_of, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
     rows, columns = distance_transform_edt(~whole, return_distances=False, return_indices=True)
     numbers = np.where(own, numbers[rows, columns], 0)
     hands = labels == HANDS
     away = cv2.distanceTransform((~hands).astype(np.uint8), cv2.DIST_L2, 5) if hands.any() else np.full(labels.shape, np.inf)
     pieces = []
-    for number in range(1, count):
+    for number in range(1, number_of):
         mask = numbers == number
         area = int(mask.sum())
         rim = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())

@@ -10,7 +10,7 @@ With a user's marks (`carry`) SAM 2 starts from the masks of the marked frames, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,9 @@ from neuspring.config.perception import GroundedSam2, MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.marks.carry import Carried, Cues, doubt_of, frame_mask
+from neuspring.perception.frames import frames_of
+from neuspring.perception.marks.carry import CameraFilm, Carried, Cues, doubt_of, frame_mask, over_capture
 from neuspring.perception.marks.marks import Mark
-from neuspring.perception.marks.store import film_of
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Detection:
 def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, models: Models | None = None) -> np.ndarray:
     """Labels [T, H, W]. Raises InputError where weights are missing or the prompt finds no object or no hand."""
     models = models or load(settings, device)
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    frames = frames_of(capture, camera)
     images = [capture.color(camera, frame) for frame in frames]
     prompt = settings.prompt or capture.description.category
     detections = detect(images[0], prompt, settings, models, device)
@@ -74,34 +74,27 @@ def carry(
     Doubt comes from how unsure SAM 2 is at borders and from jumps of areas. Raises InputError where weights are missing or marks do
     not fit.
     """
-    film = film_of(capture, camera)
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
-    place = {frame: index for index, frame in enumerate(frames)}
-    absent = [mark.frame for mark in marks if mark.frame not in place]
-    if absent or not any(mark.label == "object" for mark in marks):
-        rule = "an object must be marked, and marks must lie on frames that the camera has"
-        raise InputError(f"marks of camera {camera}", rule, absent or sorted({mark.label for mark in marks}))
-    models = models or load(settings, device, words=False)
-    starts: dict[int, np.ndarray] = {}
-    for frame in sorted({mark.frame for mark in marks if mark.label != "ignore"}):
-        own = [replace(mark, frame=place[frame]) for mark in marks if mark.frame == frame]
-        starts[place[frame]] = frame_mask(film, place[frame], own, MarksSegmentation())
-    images = [film.color(index) for index in range(film.count)]
-    labels = np.zeros((film.count, *images[0].shape[:2]), np.uint8)
-    unsure = np.zeros((film.count, 2))
-    # Hands come last: they are in front of what they hold.
-    for column, label in enumerate((OBJECT, HANDS)):
-        masks = {index: start == label for index, start in starts.items() if (start == label).any()}
-        for index, logits in carry_masks(images, masks, models, device).items():
-            labels[index][logits > 0] = label
-            near = np.abs(logits) < np.quantile(np.abs(logits[logits > 0]), 0.2) if (logits > 0).any() else logits > 0
-            unsure[index, column] = float((1 / (1 + np.exp(np.abs(logits[near])))).mean()) if near.any() else 0.0
-    doubt = doubt_of(labels, [Cues(unsure=float(own.max())) for own in unsure])
-    whole = np.zeros((capture.frame_count, *images[0].shape[:2]), np.uint8)
-    whole[frames] = labels
-    doubts = np.zeros(capture.frame_count)
-    doubts[frames] = doubt
-    return Carried(whole, doubts)
+    if not any(mark.label == "object" for mark in marks):
+        labels = sorted({mark.label for mark in marks})
+        raise InputError(f"marks of camera {camera}", "an object must be marked in one frame or more", labels)
+
+    def work(film: CameraFilm, own: list[Mark]) -> Carried:
+        networks = models or load(settings, device, words=False)
+        frames = sorted({mark.frame for mark in own if mark.label != "ignore"})
+        starts = {frame: frame_mask(film, frame, own, MarksSegmentation()) for frame in frames}
+        images = [film.color(index) for index in range(film.count)]
+        labels = np.zeros((film.count, *images[0].shape[:2]), np.uint8)
+        unsure = np.zeros((film.count, 2))
+        # Hands come last: they are in front of what they hold.
+        for column, label in enumerate((OBJECT, HANDS)):
+            masks = {index: start == label for index, start in starts.items() if (start == label).any()}
+            for index, logits in carry_masks(images, masks, networks, device).items():
+                labels[index][logits > 0] = label
+                near = np.abs(logits) < np.quantile(np.abs(logits[logits > 0]), 0.2) if (logits > 0).any() else logits > 0
+                unsure[index, column] = float((1 / (1 + np.exp(np.abs(logits[near])))).mean()) if near.any() else 0.0
+        return Carried(labels, doubt_of(labels, [Cues(unsure=float(both.max())) for both in unsure]))
+
+    return over_capture(capture, camera, marks, work)
 
 
 def carry_masks(images: list[np.ndarray], masks: dict[int, np.ndarray], models: Models, device: str) -> dict[int, np.ndarray]:

@@ -15,6 +15,7 @@ import torch
 from neuspring.config.perception import CoTracker3
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
+from neuspring.perception.frames import frames_of
 from neuspring.perception.track_opencv import Followed, choose
 
 WEIGHTS = "scaled_online.pth"
@@ -36,7 +37,7 @@ def track(
     if not len(start):
         return result
     model = (load(settings) if model is None else model).to(device)
-    frames = [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
+    frames = frames_of(capture, camera)
     video = torch.from_numpy(np.stack([capture.color(camera, frame) for frame in frames])).permute(0, 3, 1, 2)[None]
     queries = torch.from_numpy(np.concatenate([np.zeros((len(start), 1)), start], axis=1)[None]).float().to(device)
     places, seen = _windows(model, video, queries, device)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import NOTHING, Capture
+from neuspring.perception.frames import gray
 
 LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""
@@ -221,11 +222,6 @@ def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Whether points (x, y) [n, 2] lie in an image of a shape [n]."""
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
-
-
-def gray(capture: Capture, camera: str, frame: int) -> np.ndarray:
-    """The gray image [H, W] uint8."""
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY))
 
 
 def equalized(image: np.ndarray) -> np.ndarray:

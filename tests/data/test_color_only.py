@@ -19,7 +19,8 @@ from neuspring.perception.annotate.annotations import Annotations, Click, Point
 from neuspring.perception.annotate.tracks import Pointing, tracks_of
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.findings import look_at_masks, mask_facts
-from neuspring.perception.marks.store import film_of, save_masks
+from neuspring.perception.marks.carry import CameraFilm
+from neuspring.perception.marks.store import save_masks
 from tests.support.board import BOARD, LENS, board_image
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses
 from tests.support.findings import holds, of_level, serious
@@ -177,7 +178,7 @@ def test_segmentation_by_height_is_refused_at_the_start(capture):
     ):
         with pytest.raises(InputError, match=r"segmentation by opencv needs depth.*marks .*, given or grounded_sam2"):
             refuse()
-    film = film_of(capture, "0")
+    film = CameraFilm(capture, "0")
     assert film.depth(0) is None and film.height(0) is None
 
 

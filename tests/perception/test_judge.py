@@ -13,8 +13,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.synthetic import make as making
 from neuspring.data.synthetic.truth import at_points, truth_of, truth_path, under_pixels
-from neuspring.perception import track_truth
-from neuspring.perception.judge import judge
+from neuspring.perception.judge import judge, track
 from neuspring.perception.lift import lift
 from neuspring.perception.results import Masks, PixelTracks
 from tests.support.filmed import film
@@ -36,7 +35,7 @@ def perfect(tmp_path_factory):
     masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
     tracks = {}
     for camera in capture.cameras:
-        exact = track_truth.track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
+        exact = track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
         tracks[camera] = PixelTracks(pixels=exact.pixels, visible=exact.visible, backend="truth")
     lifted = lift(capture, masks, tracks, SETTINGS)
     return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)

@@ -10,7 +10,7 @@ from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere
 from neuspring.data.synthetic.render import HAND
-from neuspring.perception import shape, shape_mesh
+from neuspring.perception import shape
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import assemble, inside, on_table, structure, voxel_for
 from tests.support.still import overlap, still, tracked
@@ -63,7 +63,7 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place_wherever_the_object_lies(tm
     _, _, cloud, truth = film(tmp_path, 3)
     far = np.array([1.0, 0.5, 0.0])
     other = 7.0 * Rotation.from_rotvec([1.0, 0.4, -2.0]).apply(truth.vertices) + [3.0, -2.0, 1.0]
-    placed, rms = shape_mesh.place(other, truth.faces, cloud + far)
+    placed, rms = shape.place(other, truth.faces, cloud + far)
     assert rms < 0.003
     assert overlap(ShapePrior(vertices=placed - far, faces=truth.faces, backend="mesh"), truth) > 0.9
 
@@ -71,7 +71,7 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place_wherever_the_object_lies(tm
 def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3)
     bent = truth.vertices + np.array([0, 0, 0.008]) * np.sin(np.pi * (truth.vertices[:, :1] / 0.1))
-    result = shape_mesh.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings())
+    result = shape.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings())
     before, after = (np.median(cKDTree(v).query(cloud)[0]) for v in (bent, result))
     assert after < 0.75 * before
 

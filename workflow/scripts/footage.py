@@ -27,9 +27,9 @@ from neuspring.perception import track_opencv
 from neuspring.perception.annotate.annotations import Click
 from neuspring.perception.annotate.follow import GrayImages
 from neuspring.perception.annotate.follow import follow as follow_click
+from neuspring.perception.frames import overlap
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import Marks
-from neuspring.perception.marks.store import overlap
 from workflow.scripts.masks import MARKS, Frames
 
 RIM = 3.0

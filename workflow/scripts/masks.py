@@ -20,9 +20,10 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.marks.carry import Carried, carry
+from neuspring.perception.frames import overlap
+from neuspring.perception.marks.carry import Carried, carry, carry_camera
 from neuspring.perception.marks.marks import Mark, Marks
-from neuspring.perception.marks.store import carry_camera, overlap, overlay
+from neuspring.perception.marks.store import overlay
 
 MARKS = Path(__file__).parents[2] / "tests" / "data" / "marks"
 MOST_MARKS = 5

@@ -18,7 +18,8 @@ import numpy as np
 
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.annotations import Click
-from neuspring.perception.track_opencv import LEVELS, equalized, gray, inside, likeness, lucas_kanade
+from neuspring.perception.frames import gray
+from neuspring.perception.track_opencv import LEVELS, equalized, inside, likeness, lucas_kanade
 
 WINDOW = 13
 """Side of the Lucas-Kanade window, pixels: a point alone has no neighbors that vote, so it needs more texture than one of many."""

@@ -15,9 +15,9 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.shared import Document, Job, Report
-from neuspring.perception.marks.carry import Carried, frame_mask
+from neuspring.perception.marks.carry import CameraFilm, Carried, carry_camera, frame_mask
 from neuspring.perception.marks.marks import MARKS, Marks
-from neuspring.perception.marks.store import Made, carry_camera, film_of, save_carried, source_digest
+from neuspring.perception.marks.store import MasksFile, save_carried, source_digest
 
 MOST_MARKS = 2000
 """Marks of a camera: a limit for what a browser may send."""
@@ -60,7 +60,7 @@ class Masks:
                 }
                 for camera, result in self._results.items()
             }
-        made = Made.of(self.capture).cameras
+        made = MasksFile.of(self.capture).cameras
         saved = {camera: list(made[camera].doubt) if camera in made else [] for camera in self.saved_cameras()}
         return {"revision": revision, "marks": plain(marks), "job": self.job.plain(), "carried": carried, "saved": saved}
 
@@ -84,7 +84,7 @@ class Masks:
         # A film lacks the frames that its camera missed.
         place = sum(self.capture.has(camera, before) for before in range(frame))
         marks = [replace(mark, frame=place) for mark in self.document.read()[1].of(camera) if mark.frame == frame]
-        return frame_mask(film_of(self.capture, camera), place, marks, self.settings)
+        return frame_mask(CameraFilm(self.capture, camera), place, marks, self.settings)
 
     def carry(self, cameras: Sequence[str]) -> None:
         """Begin to carry the marks of cameras through the video. Raises InputError, Busy."""

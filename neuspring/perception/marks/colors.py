@@ -49,10 +49,10 @@ def lab_of(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
 
 
-def bins_of(lab: np.ndarray) -> np.ndarray:
-    """The bin of every pixel [H, W]."""
-    first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(BINS))
-    return np.asarray((first * BINS[1] + second) * BINS[2] + third)
+def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
+    """The bin of every pixel [H, W], of so many bins of L, a and b."""
+    first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(bins))
+    return np.asarray((first * bins[1] + second) * bins[2] + third)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +72,9 @@ class Colors:
         return cls(counts, np.log((1 - UNSEEN) * share / VOLUME + UNSEEN / SPREAD).astype(np.float32))
 
 
-def count(bins: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """How often each color is seen [bins] where a mask [H, W] is true."""
-    return np.bincount(bins[where], minlength=int(np.prod(BINS))).astype(float)
+def count(seen: np.ndarray, where: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
+    """How often each color is seen [bins] where a mask [H, W] is true; `seen` [H, W] are the bins of pixels."""
+    return np.bincount(seen[where], minlength=int(np.prod(bins))).astype(float)
 
 
 def mixed(parts: list[tuple[float, np.ndarray]]) -> np.ndarray:

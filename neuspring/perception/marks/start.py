@@ -101,7 +101,7 @@ def _softmax(logs: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class MarkedFrame:
     """A marked frame that is solved."""
 
     probability: np.ndarray
@@ -110,7 +110,7 @@ class Start:
     """Counts of the colors of nothing, object and hands, [bins] each."""
 
     @classmethod
-    def of(cls, lab: np.ndarray, probability: np.ndarray, seeds: Seeds) -> Start:
+    def of(cls, lab: np.ndarray, probability: np.ndarray, seeds: Seeds) -> MarkedFrame:
         """From probabilities that are known: counts the colors."""
         labels = probability.argmax(axis=0).astype(np.uint8)
         return cls(probability, tuple(counts_of(lab, bins_of(lab), labels, seeds.certain)))
@@ -126,7 +126,7 @@ def start(
     seeds: Seeds,
     height: np.ndarray | None = None,
     background: Background | None = None,
-) -> Start:
+) -> MarkedFrame:
     """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, and the background."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
@@ -143,7 +143,7 @@ def start(
         probability = solve(logs.astype(np.float32), lab)
         labels = tidy(probability.argmax(axis=0).astype(np.uint8), seeds)
     probability[:, labels != probability.argmax(axis=0)] = np.array([1.0, 0.0, 0.0])[:, None]
-    return Start.of(lab, probability, seeds)
+    return MarkedFrame.of(lab, probability, seeds)
 
 
 def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np.ndarray) -> list[np.ndarray]:

@@ -42,7 +42,7 @@ LEAST_ENTERING = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class CarriedFrame:
     """A frame that is solved."""
 
     probability: np.ndarray
@@ -78,7 +78,7 @@ class Pass:
         self.running = [np.zeros_like(own) for own in self.first]
         self._learn(None)
 
-    def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> Step:
+    def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> CarriedFrame:
         """The next frame, Lab [H, W, 3], which becomes the last one; with its depth, m, and its marks, if there are any."""
         window = self.window(lab, seeds)
         near, before = lab[window], self.probability[(slice(None), *window)]
@@ -100,7 +100,7 @@ class Pass:
         chosen = np.take_along_axis(color, solved.argmax(axis=0)[None], axis=0)[0]
         flow_doubt, misfit = np.zeros(lab.shape[:2], np.float32), np.zeros(lab.shape[:2], np.float32)
         flow_doubt[window], misfit[window] = doubted, color.max(axis=0) - chosen
-        return Step(self.probability, flow_doubt, misfit)
+        return CarriedFrame(self.probability, flow_doubt, misfit)
 
     def window(self, lab: np.ndarray, seeds: Seeds | None) -> tuple[slice, slice]:
         """The part of the image that is worked on: around what was there, what comes in from the border, and marks."""

@@ -9,8 +9,8 @@ from neuspring import config
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.make import make
+from neuspring.perception.frames import overlap
 from neuspring.perception.marks.marks import Mark
-from neuspring.perception.marks.store import overlap
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
 from tests.support.served import TOKEN, Client, served

@@ -11,7 +11,7 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.perception.annotate.masks import Masks
-from neuspring.perception.marks.store import Made
+from neuspring.perception.marks.store import MasksFile
 from tests.support.moving import CORNER, FRAMES, SHIFT, SIDE, moving
 
 MISSING = (1, 2)
@@ -65,7 +65,7 @@ def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
     assert (capture.folder / "mask_0.png").exists()
     later = page_of(capture).plain()
     assert len(later["saved"]["0"]) == FRAMES
-    assert Made.of(capture).cameras["0"].backend == "marks"
+    assert MasksFile.of(capture).cameras["0"].backend == "marks"
     assert not capture.path("mask", "0", MISSING[0]).exists()
     assert overlap(capture.mask("0", 5) == 1, square(5)) > 0.85
     assert not json.loads((capture.folder / "capture.json").read_text())["masks"]  # camera "covered" has none

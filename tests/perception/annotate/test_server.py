@@ -10,7 +10,7 @@ from neuspring.data.capture import TRACKS, Capture, write_tracks
 from neuspring.perception.annotate import tracks
 from neuspring.perception.annotate.annotations import ANNOTATIONS
 from neuspring.perception.annotate.server import COLORS, Server, overlay_png
-from neuspring.perception.marks.store import Made
+from neuspring.perception.marks.store import MasksFile
 from tests.support.moving import FRAMES, moving, truth
 from tests.support.painted import Painted
 from tests.support.served import decoded, served
@@ -134,7 +134,7 @@ def test_marks_are_carried_looked_at_and_saved(client, capture):
     status, answer = client.post("/api/masks/save")
     assert (status, answer) == (200, {"cameras": ["0"]})
     assert [capture.mask("0", frame).sum() for frame in (0, FRAMES - 1)] == [21 * 21] * 2
-    assert Made.of(capture).cameras["0"].backend == "marks"
+    assert MasksFile.of(capture).cameras["0"].backend == "marks"
     assert client.get("/api/masks")["carried"]["0"]["saved"]
     write_marks(client, HAND)
     assert client.get("/api/masks")["carried"]["0"]["stale"]

@@ -11,10 +11,12 @@ from neuspring.cli.main import main
 from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception import frames
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.marks import store
+from neuspring.perception.marks.carry import CameraFilm, Carried
 from neuspring.perception.marks.marks import Marks
-from neuspring.perception.marks.store import Made, MadeCamera, film_of, has_masks, save_masks
+from neuspring.perception.marks.store import MasksFile, has_masks, save_masks
 from tests.support.filmed import FRAMES, film
 from tests.support.marked import mark, overlap
 
@@ -63,7 +65,7 @@ def test_marks_become_the_masks_of_a_capture(folder, capsys):
                 assert overlap(capture.mask(camera, frame), truth, HANDS) > 0.8, (camera, frame)
     assert not capture.path("mask", "1", 3).exists()
     assert cv2.imread(str(folder / "mask_0.png")).shape[1] == 4 * 160
-    assert len(Made.of(capture).cameras["0"].doubt) == FRAMES
+    assert len(MasksFile.of(capture).cameras["0"].doubt) == FRAMES
 
     times = {path: path.stat().st_mtime_ns for path in (folder / "mask").rglob("*.png")}
     assert main(["mask", str(folder)]) == 0
@@ -98,18 +100,18 @@ def test_masks_are_announced_when_every_camera_has_them(folder):
 
 
 def test_masks_that_are_half_written_are_not_taken_for_those_before(folder, monkeypatch):
-    capture, made = Capture.load(folder), MadeCamera(source="sha256:before", backend="marks", doubt=(0.0,) * FRAMES)
-    save_masks(capture, "0", np.ones((FRAMES, 90, 160), np.uint8))
-    Made.of(capture).save(capture, "0", made)
-    assert Made.of(capture).holds(capture, "0", "sha256:before")
+    capture = Capture.load(folder)
+    carried = Carried(np.ones((FRAMES, 90, 160), np.uint8), np.zeros(FRAMES))
+    store.save_carried(capture, "0", carried, "sha256:before", "marks")
+    assert MasksFile.of(capture).holds(capture, "0", "sha256:before")
 
     def full(path, write):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(store, "write_atomically", full)
+    monkeypatch.setattr(frames, "write_atomically", full)
     with pytest.raises(OSError, match="no space"):
         save_masks(capture, "0", np.zeros((FRAMES, 90, 160), np.uint8))
-    assert not Made.of(capture).holds(capture, "0", "sha256:before")
+    assert not MasksFile.of(capture).holds(capture, "0", "sha256:before")
 
 
 @pytest.mark.parametrize(
@@ -126,7 +128,7 @@ def test_masks_that_do_not_fit_are_refused(folder, labels, message):
 
 
 def test_frames_have_heights_above_the_table(folder):
-    images = film_of(Capture.load(folder), "0")
+    images = CameraFilm(Capture.load(folder), "0")
     height = images.height(0)
     truth = cv2.imread(str(folder / "truth" / "0" / "00000.png"), cv2.IMREAD_UNCHANGED)
     assert abs(np.nanmedian(height[truth == 0])) < 0.003
