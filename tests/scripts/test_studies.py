@@ -19,8 +19,8 @@ from tests.support import small
 from tests.support.colored import paint
 from tests.support.findings import of_level
 from tests.support.real import FOOTAGE
-from workflow.scripts.beside_data import PHYSTWIN, Run, fitted_shift, iou_without_hands, shifted
-from workflow.scripts.beside_phystwin import Scores
+from workflow.scripts.beside_data import PHYSTWIN, Published, Run, fitted_shift, iou_without_hands, shifted
+from workflow.scripts.beside_phystwin import Scores, labeled_rows
 from workflow.scripts.beside_tables import COLUMNS, GROUPS, cell, costs, differences, mean_and_spread, minutes_by_job
 from workflow.scripts.footage import film
 from workflow.scripts.footage_captures import write_capture
@@ -44,6 +44,31 @@ def test_a_shift_is_found_again(shift):
     mask = block(slice(10, 22), slice(15, 40)) | block(slice(20, 31), slice(30, 36))
     labels = np.where(shifted(mask, shift), OBJECT, 0).astype(np.uint8)
     assert fitted_shift(mask, labels, most=3.0) == shift
+
+
+def test_whole_shifts_move_pixels_and_half_ones_keep_those_covered_by_more_than_a_half():
+    mask = block(slice(10, 20), slice(15, 25))
+    assert (shifted(mask, (2, -3)) == block(slice(7, 17), slice(17, 27))).all()
+    assert (shifted(mask, (0.5, 0)) == block(slice(10, 20), slice(16, 25))).all()
+    color = np.where(mask[..., None], 200, 0).astype(np.uint8).repeat(3, axis=2)
+    moved = shifted(color, (0.5, 0))
+    assert (moved[12, 15], moved[12, 16], moved[12, 25]) == (pytest.approx(100), pytest.approx(200), pytest.approx(100))
+
+
+def test_published_pictures_are_cut_out_and_moved():
+    mask = block(slice(8, 16), slice(16, 32))
+    one = Published(np.packbits(mask.ravel())[None], [np.full((40, 60, 3), 90, np.uint8)], (2.0, -1.0))
+    rgba, moved = one.picture(0), block(slice(7, 15), slice(18, 34))
+    assert (one.silhouette(0) == moved).all()
+    assert (rgba == np.where(moved[..., None], [90, 90, 90, 255], 0)).all()
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_cases_without_drawn_masks_are_compared_with_carried_ones(drawn):
+    labels = np.where(block(slice(10, 20), slice(10, 20)), OBJECT, 0).astype(np.uint8)
+    case = SimpleNamespace(drawn={0: labels} if drawn else {}, labeled=dict.fromkeys((0, 3, 6, 9), labels))
+    (row,) = labeled_rows(case, [(9, block(slice(10, 20), slice(10, 15)))])
+    assert (row["part"], row["metric"], row["value"]) == ("last", "iou_drawn" if drawn else "iou_carried", 0.5)
 
 
 def test_hands_count_on_neither_side():
