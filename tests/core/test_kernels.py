@@ -23,7 +23,7 @@ def test_processes_that_start_together_compile_each_kernel_once(tmp_path):
     start = [sys.executable, "-c", LOAD]
     crowd = [
         subprocess.Popen(start, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, text=True)
-        for _ in range(4)
+        for _ in range(2)
     ]
     for process in crowd:
         assert process.stdout is not None
@@ -39,4 +39,4 @@ def test_processes_that_start_together_compile_each_kernel_once(tmp_path):
     assert all(process.returncode == 0 for process in crowd), outputs
     # Two that list partners, and a frame forward and backward.
     assert "".join(outputs).count("(compiled)") == 4
-    assert "".join(outputs).count("(cached)") == 3 * 4
+    assert "".join(outputs).count("(cached)") == 4
