@@ -1,6 +1,7 @@
 """Captures of color alone: made, checked, and refused by what needs depth."""
 
 import json
+import time
 
 import cv2
 import numpy as np
@@ -15,8 +16,8 @@ from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.plausible_world import on_table
 from neuspring.perception import segment_opencv
-from neuspring.perception.annotate.annotations import Annotations, Click, Point
-from neuspring.perception.annotate.tracks import Pointing, tracks_of
+from neuspring.perception.annotate.clicks import Annotations, Click, ClickedPoint
+from neuspring.perception.annotate.tracks import TracksMode, tracks_of
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.marks.carry import CameraFilm
@@ -183,16 +184,17 @@ def test_segmentation_by_height_is_refused_at_the_start(capture):
 
 
 def test_clicks_stay_in_the_image(capture):
-    clicks = Annotations(points=(Point(name="corner", clicks={"0": (Click(frame=0, x=40.0, y=30.0),)}),))
+    clicks = Annotations(points=(ClickedPoint(name="corner", clicks={"0": (Click(frame=0, x=40.0, y=30.0),)}),))
     with pytest.raises(InputError, match=r"color alone cannot lift clicks to 3D; received none. Clicks stay in annotations.json"):
         tracks_of(capture, clicks)
     clicks.save(capture.folder)
-    pointing = Pointing(capture)
+    mode = TracksMode(capture)
     try:
-        assert pointing.wait(10)
-        assert [note["text"] for note in pointing.results(0)["points"][0]["notes"]][-1].startswith("color alone: followed")
+        while mode.results(0)["busy"]:
+            time.sleep(0.01)
+        assert [note["text"] for note in mode.results(0)["points"][0]["notes"]][-1].startswith("color alone: followed")
         with pytest.raises(InputError, match="tracks in the world need depth"):
-            pointing.save(replace=False)
+            mode.save(replace=False)
     finally:
-        pointing.close()
+        mode.close()
     assert not (capture.folder / "tracks.json").exists()

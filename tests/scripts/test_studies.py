@@ -203,6 +203,7 @@ def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     Marks.load(capture.folder / MARKS).require(capture)
     found = check_layout(capture.folder)
     assert of_level(found, "error") == []
-    # The white rope is 38.7 cm long; its mask ends within three pixels of 2 mm at both ends.
+    # The README of the footage back-projects the white rope onto the table: 38.7 cm from tip to tip (nobody measured it with a
+    # ruler). The mask ends within three pixels of 2 mm at both ends, and the size is told in whole centimeters.
     (length,) = (int(size[1]) for text in of_level(found, "note") if (size := re.search(r"object size on the table (\d+) x", text)))
     assert length == pytest.approx(38.7, abs=1.2 + 0.5)

@@ -24,10 +24,8 @@ class Refused(Exception):
 
 def is_loopback(host: str) -> bool:
     """Whether an address or name means this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    address = _address(host)
+    return host == "localhost" if address is None else address.is_loopback
 
 
 def check_host(header: str | None, bound: str) -> None:
@@ -40,7 +38,7 @@ def check_host(header: str | None, bound: str) -> None:
         raise Refused(400, "A Host header is required.")
     if name in LOOPBACK_NAMES or name == bound.lower():
         return
-    if not is_loopback(bound) and (_is_address(name) or name in {socket.gethostname().lower(), socket.getfqdn().lower()}):
+    if not is_loopback(bound) and (_address(name) or name in {socket.gethostname().lower(), socket.getfqdn().lower()}):
         return
     raise Refused(403, "The Host header names another machine. Open the address that this program printed.")
 
@@ -53,9 +51,8 @@ def check_origin(headers: Mapping[str, str]) -> None:
         raise Refused(403, "Requests of other sites are refused.")
 
 
-def _is_address(name: str) -> bool:
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        ipaddress.ip_address(name)
+        return ipaddress.ip_address(name)
     except ValueError:
-        return False
-    return True
+        return None

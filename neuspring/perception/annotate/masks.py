@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
 
-import cv2
 import numpy as np
 
 from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.shared import Document, Job, Report
+from neuspring.perception.annotate.shared import BackgroundJob, Document, Report
 from neuspring.perception.marks.carry import CameraFilm, Carried, carry_camera, frame_mask
 from neuspring.perception.marks.marks import MARKS, Marks
 from neuspring.perception.marks.store import MasksFile, save_carried, source_digest
@@ -27,20 +26,17 @@ MOST_MARKS = 2000
 class CarriedMasks:
     """Masks of one camera, as they were carried."""
 
-    images: Sequence[bytes]
-    """A gray PNG per frame."""
-    doubt: np.ndarray
-    """[T], 0 sure, 1 doubtful."""
+    carried: Carried
     marks: Marks
     """What they came from."""
     saved: bool = False
 
 
-class Masks:
+class MasksMode:
     """State of the masks mode, shared by all tabs."""
 
     def __init__(self, capture: Capture, settings: MarksSegmentation) -> None:
-        self.capture, self.settings, self.job = capture, settings, Job()
+        self.capture, self.settings, self.job = capture, settings, BackgroundJob()
         path = capture.folder / MARKS
         self.document: Document[Marks] = Document(
             path, lambda: Marks.load(path) if path.exists() else Marks(), lambda marks: marks.save(path)
@@ -54,7 +50,7 @@ class Masks:
         with self._lock:
             carried = {
                 camera: {
-                    "doubt": [round(float(value), 3) for value in result.doubt],
+                    "doubt": [round(float(value), 3) for value in result.carried.doubt],
                     "saved": result.saved,
                     "stale": result.marks.of(camera) != marks.of(camera),
                 }
@@ -105,9 +101,8 @@ class Masks:
             progress(0, self.capture.frame_count)
             carried = carry_camera(self.capture, camera, marks.of(camera), self.settings, progress=progress)
             doubtful += int((carried.doubt > 0.5).sum())
-            result = CarriedMasks([_png(labels) for labels in carried.labels], carried.doubt, marks)
             with self._lock:
-                self._results[camera] = result
+                self._results[camera] = CarriedMasks(carried, marks)
         names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
         frames = f"{doubtful or 'no'} very doubtful frame{'' if doubtful == 1 else 's'}"
         return f"Carried {names}; {frames}. Look at the frames that are listed, then save."
@@ -117,7 +112,7 @@ class Masks:
         if source == "carried":
             with self._lock:
                 result = self._results.get(camera)
-            return _labels(result.images[frame]) if result and self.capture.has(camera, frame) else None
+            return result.carried.labels[frame] if result and self.capture.has(camera, frame) else None
         exists = self.capture.has(camera, frame) and self.capture.path("mask", camera, frame).exists()
         return self.capture.mask(camera, frame) if source == "saved" and exists else None
 
@@ -130,9 +125,8 @@ class Masks:
         # Two tabs would write the same files, and the record of one of them would be lost.
         with self._saving:
             for camera, result in results.items():
-                carried = Carried(np.stack([_labels(image) for image in result.images]), result.doubt)
                 source = source_digest(self.capture, camera, result.marks.of(camera), "marks", self.settings)
-                save_carried(self.capture, camera, carried, source, "marks")
+                save_carried(self.capture, camera, result.carried, source, "marks")
                 with self._lock:
                     if self._results.get(camera) is result:
                         self._results[camera] = replace(result, saved=True)
@@ -142,12 +136,3 @@ class Masks:
         """Cameras with a mask in the capture."""
         frames = range(self.capture.frame_count)
         return [c for c in self.capture.cameras if any(self.capture.path("mask", c, frame).exists() for frame in frames)]
-
-
-def _png(labels: np.ndarray) -> bytes:
-    return cv2.imencode(".png", np.ascontiguousarray(labels), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-
-
-def _labels(image: bytes) -> np.ndarray:
-    """Labels [H, W] of a gray PNG."""
-    return np.asarray(cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED))

@@ -32,9 +32,9 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.annotate.guard import Refused, check_host, check_origin
-from neuspring.perception.annotate.masks import Masks
+from neuspring.perception.annotate.masks import MasksMode
 from neuspring.perception.annotate.shared import Busy, Stale
-from neuspring.perception.annotate.tracks import Foreign, Pointing
+from neuspring.perception.annotate.tracks import Foreign, TracksMode
 
 STATIC = Path(__file__).parent / "static"
 """The only files that are given out."""
@@ -72,24 +72,24 @@ class Server:
     ) -> None:
         """Listen; port 0: any that is free. Raises InputError for an address that cannot be had, or a damaged file."""
         self.capture, self.host, self.token = capture, host, token or secrets.token_urlsafe(16)
-        self.masks = Masks(capture, settings or MarksSegmentation())
+        self.masks = MasksMode(capture, settings or MarksSegmentation())
         self.masks.document.read()
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
-        self.pointing = Pointing(capture)
+        self.tracks = TracksMode(capture)
         try:
-            self.pointing.document.read()
+            self.tracks.document.read()
         except InputError:
             self._socket.close()
-            self.pointing.close()
+            self.tracks.close()
             raise
         app = Starlette(
             routes=[
                 Route("/api/state", self._state),
                 Route("/api/masks", lambda _: JSONResponse(self.masks.plain())),
-                Route("/api/clicks", lambda _: JSONResponse(self.pointing.plain())),
+                Route("/api/clicks", lambda _: JSONResponse(self.tracks.plain())),
                 Route("/api/job", lambda _: JSONResponse(self.masks.job.plain())),
-                Route("/api/tracks/{since:int}", lambda asked: JSONResponse(self.pointing.results(asked.path_params["since"]))),
+                Route("/api/tracks/{since:int}", lambda asked: JSONResponse(self.tracks.results(asked.path_params["since"]))),
                 Route("/api/color/{camera}/{frame:int}", self._color),
                 Route("/api/overlay/{source}/{camera}/{frame:int}", self._overlay),
                 Route("/api/marks", self._write_marks, methods=["POST"]),
@@ -128,7 +128,7 @@ class Server:
         self._socket.close()
         self.masks.job.stop()
         self.masks.job.join()
-        self.pointing.close()
+        self.tracks.close()
 
     async def _answer(self, request: Request, go_on: Callable[[Request], Awaitable[Response]]) -> Response:
         """Check who asks, read the body, and answer; what is refused or fails becomes a status and a sentence."""
@@ -175,7 +175,7 @@ class Server:
             "frame_rate": description.frame_rate,
             "cameras": cameras,
             "masks": self.masks.plain(),
-            "tracks": self.pointing.plain(),
+            "tracks": self.tracks.plain(),
         }
         return JSONResponse(values)
 
@@ -205,7 +205,7 @@ class Server:
 
     def _write_clicks(self, request: Request) -> Response:
         values = request.state.values
-        return JSONResponse({"revision": self.pointing.write(values.get("revision"), values.get("annotations"))})
+        return JSONResponse({"revision": self.tracks.write(values.get("revision"), values.get("annotations"))})
 
     def _carry(self, request: Request) -> Response:
         """Begin to carry the marks of the named cameras."""
@@ -220,7 +220,7 @@ class Server:
         return JSONResponse(self.masks.job.plain())
 
     def _save_tracks(self, request: Request) -> Response:
-        return JSONResponse({"points": self.pointing.save(replace=request.state.values.get("replace") is True)})
+        return JSONResponse({"points": self.tracks.save(replace=request.state.values.get("replace") is True)})
 
 
 def overlay_png(labels: np.ndarray) -> bytes:
@@ -259,13 +259,11 @@ def _problem(status: int, text: str) -> Response:
 
 def _listen(host: str, port: int) -> socket.socket:
     """A socket at an address. Raises InputError with the next move."""
-    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((host, port))
-        listener.listen()
+        if ":" in host:
+            return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=socket.has_dualstack_ipv6())
+        return socket.create_server((host, port))
     except (OSError, OverflowError) as error:
-        listener.close()
         number = getattr(error, "errno", None)
         if number == errno.EADDRINUSE:
             remedy = "Another program listens there. Stop it, or choose another port; --port 0 takes any free one."
@@ -276,4 +274,3 @@ def _listen(host: str, port: int) -> socket.socket:
             raise InputError("--port", "must be one that you may use", port, "Choose one above 1023.") from error
         remedy = "127.0.0.1 is for this machine alone, 0.0.0.0 for all networks."
         raise InputError("--host", "must be an address of this machine", host, remedy) from error
-    return listener

@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
 from time import monotonic
-from typing import Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from neuspring.core.errors import InputError, NumericalFailure
 
@@ -58,32 +57,26 @@ class Busy(Exception):
     """Other work has not ended."""
 
 
-@dataclass(frozen=True)
-class JobState:
-    """How far work is."""
-
-    state: Literal["idle", "running", "done", "failed", "stopped"] = "idle"
-    what: str = ""
-    done: int = 0
-    total: int = 0
-    seconds: float = 0.0
-    message: str = ""
+IDLE: dict[str, Any] = {"state": "idle", "what": "", "done": 0, "total": 0, "seconds": 0.0, "message": ""}
+"""State of a job: idle, running, done, failed or stopped; what it does, how far it is, and what it says at the end."""
 
 
-class Job:
+class BackgroundJob:
     """At most one piece of work, in a thread, with its progress and a way to stop it."""
 
     def __init__(self) -> None:
-        self._lock, self._stop, self._state, self._start = Lock(), Event(), JobState(), 0.0
+        self._lock, self._stop, self._began = Lock(), Event(), 0.0
+        self._state: dict[str, Any] = IDLE
         self._thread: Thread | None = None
 
     def start(self, work: Callable[[Report], str]) -> None:
         """Begin; `work` returns the sentence that says what it did. Raises Busy."""
         with self._lock:
-            if self._state.state == "running":
+            if self._state["state"] == "running":
                 raise Busy("Masks are being carried. Wait for the end, or stop it.")
             self._stop.clear()
-            self._state, self._start = JobState("running"), monotonic()
+            self._began = monotonic()
+            self._state = IDLE | {"state": "running"}
             self._thread = Thread(target=self._run, args=(work,), daemon=True)
             self._thread.start()
 
@@ -99,9 +92,8 @@ class Job:
     def plain(self) -> dict[str, Any]:
         """The state as plain JSON values."""
         with self._lock:
-            state = self._state
-            seconds = monotonic() - self._start if state.state == "running" else state.seconds
-        return asdict(replace(state, seconds=seconds))
+            running = self._state["state"] == "running"
+            return self._state | ({"seconds": monotonic() - self._began} if running else {})
 
     def _run(self, work: Callable[[Report], str]) -> None:
         try:
@@ -121,4 +113,4 @@ class Job:
 
     def _set(self, **changes: Any) -> None:
         with self._lock:
-            self._state = replace(self._state, seconds=monotonic() - self._start, **changes)
+            self._state = self._state | {"seconds": monotonic() - self._began, **changes}

@@ -10,7 +10,7 @@ import pytest
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.masks import Masks
+from neuspring.perception.annotate.masks import MasksMode
 from neuspring.perception.marks.store import MasksFile
 from tests.support.moving import CORNER, FRAMES, SHIFT, SIDE, moving
 
@@ -43,8 +43,8 @@ def overlap(one, other) -> float:
     return (one & other).sum() / (one | other).sum()
 
 
-def page_of(capture: Capture) -> Masks:
-    return Masks(capture, MarksSegmentation())
+def page_of(capture: Capture) -> MasksMode:
+    return MasksMode(capture, MarksSegmentation())
 
 
 def test_a_preview_is_of_the_frame_that_was_marked_also_after_missing_frames(capture):

@@ -7,8 +7,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import TRACKS, Capture, write_tracks
-from neuspring.perception.annotate import tracks
-from neuspring.perception.annotate.annotations import ANNOTATIONS
+from neuspring.perception.annotate.clicks import ANNOTATIONS
 from neuspring.perception.annotate.server import COLORS, Server, overlay_png
 from neuspring.perception.marks.store import MasksFile
 from tests.support.moving import FRAMES, moving, truth
@@ -206,11 +205,11 @@ def test_clicks_become_tracks(client, capture):
 def test_a_correction_follows_only_what_changed(client):
     client.post("/api/clicks", revision="none", annotations=clicks(0, 8))
     followed(client)
-    runs = set(client.server.pointing._runs)
+    runs = client.server.tracks._run.cache_info().misses
     client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 8, 11))
     followed(client)
-    new = set(client.server.pointing._runs) - runs
-    assert {(click.frame, stop) for _, click, stop, _ in new} == {(8, 11), (11, 8), (11, FRAMES)}
+    # From 8 to 11, from 11 to 8, and from 11 to the end.
+    assert client.server.tracks._run.cache_info().misses == runs + 3
 
 
 def test_bad_clicks_are_refused(client, capture):
@@ -257,7 +256,7 @@ def test_an_error_of_the_program_is_told_and_work_goes_on(client, monkeypatch):
         raise ValueError("boom")
 
     with monkeypatch.context() as patch:
-        patch.setattr(tracks, "follow_from", broken)
+        patch.setattr(client.server.tracks, "_run", broken)
         client.post("/api/clicks", revision="none", annotations=clicks(0))
         assert "ValueError: boom" in followed(client)["failure"]
     client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 1))

@@ -10,9 +10,8 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.annotations import ANNOTATIONS, Annotations, Click, Point
-from neuspring.perception.annotate.follow import GrayImages, Trail, follow
-from neuspring.perception.annotate.tracks import PointTrack, expected_frames, join, lift_places, notes_of, tracks_of
+from neuspring.perception.annotate.clicks import ANNOTATIONS, Annotations, Click, ClickedPoint, GrayImages, Trail, follow
+from neuspring.perception.annotate.tracks import expected_frames, join, lift_place, notes_of, tracks_of
 from tests.support.filmed import film
 from tests.support.moving import COVERED, FRAMES, NEAR, moving, truth
 
@@ -34,7 +33,7 @@ def one(*clicks, name="ear", camera="0"):
 def test_what_is_written_is_read_and_says_no_more_than_needed(tmp_path):
     capture = moving(tmp_path)
     clicks = (Click(frame=0, x=5.0, y=6.5), Click(frame=3, hidden=True))
-    annotations = Annotations(points=(Point(name="left ear", clicks={"0": clicks}), Point(name="tail")))
+    annotations = Annotations(points=(ClickedPoint(name="left ear", clicks={"0": clicks}), ClickedPoint(name="tail")))
     annotations.save(tmp_path)
     assert Annotations.load(capture) == annotations
     stored = json.loads((tmp_path / ANNOTATIONS).read_text())
@@ -140,7 +139,7 @@ def body(tmp_path_factory):
                 ends = (0, capture.frame_count - 1)
                 clicks[name] = tuple(Click(frame=t, x=float(pixels[t, 0]), y=float(pixels[t, 1])) for t in ends)
         if clicks:
-            points[number] = Point(name=str(number), clicks=clicks)
+            points[number] = ClickedPoint(name=str(number), clicks=clicks)
     assert len(points) >= 8
     return capture, points
 
@@ -172,25 +171,19 @@ def capture(tmp_path_factory) -> Capture:
     return moving(tmp_path_factory.mktemp("moving"), missing=(4,))
 
 
-def places(*rows: tuple[float, float] | None) -> np.ndarray:
-    """Places of the first frames; unknown afterwards."""
-    result = np.full((FRAMES, 2), np.nan)
-    for frame, row in enumerate(rows):
-        if row is not None:
-            result[frame] = row
-    return result
-
-
 def test_a_place_is_lifted_at_its_own_depth(capture):
-    points = lift_places(capture, "0", truth(POINT))
-    assert np.flatnonzero(np.isnan(points).any(axis=1)).tolist() == [4]  # the frame that the camera missed
-    pixels, depth = capture.cameras["0"].project(np.delete(points, 4, axis=0))
-    np.testing.assert_allclose(pixels, np.delete(truth(POINT), 4, axis=0), atol=1e-9)
-    np.testing.assert_allclose(depth, NEAR)
+    for frame, place in enumerate(truth(POINT).tolist()):
+        point = lift_place(capture, "0", frame, *place)
+        if frame == 4:  # the frame that the camera missed
+            assert np.isnan(point).all()
+            continue
+        pixel, depth = capture.cameras["0"].project(point)
+        np.testing.assert_allclose(pixel, place, atol=1e-9)
+        np.testing.assert_allclose(depth, NEAR)
 
 
 def test_a_camera_without_depth_gives_no_point(tmp_path):
-    assert np.isnan(lift_places(moving(tmp_path, depth=False), "0", truth(POINT))).all()
+    assert np.isnan(lift_place(moving(tmp_path, depth=False), "0", 0, *POINT)).all()
 
 
 @pytest.mark.parametrize(("measured", "expected"), [(0, np.nan), (3, np.nan), (4, 0.7), (25, 0.7)])
@@ -201,33 +194,35 @@ def test_the_depth_is_the_median_of_what_is_measured_around_the_place(tmp_path, 
     near[:1] = min(measured, 1) * 900  # one outlier
     image[48:53, 58:63] = near.reshape(5, 5)
     cv2.imwrite(str(capture.path("depth", "0", 0)), image)
-    point = lift_places(capture, "0", places((60.2, 49.8)))[0]
+    point = lift_place(capture, "0", 0, 60.2, 49.8)
     np.testing.assert_allclose(capture.cameras["0"].project(point)[1] if np.isfinite(point).all() else np.nan, expected)
 
 
 def test_cameras_are_averaged_and_their_distance_is_told(capture):
     """Both cameras have the same pose, so a place one pixel beside the other lies NEAR / 40 m beside it."""
-    seen = {"0": places((46, 62), (48.5, 60.75)), "covered": places((47, 62))}
-    track = join([lift_places(capture, camera, own) for camera, own in seen.items()], FRAMES)
-    np.testing.assert_allclose(track.places, lift_places(capture, "0", places((46.5, 62), (48.5, 60.75))), atol=1e-9)
-    np.testing.assert_allclose(track.apart[:2], [NEAR / 40, np.nan])
-    assert np.isnan(join([], FRAMES).places).all()
+    unknown = np.full(3, np.nan)
+    seen = [lift_place(capture, "0", 0, 46, 62), lift_place(capture, "0", 1, 48.5, 60.75), unknown]
+    other = [lift_place(capture, "covered", 0, 47, 62), unknown, unknown]
+    places, apart = join([np.stack(seen), np.stack(other)], 3)
+    np.testing.assert_allclose(places, [lift_place(capture, "0", 0, 46.5, 62), seen[1], unknown], atol=1e-9)
+    np.testing.assert_allclose(apart, [NEAR / 40, np.nan, np.nan])
+    assert np.isnan(join([], FRAMES)[0]).all()
 
 
-def note_texts(capture, trail: Trail, track: PointTrack, *clicks: Click) -> list[tuple[int, int, int, str]]:
+def note_texts(capture, trail: Trail, track: tuple[np.ndarray, np.ndarray], *clicks: Click) -> list[tuple[int, int, int, str]]:
     """Frames of each note, and how its text begins."""
-    point = Point(name="ear", clicks={"0": clicks or (Click(frame=0, x=1.0, y=1.0),)})
-    notes = notes_of(point, {"0": trail}, track, capture)
+    point = ClickedPoint(name="ear", clicks={"0": clicks or (Click(frame=0, x=1.0, y=1.0),)})
+    notes = notes_of(point, {"0": trail}, *track, capture)
     return [(note.first, note.last, note.frame, next(t for t in TEXTS if note.text.startswith(t))) for note in notes]
 
 
-def good() -> tuple[Trail, PointTrack]:
-    """A trail without doubt, but for the frame that the camera missed."""
+def good() -> tuple[Trail, tuple[np.ndarray, np.ndarray]]:
+    """A trail without doubt, but for the frame that the camera missed, and its places and distances in the world."""
     trail = Trail(np.ones((FRAMES, 2)), np.zeros(FRAMES), np.ones(FRAMES))
     trail.places[4] = np.nan
     world = np.zeros((FRAMES, 3))
     world[4] = np.nan
-    return trail, PointTrack(world, np.full(FRAMES, np.nan))
+    return trail, (world, np.full(FRAMES, np.nan))
 
 
 def test_a_good_track_has_no_notes(capture):
@@ -255,7 +250,7 @@ def test_hidden_frames_are_not_lost(capture):
 )
 def test_what_is_doubtful_is_noted_with_its_worst_frame(capture, what, frames, value, note):
     trail, track = good()
-    spoiled = {"trail.apart": trail.apart, "trail.alike": trail.alike, "track.places": track.places, "track.apart": track.apart}
+    spoiled = {"trail.apart": trail.apart, "trail.alike": trail.alike, "track.places": track[0], "track.apart": track[1]}
     spoiled[what][frames] = value
     assert note_texts(capture, trail, track) == [note]
 
