@@ -62,6 +62,7 @@ RENAMED |= dict.fromkeys(
         *("losses.alpha", "simulation.mass", "search.clusters", "extra", "bending_reach"),
         *("homogeneous_epochs", "fit.warmup_epochs", "schedule", "fit.clip_gradient_norm", "weight_decay"),
         *("rest_lengths_by", "field.scale", "field.controllers"),
+        *("rest_length_bound", "rest_prior", "rest_learning_rate"),
     ),
     REMOVED,
 )

@@ -36,8 +36,6 @@ class SearchRow(Section):
     """Search settings of this row alone (keys of `search`), on top of the configuration's."""
     released_quirks: dict[str, Any] = field(default_factory=dict)
     """Keys of `released_quirks`, on top of the configuration's, for this search and the fits that start from it."""
-    losses: dict[str, Any] = field(default_factory=dict)
-    """Keys of `losses`, on top of the configuration's, for this search and the fits that start from it."""
 
 
 @dataclass(frozen=True, kw_only=True)

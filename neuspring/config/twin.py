@@ -82,8 +82,6 @@ class Fit(Section):
     """Learning rate of contact scalars, drag and common factors; null: `learning_rate`."""
     factor_learning_rate: Positive | None = None
     """Learning rate of drag and common factors; null: `scalar_learning_rate`."""
-    rest_learning_rate: Positive | None = None
-    """Learning rate of rest lengths that are free beside a field; null: `learning_rate`."""
     epsilon: Positive = 1e-15
     """Adam's epsilon, in the loss unit. Gradients far below it are not followed. The released code has 1e-8, with
     `loss_unit: meter`."""
@@ -103,11 +101,6 @@ class Fit(Section):
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous"] = "fixed"
     """What is trained of the damping. homogeneous: drag and one factor of all dashpots."""
-    rest_length_bound: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Bound of trained rest lengths: within exp(+-bound) of the distances in the rest shape; 0: rest lengths are fixed.
-    They are free per spring, beside a field too."""
-    rest_prior: NonNegative = 0.0
-    """Weight of the mean squared change of the logarithm of trained rest lengths, in the loss unit."""
     rest_shape: RestShape = dataclasses.field(default_factory=RestShape)
     selection: Literal["training_loss", "tail"] = "training_loss"
     """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last

@@ -81,8 +81,8 @@ def overlaid(settings: T, own: Mapping[str, Any], where: str) -> T:
 
 
 def with_search(config: Config, row: SearchRow, name: str) -> Config:
-    """The configuration of a search: with the row's settings, quirks and losses on top; those hold for its fits too."""
-    own = {"search": row.settings, "released_quirks": row.released_quirks, "losses": row.losses}
+    """The configuration of a search: with the row's settings and quirks on top; those hold for its fits too."""
+    own = {"search": row.settings, "released_quirks": row.released_quirks}
     keys = {section: "settings" if section == "search" else section for section in own}
     return dataclasses.replace(
         config, **{key: overlaid(getattr(config, key), own[key], f"search {name}, {keys[key]}") for key in own}

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from neuspring.config import Config, Kind
 from neuspring.core.artifacts import Observations
@@ -43,11 +42,9 @@ def fit(
     from neuspring.core.files import write_history
     from neuspring.twin.fit import fit as fit_twin
     from neuspring.twin.losses import frames_seen
-    from neuspring.twin.pool import PooledFit
 
-    problem, checkpoint, key = prepared(observations, search, settings, run, kind, oracle, device)
-    run_of = partial(PooledFit, pool=pool, leave_out=leave_out) if pool or leave_out else None
-    result = fit_twin(problem, partial=checkpoint, key=key, run_of=run_of)
+    problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
+    result = fit_twin(problem, partial=checkpoint, key=key)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
     columns = {name: result.history[name] for name in ("loss", "tail_loss", "gradient_norm", "learning_rate")}
@@ -75,7 +72,15 @@ def fit(
 
 
 def prepared(
-    observations: Observations, search: Before, settings: Config, run: Recorder, kind: Kind, oracle: bool, device: str, **_: Any
+    observations: Observations,
+    search: Before,
+    settings: Config,
+    run: Recorder,
+    pool: Sequence[Observations],
+    leave_out: bool,
+    kind: Kind,
+    oracle: bool,
+    device: str,
 ) -> tuple[FitProblem, Path, str]:
     """A fit before it runs, where its checkpoints lie, and what a checkpoint must match. The search must not have failed."""
     from neuspring.core.artifacts import Twin
@@ -95,6 +100,8 @@ def prepared(
         kind,
         seed,
         oracle,
+        pool,
+        leave_out,
     )
     # What was read, the search by its twin alone.
     inputs = {name: digest for name, digest in run.inputs.items() if name != "search"} | {"twin": search.record.files["twin"][1]}

@@ -76,8 +76,7 @@ def _twin_predictor(learned: Before, settings: Config, device: str) -> Predictor
     from neuspring.twin.transfer import move
 
     twin = Twin.load(learned.file("twin"))
-    settings_of_fit = learned.record.settings.get("fit", {})
-    keep_lengths = bool(settings_of_fit.get("rest_length_bound") or settings_of_fit.get("rest_shape", {}).get("handles"))
+    keep_lengths = bool(learned.record.settings.get("fit", {}).get("rest_shape", {}).get("handles"))
     keep_frame_time = learned.record.settings["released_quirks"]["frame_time_667"]
 
     def predict(observations: Observations) -> tuple[Trajectory, int, dict[str, float]]:

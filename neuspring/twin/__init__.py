@@ -4,8 +4,7 @@ topology    points to regions, regions to springs; the spacing of nodes
 search      CMA-ES over topology and a homogeneous material: candidates (variables, twin, cost), trials (many on the lanes of one
             solver), polish (Levenberg-Marquardt)
 field       the neural spring field
-fit         Adam through the simulation: parameters (what is trained), rest_shape (an unloaded shape), batch (fits that share
-            launches), pool (one twin for several recordings)
+fit         Adam through the simulation, on one recording or several: parameters (what is trained), batch (fits that share launches)
 losses      every term of the training loss, for search, fit and polish
 rollout     prediction; hand_paths: hands in front of one camera without depth
 transfer    a twin on another recording, with register where its nodes are others

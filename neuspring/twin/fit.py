@@ -13,6 +13,7 @@ is recorded is in m^2.
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -33,9 +34,9 @@ from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
 from neuspring.twin.losses import FrameLoss, frames_seen
-from neuspring.twin.parameters import TwinParameters, median_gradient, movement, watched
-from neuspring.twin.rest_shape import topology_spacing
+from neuspring.twin.parameters import TwinParameters, median_gradient, movement, topology_spacing, watched
 from neuspring.twin.rollout import initial_velocity
+from neuspring.twin.transfer import on_recording, require_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,8 +72,13 @@ class FitProblem:
     """Seed of the field's first weights."""
     oracle: bool = False
     """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
+    pool: Sequence[Observations] = ()
+    """Other recordings of the object, that one material is fitted on together with `observations`."""
+    leave_out: bool = False
+    """Fit the pool alone: only frame 0 of `observations` is used."""
 
     def __post_init__(self) -> None:
+        require_pool(self.observations, self.pool, self.leave_out)
         if self.oracle and self.fit.selection == "tail":
             raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
 
@@ -328,6 +334,74 @@ class TwinFit:
         return figures
 
 
+class PooledFit(TwinFit):
+    """Epochs over several recordings of one object: one material; for each recording its own hands, start and frames.
+
+    An epoch is one pass over each recording in turn, with the same parameters and the same state of Adam. Stiffness, dashpots, drag
+    and contact are shared, and so is an estimated shape, as factors on the distances in each recording's rest shape; its
+    displacement lives in that of the problem's own recording. All recordings take as many substeps per frame as the one that needs
+    most. Losses are means over the recordings, in one unit.
+    """
+
+    def __init__(self, problem: FitProblem) -> None:
+        alone = replace(problem, pool=(), leave_out=False)
+        super().__init__(alone)
+        moved = [(on_recording(problem.twin, observations, problem.quirks), observations) for observations in problem.pool]
+        self._leave_out = problem.leave_out
+        self._members = [] if problem.leave_out else [self._member(alone)]
+        self._members += [self._member(replace(alone, twin=twin, observations=seen)) for twin, seen in moved]
+
+    def _member(self, problem: FitProblem) -> TwinFit:
+        """The fit of one recording, which trains this one's parameters with this one's optimizer."""
+        member = TwinFit(problem)
+        start = self.parameters.start | {"rest_lengths": member.parameters.start["rest_lengths"]}
+        # The copy has the same trained tensors.
+        member.parameters = copy.copy(self.parameters)
+        member.parameters.start = start
+        member.optimizer = self.optimizer
+        # Frame 0 of each recording has a spacing of its own; a meter must weigh the same in all.
+        member.loss_scale = self.loss_scale
+        return member
+
+    @property
+    def one_step(self) -> bool:
+        """Whether an epoch is a single optimizer step: never of several recordings."""
+        return len(self._members) == 1 and self._members[0].one_step
+
+    @property
+    def collision_overflow(self) -> int:
+        """The sum over all recordings."""
+        return sum(member.collision_overflow for member in self._members)
+
+    def use_substeps(self, count: int) -> None:
+        """Integrate all recordings with `count` substeps per frame from now on."""
+        super().use_substeps(count)
+        for member in self._members:
+            member.use_substeps(count)
+
+    def stable_parameters(self) -> Parameters:
+        """The present parameters, packed, after seeing that they can be integrated on every recording. Raises NonFinite."""
+        for member in self._members:
+            member.stable_parameters()
+        if self._leave_out:
+            super().stable_parameters()
+        self.use_substeps(max(run.twin.simulation.substeps for run in [self, *self._members]))
+        return self.parameters.pack(self.twin.simulation.substep)
+
+    def epoch(self) -> dict[str, float]:
+        """One pass over each recording; raises NonFinite. Means over the recordings, and the largest gradient of any step."""
+        for member in self._members:
+            member.gradients = self.gradients
+        rows = [member.epoch() for member in self._members]
+        if len(rows) == 1:
+            return rows[0]
+        return {"loss": sum(row["loss"] for row in rows) / len(rows), "gradient_norm": max(row["gradient_norm"] for row in rows)}
+
+    def tail_loss(self) -> float:
+        """Mean loss of the held-back frames of all recordings, m^2. Raises NonFinite."""
+        return sum(member.tail_loss() for member in self._members) / len(self._members)
+
+
 def fit(
     problem: FitProblem,
     *,
@@ -335,20 +409,19 @@ def fit(
     key: str = "",
     on_epoch: Callable[[Sequence[Mapping[str, Any]]], None] = lambda history: None,
     lane: Lane | None = None,
-    run_of: Callable[[FitProblem, Lane | None], TwinFit] | None = None,
 ) -> FitResult:
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
-    `lane` the simulation shares launches with other fits (batch.py). `run_of` makes what runs the epochs: `TwinFit`, or one on
-    several recordings (pool.py). Raises NumericalFailure if no epoch could be completed.
+    `lane` the simulation shares launches with other fits (batch.py), unless the problem has a pool. Raises NumericalFailure if no
+    epoch could be completed.
     """
     import pandas as pd
 
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(lane.batch.lanes) if lane else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
-    run = (run_of or TwinFit)(problem, lane)
+    run = PooledFit(problem) if problem.pool else TwinFit(problem, lane)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)

@@ -1,14 +1,24 @@
 """What a first-order stage trains, and the physical quantities that follow from it.
 
-Every spring has offsets o on a log scale: its own numbers (`springs`), or the neural spring field at its midpoint (`field`;
-rest lengths stay free per spring). With b(o) = bound tanh(o / bound), or o without a bound:
+Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`). With
+b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
-    stiffness    Y = Y0 exp(b(o_Y)), clamped to the stiffness range
-    rest length  l = l0 exp(r tanh(o_l))                                if rest_length_bound r > 0
-                 l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|           if rest_shape.handles > 0 (rest_shape.py)
+    Y = Y0 exp(b(o)), clamped to the stiffness range.
 
 Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
+
+With `rest_shape.handles` an unloaded shape X + u(X) is estimated, X the canonical shape of nodes and controllers, u a smooth
+displacement. A few points p_k are handles. Each has a displacement t_k and a displacement gradient A_k; weights w_k blend them:
+
+    u(x) = h sum_k w_k(x) (t_k + A_k (x - p_k) / s),      w_k(x) ~ exp(-|x - p_k|^2 / 2 s^2),   sum_k w_k = 1
+
+with h the node spacing and s the median distance of a handle to the nearest other one. So t and A have no unit, every affine map of
+the body can be met exactly, and a cable can curve without shear. Rest lengths follow:
+
+    l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|
+
+Controllers move with u as the nodes around them do: a grip holds material points, and a rigid part of u must change no length.
 """
 
 from __future__ import annotations
@@ -23,10 +33,11 @@ from torch import nn
 
 from neuspring import config
 from neuspring.config import Kind
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Topology, Twin
+from neuspring.core.geometry import farthest
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
-from neuspring.twin.rest_shape import UnloadedShape
+from neuspring.twin.topology import node_spacing
 
 CONTACT_SCALARS = tuple(LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
@@ -66,6 +77,59 @@ def bounded(offset: torch.Tensor, bound: float) -> torch.Tensor:
     return bound * torch.tanh(offset / bound) if bound else offset
 
 
+def topology_spacing(topology: Topology) -> float:
+    """Distance between neighboring nodes in the rest shape, m (topology.py); of one node alone, the median rest length."""
+    nodes = topology.canonical[: len(topology.nodes)]
+    return node_spacing(nodes) if len(nodes) > 1 else float(np.median(topology.rest_lengths.astype(np.float64)))
+
+
+def blending(points: np.ndarray, count: int) -> np.ndarray:
+    """Matrix [P, 4 H] that takes (t_k, columns of A_k) of H = min(count, P) handles to u / h at points [P, 3], m."""
+    from scipy.spatial import cKDTree
+
+    centers = points[farthest(points, count)]
+    away = points[:, None] - centers  # [P, H, 3]
+    gaps = cKDTree(centers).query(centers, k=2)[0][:, 1]
+    scale = float(np.median(gaps))
+    exponent = -(away**2).sum(axis=2) / (2 * scale**2)
+    # The largest exponent is taken out first, so that a point far from all handles has weights too.
+    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    parts = np.concatenate([np.ones_like(away[..., :1]), away / scale], axis=2) * weights[..., None]
+    matrix: np.ndarray = parts.reshape(len(points), -1)
+    return matrix
+
+
+class UnloadedShape(nn.Module):
+    """u of a topology, zero at the start: forward() gives the factors l0' / l0 [S] of the rest lengths."""
+
+    matrix: torch.Tensor
+    apart: torch.Tensor
+    change: torch.Tensor
+
+    def __init__(self, topology: Topology, handles: int) -> None:
+        super().__init__()
+        points = topology.canonical.astype(np.float64)
+        matrix = topology_spacing(topology) * blending(points, handles)
+        first, second = topology.springs.T
+        for name, values in (
+            ("matrix", matrix),
+            ("apart", points[first] - points[second]),
+            ("change", matrix[first] - matrix[second]),
+        ):
+            self.register_buffer(name, torch.from_numpy(values.astype(np.float32)), persistent=False)
+        self.handles = nn.Parameter(torch.zeros(matrix.shape[1], 3))
+
+    def forward(self) -> torch.Tensor:
+        """l0' / l0 [S], 1 where u changes no length."""
+        ratio: torch.Tensor = (self.apart + self.change @ self.handles).norm(dim=1) / self.apart.norm(dim=1)
+        return ratio
+
+    def displacement(self) -> torch.Tensor:
+        """u [N + C, 3], m, of nodes, then controllers."""
+        return self.matrix @ self.handles
+
+
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
@@ -77,15 +141,11 @@ class TwinParameters(nn.Module):
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
-        self.channels = ["stiffness"]
-        """What the columns of the offsets, or the outputs of the field, change."""
-        self.offsets, self.field, self.rest_offsets = None, None, None
+        self.offsets, self.field = None, None
         if kind == "springs":
-            self.channels += ["rest_lengths"] if settings.rest_length_bound else []
-            self.offsets = nn.Parameter(torch.zeros(count, len(self.channels)))
+            self.offsets = nn.Parameter(torch.zeros(count, 1))
         else:
-            self.rest_offsets = nn.Parameter(torch.zeros(count)) if settings.rest_length_bound else None
-            self.field = SpringField(midpoints(topology.canonical, topology.springs), settings.field, len(self.channels), seed)
+            self.field = SpringField(midpoints(topology.canonical, topology.springs), settings.field, 1, seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
         self.unloaded = UnloadedShape(topology, settings.rest_shape.handles) if settings.rest_shape.handles else None
@@ -111,8 +171,6 @@ class TwinParameters(nn.Module):
             groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
                 groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate))
-        if self.rest_offsets is not None:
-            groups.append(([self.rest_offsets], s.rest_learning_rate or rate))
         groups.append((self.scalars.values(), s.scalar_learning_rate or rate))
         if self.factors:
             groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate))
@@ -120,16 +178,11 @@ class TwinParameters(nn.Module):
             groups.append((self.unloaded.parameters(), s.rest_shape.learning_rate))
         return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
 
-    def raw(self) -> dict[str, torch.Tensor]:
-        """Offsets [S] before bounding, by what they change."""
-        columns = self.offsets if self.field is None else self.field()
-        assert columns is not None
-        raw: dict[str, torch.Tensor] = dict(zip(self.channels, columns.unbind(dim=1), strict=True))
-        return raw if self.rest_offsets is None else raw | {"rest_lengths": self.rest_offsets}
-
-    def deviation(self, offset: torch.Tensor) -> torch.Tensor:
-        """Factor of each spring's stiffness [S], apart from common factors, for offsets [S] before bounding."""
-        return bounded(offset, self.settings.output_bound).exp()
+    def deviation(self) -> torch.Tensor:
+        """Factor of each spring's stiffness [S], apart from common factors."""
+        offsets = self.offsets if self.field is None else self.field()
+        assert offsets is not None
+        return bounded(offsets[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
         """The common factor of a physical value: one number, or a number per spring."""
@@ -142,8 +195,8 @@ class TwinParameters(nn.Module):
 
     def physical(self) -> dict[str, torch.Tensor]:
         """Every physical parameter, with the keyword names of `physics.parameters.pack`."""
-        s, values, raw = self.settings, dict(self.start), self.raw()
-        stiffness = self.start["stiffness"] * (self.deviation(raw["stiffness"]) * self._common("stiffness"))
+        s, values = self.settings, dict(self.start)
+        stiffness = self.start["stiffness"] * (self.deviation() * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
         values["stiffness"] = clamp(stiffness, *s.stiffness_range)
@@ -152,8 +205,6 @@ class TwinParameters(nn.Module):
                 values[name] = self.start[name] * self._common(name)
         if self.unloaded is not None:
             values["rest_lengths"] = self.start["rest_lengths"] * self.unloaded()
-        if "rest_lengths" in raw:
-            values["rest_lengths"] = values["rest_lengths"] * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).exp()
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float) -> Parameters:
@@ -165,9 +216,6 @@ class TwinParameters(nn.Module):
         s, total = self.settings, torch.zeros(())
         if self.field is not None and s.field.plane_smoothness:
             total = total + s.field.plane_smoothness * self.field.roughness()
-        raw = self.raw() if s.rest_prior else {}
-        if "rest_lengths" in raw:
-            total = total + s.rest_prior * (s.rest_length_bound * torch.tanh(raw["rest_lengths"])).square().mean()
         if self.unloaded is not None and s.rest_shape.prior:
             total = total + s.rest_shape.prior * (self.unloaded() - 1).square().mean()
         return total
@@ -191,11 +239,9 @@ class TwinParameters(nn.Module):
             value = np.clip(values[name], *LIMITS.get(name, (-np.inf, np.inf)))
             material[name] = value if value.ndim else float(value)
         topology = twin.topology
-        if self.settings.rest_length_bound or self.unloaded is not None:
-            topology = replace(topology, rest_lengths=values["rest_lengths"])
         if self.unloaded is not None:
             shape = topology.canonical + self.unloaded.displacement().detach().cpu().numpy()
-            topology = replace(topology, rest_shape=shape.astype(np.float32))
+            topology = replace(topology, rest_lengths=values["rest_lengths"], rest_shape=shape.astype(np.float32))
         return replace(twin, material=replace(twin.material, **material), topology=topology)
 
 
@@ -233,7 +279,7 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
             change = (parameters.field.planes.texels.cpu() - first).abs()
             figures["texels_moved"] = _share(change > MOVED * s.field.texel_scale)
         if s.output_bound:
-            deviation = parameters.deviation(parameters.raw()["stiffness"]).log()
+            deviation = parameters.deviation().log()
             figures["at_bound"] = _share(deviation.abs() >= AT_BOUND * s.output_bound)
         physical = parameters.physical()
         low, high = s.stiffness_range
@@ -241,7 +287,7 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
         figures["at_stiffness_range"] = _share((stiffness >= high) | (stiffness <= low))
         if parameters.factors:
             figures["factors"] = {name: float(value.exp()) for name, value in parameters.factors.items()}
-        if s.rest_length_bound or parameters.unloaded is not None:
+        if parameters.unloaded is not None:
             strain = physical["rest_lengths"] / parameters.start["rest_lengths"] - 1
             figures["rest_strain"] = float(strain.square().mean().sqrt())
     return figures

@@ -127,7 +127,6 @@ MISTAKES = {
         "fit: {field: {triplane: false, fourier: feature}}",
         "field.fourier: coordinates is required without the tri-plane, received feature",
     ),
-    "rest length bound": ("fit: {rest_length_bound: 1}", "fit.rest_length_bound", "less than 1"),
     "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
     "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),

@@ -8,7 +8,7 @@ import torch
 
 from neuspring import config
 from neuspring.twin.fit import FitProblem, TwinFit, fit
-from neuspring.twin.rest_shape import topology_spacing
+from neuspring.twin.parameters import topology_spacing
 from tests.support import small
 
 SINGLE = 1e-5
@@ -17,8 +17,8 @@ TRAINED = 1e-3
 """Relative: losses of three epochs in float32, whose rounding Adam's normalized steps pass on."""
 FIELD = config.SpringField(channels=4, hidden=16, bands=2, plane_smoothness=1e-2)
 SETTINGS = {
-    "springs": {"rest_length_bound": 0.1, "rest_prior": 0.1},
-    "field": {"rest_shape": config.RestShape(handles=4), "output_bound": 1.5, "horizon": 2},
+    "springs": {"rest_shape": config.RestShape(handles=4)},
+    "field": {"output_bound": 1.5, "horizon": 2},
 }
 
 
@@ -81,7 +81,7 @@ def test_meters_and_millimeters(kind):
 
 def test_the_released_unit_depends_on_the_unit():
     """With the released epsilon and the loss in m^2, the same scene in kilometers does not train."""
-    released = {"epsilon": 1e-8, "loss_unit": "meter", "rest_prior": 0.0}
+    released = {"epsilon": 1e-8, "loss_unit": "meter", "rest_shape": config.RestShape()}
     moved = []
     for factor in (1.0, 2.0**-10):
         run = TwinFit(in_unit(factor, "springs", config.Losses(), **released))

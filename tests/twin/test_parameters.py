@@ -1,4 +1,4 @@
-"""What is trained becomes physics: gradients through the field and the simulator, bounds, clamps, warm start."""
+"""What is trained becomes physics: gradients through field and simulator, bounds, clamps, warm start, an unloaded shape."""
 
 import math
 from dataclasses import replace
@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from neuspring import config
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from neuspring.twin.field import in_cube, midpoints
 from neuspring.twin.fit import TwinFit, fit
-from neuspring.twin.parameters import TwinParameters, bounded, inward_clamp, movement
+from neuspring.twin.parameters import TwinParameters, UnloadedShape, blending, bounded, inward_clamp, movement, topology_spacing
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.topology import distances
 from tests.support import small
 from tests.support.scenes import random_scene, twin_of
 
@@ -25,7 +27,11 @@ TRUNCATION = 1e-7
 SINGLE = 1e-6
 """Relative: a few operations in float32, whose rounding is 6e-8."""
 SMALL = {"channels": 3, "hidden": 8, "bands": 2}
-ALL = {"damping": "homogeneous", "rest_length_bound": 0.2, "output_bound": 1.5}
+SOLVED = 1e-9
+"""Relative: a least-squares solution in float64."""
+DIFFERENCES = 2e-6
+"""Relative: differences of positions in float32, some ten times longer than a spring."""
+ALL = {"damping": "homogeneous", "output_bound": 1.5}
 
 
 def twin() -> Twin:
@@ -60,11 +66,9 @@ def offsets(trained: TwinParameters, values: torch.Tensor | float) -> TwinParame
 # Gradients ------------------------------------------------------------------------------------------------------------
 
 TRAINED = {
-    "field": ("field", {}, ALL),
+    "field": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
     "field of coordinates": ("field", {"triplane": False}, ALL),
-    "springs": ("springs", {}, ALL | {"global_stiffness": True}),
-    "common factors": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
-    "unloaded shape": ("springs", {}, ALL | {"rest_shape": config.RestShape(handles=3)}),
+    "springs, unloaded shape": ("springs", {}, ALL | {"global_stiffness": True, "rest_shape": config.RestShape(handles=3)}),
 }
 
 
@@ -80,7 +84,7 @@ def test_gradients_through_simulated_frames_match_differences(name):
     start = twin_of(scene, x, hands[0])
     trained = parameters(kind, start, field, **settings).double()
     trained.start = {key: value.double() for key, value in trained.start.items()}
-    disturb(trained, seed=1)
+    disturb(trained, seed=0)
     topology, motion = start.topology, torch.tensor(hands)
     solver = FrameSolver(topology.springs, len(x), hands.shape[1], start.simulation, dtype=torch.float64)
     target = torch.tensor(np.random.default_rng(1).normal(size=(4, *x.shape)) * 0.1)
@@ -185,16 +189,12 @@ def test_offsets_are_logarithms_of_factors():
     torch.testing.assert_close(trained.physical()["stiffness"], expected, rtol=SINGLE, atol=0)
 
 
-def test_bounds_of_stiffness_and_rest_lengths():
+def test_the_bound_of_stiffness():
     """However far the offsets go."""
     for sign in (-1.0, 1.0):
         trained = offsets(parameters("springs", **ALL), sign * 50.0)
-        physical = trained.physical()
-        for name, bound in (("stiffness", 1.5), ("rest_lengths", 0.2)):
-            factor = torch.tensor(np.exp(sign * bound), dtype=torch.float32)
-            torch.testing.assert_close(physical[name], trained.start[name] * factor, rtol=SINGLE, atol=0)
-    free = offsets(parameters("springs"), 3.0)
-    assert torch.equal(free.physical()["rest_lengths"], free.start["rest_lengths"])
+        factor = torch.tensor(np.exp(sign * 1.5), dtype=torch.float32)
+        torch.testing.assert_close(trained.physical()["stiffness"], trained.start["stiffness"] * factor, rtol=SINGLE, atol=0)
 
 
 def test_homogeneous_damping_has_one_factor_for_all_dashpots_and_one_for_drag():
@@ -203,7 +203,6 @@ def test_homogeneous_damping_has_one_factor_for_all_dashpots_and_one_for_drag():
         trained.factors["drag"].fill_(0.5)
         trained.factors["dashpot"].fill_(-0.5)
     physical, start = trained.physical(), trained.start
-    assert trained.channels == ["stiffness"]
     torch.testing.assert_close(physical["drag"], start["drag"] * np.exp(0.5), rtol=SINGLE, atol=0)
     torch.testing.assert_close(physical["dashpot"], start["dashpot"] * np.exp(-0.5), rtol=SINGLE, atol=0)
     assert torch.equal(physical["stiffness"], start["stiffness"])
@@ -238,17 +237,6 @@ def test_a_damping_of_zero_has_no_factor():
     assert set(parameters(start=still, damping="homogeneous").factors) == {"dashpot"}
 
 
-def test_rest_lengths_are_free_per_spring_beside_a_field():
-    free = parameters(**ALL)
-    assert free.field().shape[1] == 1
-    with torch.no_grad():
-        free.rest_offsets[3] = 0.5
-    ratio = (free.physical()["rest_lengths"] / free.start["rest_lengths"]).detach()
-    assert ratio[3].item() == pytest.approx(np.exp(0.2 * np.tanh(0.5)), rel=SINGLE)
-    assert (ratio == 1).sum() == len(ratio) - 1
-    assert parameters().rest_offsets is None, "no bound: not trained"
-
-
 def test_the_field_lives_on_the_rest_shape():
     start = twin()
     points = len(start.topology.nodes) + len(start.topology.controllers)
@@ -269,10 +257,10 @@ def test_stiffness_of_zero_can_grow():
 
 
 def test_learning_rates_of_each_group():
-    field = {"plane_learning_rate": 0.3}
-    rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "rest_learning_rate": 0.4}
-    trained = parameters(field=field, damping="homogeneous", rest_length_bound=0.1, **rates)
-    expected = {"field.layers": 0.1, "field.planes": 0.3, "rest_offsets": 0.4}
+    shape = config.RestShape(handles=2, learning_rate=0.5)
+    rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "factor_learning_rate": 0.4}
+    trained = parameters(field={"plane_learning_rate": 0.3}, damping="homogeneous", rest_shape=shape, **rates)
+    expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4, "unloaded": 0.5}
     names = {tensor: name for name, tensor in trained.named_parameters()}
     for group in trained.groups():
         assert group["lr"] == group["base_rate"]
@@ -283,18 +271,6 @@ def test_learning_rates_of_each_group():
     assert not names, "every trained value belongs to one group"
 
 
-def test_factors_and_the_unloaded_shape_have_rates_of_their_own():
-    shape = config.RestShape(handles=2, learning_rate=0.5)
-    trained = parameters(
-        "springs", global_stiffness=True, factor_learning_rate=0.3, scalar_learning_rate=0.2, rest_shape=shape, learning_rate=0.1
-    )
-    rates = {tensor: group["base_rate"] for group in trained.groups() for tensor in group["params"]}
-    assert rates[trained.factors["stiffness"]] == 0.3
-    assert rates[trained.scalars["ground_friction"]] == 0.2
-    assert rates[trained.unloaded.handles] == 0.5
-    assert rates[trained.offsets] == 0.1
-
-
 def test_the_penalty_is_the_weighted_roughness():
     trained = disturb(parameters(field={"plane_smoothness": 0.5}))
     assert trained.penalty().item() == pytest.approx(0.5 * trained.field.roughness().item(), rel=SINGLE)
@@ -302,13 +278,6 @@ def test_the_penalty_is_the_weighted_roughness():
     for other in (parameters(), parameters("springs", field={"plane_smoothness": 0.5})):
         assert disturb(other).penalty() == 0
     assert parameters(field={"plane_smoothness": 0.5, "triplane": False}).penalty() == 0
-
-
-def test_the_prior_of_rest_lengths_is_their_mean_squared_logarithm():
-    trained = disturb(parameters(rest_length_bound=0.2, rest_prior=3.0))
-    ratio = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"]
-    assert trained.penalty().item() == pytest.approx(3.0 * float(ratio.log().square().mean()), rel=1e-4)
-    assert trained.penalty() > 0
 
 
 def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
@@ -379,13 +348,13 @@ def test_a_texel_has_moved_by_a_tenth_of_the_scale_at_the_start():
 
 
 def test_common_factors_and_strains_are_reported():
-    trained = of_scene("springs", global_stiffness=True, rest_length_bound=0.1)
+    trained = disturb(of_scene("springs", global_stiffness=True, rest_shape=config.RestShape(handles=3)))
     with torch.no_grad():
         trained.factors["stiffness"].fill_(math.log(3.0))
-        trained.offsets[:, 1] = math.inf
+        strain = trained.unloaded() - 1
     figures = movement(trained)
     assert figures["factors"] == pytest.approx({"stiffness": 3.0})
-    assert figures["rest_strain"] == pytest.approx(math.exp(0.1) - 1, rel=1e-5)
+    assert figures["rest_strain"] == pytest.approx(float(strain.square().mean().sqrt()), rel=1e-5)
 
 
 def gradient_over_epsilon(kind: str, epsilon: float, rate: float) -> float:
@@ -408,3 +377,99 @@ def test_gradients_of_texels_go_with_the_last_layer():
     slow, fast = (gradient_over_epsilon("field", 1e-15, rate) for rate in (1e-12, 1e-9))
     assert slow > 0
     assert fast == pytest.approx(1e3 * slow, rel=1e-2)
+
+
+# The unloaded shape -----------------------------------------------------------------------------------------------------
+
+
+def rope() -> Topology:
+    return small.fit_problem().twin.topology
+
+
+@pytest.mark.parametrize("handles", [2, 5, 1000])
+def test_every_affine_map_is_met_exactly(handles):
+    """The blend of one affine map at all handles is that map, wherever the handles are."""
+    points = np.random.default_rng(0).normal(size=(40, 3)) * (1.0, 0.3, 0.01)
+    matrix = blending(points, handles)
+    assert matrix.shape == (40, 4 * min(handles, 40))
+    wanted = points @ np.array([[0.1, 2.0, 0.0], [-0.4, 0.0, 1.0], [3.0, 0.0, 0.2]]) + [1.0, -2.0, 0.5]
+    solution = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+    np.testing.assert_allclose(matrix @ solution, wanted, atol=SOLVED * np.abs(wanted).max())
+    same = np.zeros((matrix.shape[1], 3))
+    same[::4] = (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(matrix @ same, np.broadcast_to((1.0, 2.0, 3.0), (40, 3)), rtol=SOLVED, err_msg="partition of unity")
+
+
+def test_a_point_far_from_every_handle_still_belongs_to_some():
+    points = np.concatenate([np.random.default_rng(0).normal(size=(30, 3)) * 0.01, [[100.0, 0.0, 0.0]]])
+    assert np.isfinite(blending(points, 3)).all()
+    np.testing.assert_allclose(blending(points, 3)[:, ::4].sum(axis=1), 1.0, rtol=SOLVED)
+
+
+def test_the_start_changes_no_length_and_a_rotation_none_either():
+    shape = UnloadedShape(rope(), 6)
+    assert torch.equal(shape(), torch.ones(len(rope().springs)))
+    points = rope().canonical.astype(np.float64)
+    quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = points @ quarter + 0.1 - points
+    handles = np.linalg.lstsq(shape.matrix.double().numpy(), turned, rcond=None)[0]
+    with torch.no_grad():
+        shape.handles.copy_(torch.from_numpy(handles))
+    torch.testing.assert_close(shape(), torch.ones_like(shape()), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(shape.displacement().detach().numpy(), turned, atol=1e-4 * np.abs(turned).max())
+
+
+def test_lengths_are_those_of_the_displaced_shape():
+    start = small.fit_problem().twin
+    run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, rest_shape=config.RestShape(handles=5))))
+    with torch.no_grad():
+        run.parameters.unloaded.handles.normal_(0.0, 0.3, generator=torch.Generator().manual_seed(0))
+    twin = run.parameters.as_twin(start)
+    assert not np.allclose(twin.topology.rest_lengths, start.topology.rest_lengths, rtol=1e-2)
+    expected = distances(twin.topology.canonical, start.topology.springs)
+    np.testing.assert_allclose(twin.topology.rest_lengths, expected, rtol=1e-5)
+    # Springs that were strained in the rest shape keep their ratio.
+    strained = replace(start, topology=replace(start.topology, rest_lengths=start.topology.rest_lengths * np.float32(0.9)))
+    other = TwinFit(small.fit_problem(twin=strained, fit=run.problem.fit))
+    other.parameters.restore(run.parameters.copy())
+    np.testing.assert_allclose(other.parameters.as_twin(strained).topology.rest_lengths, 0.9 * expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["springs", "field"])
+def test_a_bent_unloaded_shape_is_found(kind):
+    """What is filmed is a body that is unloaded in another shape; the stiffness is the true one."""
+    start = small.fit_problem().twin
+    field = config.SpringField(channels=4, hidden=8, bands=2)
+    still = {"learning_rate": 1e-9, "scalar_learning_rate": 1e-9, "field": field}
+    shape = config.RestShape(handles=4, prior=0.0, learning_rate=0.02)
+    settings = config.Fit(epochs=15, horizon=2, rest_shape=shape, **still)
+    bent = TwinFit(small.fit_problem(fit=settings))
+    with torch.no_grad():
+        bent.parameters.unloaded.handles.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(1))
+    truth = bent.parameters.as_twin(start)
+    seen = small.observations()
+    filmed = replace(seen, object_points=roll_out(truth, seen.controller_points).positions[:, : seen.object_points.shape[1]])
+    free = fit(small.fit_problem(filmed, fit=settings, kind=kind))
+    fixed = fit(small.fit_problem(filmed, fit=replace(settings, rest_shape=config.RestShape()), kind=kind))
+    assert free.best_loss < 0.3 * fixed.best_loss
+    # The prior holds it back.
+    held = fit(small.fit_problem(filmed, fit=replace(settings, rest_shape=replace(shape, prior=1e4)), kind=kind))
+    assert held.figures["rest_strain"] < 0.2 * free.figures["rest_strain"]
+    assert held.best_loss > 2 * free.best_loss
+
+
+def test_the_topology_spacing_is_that_of_a_lattice_and_follows_the_unit():
+    lattice = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), axis=-1).reshape(-1, 3) * 0.02
+    pairs = np.array([[0, 1]], np.int32)
+    made = Topology(
+        nodes=lattice.astype(np.float32),
+        controllers=np.full((1, 3), 9.0, np.float32),
+        springs=pairs,
+        rest_lengths=np.full(1, 0.05, np.float32),
+        labels=np.zeros(27, np.int32),
+    )
+    assert topology_spacing(made) == pytest.approx(0.02, rel=DIFFERENCES)
+    alone = replace(made, nodes=made.nodes[:1], labels=made.labels[:1], springs=np.array([[0, 1]], np.int32))
+    assert topology_spacing(alone) == pytest.approx(0.05, rel=DIFFERENCES), "one node: its springs"
+    with pytest.raises(ValueError, match="at least 2"):
+        config.RestShape(handles=1)

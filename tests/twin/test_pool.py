@@ -1,6 +1,5 @@
 """One twin on several recordings of an object: the search's costs, the fit's epochs, what is left out."""
 
-import functools
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +12,9 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin import polish as module
 from neuspring.twin.candidates import PENALTY, Recording, SearchProblem, evaluate, made, mean_outcome
-from neuspring.twin.fit import FitProblem, FitResult, fit
+from neuspring.twin.fit import FitProblem, FitResult, PooledFit, fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish
-from neuspring.twin.pool import PooledFit
 from neuspring.twin.search import search
 from neuspring.twin.trials import Outcome
 from tests.support import small
@@ -184,7 +182,7 @@ def problem_of(path: str, *, oracle: bool = False, **settings) -> FitProblem:
 
 def pooled(problem: FitProblem, *pool: Observations, leave_out: bool = False, **options) -> FitResult:
     """A fit on a pool."""
-    return fit(problem, run_of=functools.partial(PooledFit, pool=pool, leave_out=leave_out), **options)
+    return fit(replace(problem, pool=pool, leave_out=leave_out), **options)
 
 
 def require_equal(one: FitResult, other: FitResult) -> None:
@@ -207,24 +205,21 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
 
 SHAPE = config.RestShape(handles=4, prior=1e-3, learning_rate=0.02)
 SETTINGS = {
-    "all frames": {"horizon": 0},
-    "one step and tail": {"selection": "tail", "horizon": 0},
-    "shape, meters": {"rest_shape": SHAPE, "selection": "tail", "epochs": 2, "loss_unit": "meter"},
-    "lengths and damping": {"rest_length_bound": 0.1, "damping": "homogeneous", "global_stiffness": True},
+    "one step and tail": ("springs", {"selection": "tail", "horizon": 0}),
+    "shape, meters": ("springs", {"rest_shape": SHAPE, "selection": "tail", "epochs": 2, "loss_unit": "meter"}),
+    "field": ("field", {"field": config.SpringField(channels=4, hidden=16, bands=2), "learning_rate": 1e-2, "horizon": 0}),
 }
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_pool_of_one_is_the_plain_fit(name):
-    problem = problem_of(LIFTED, **SETTINGS[name])
-    require_equal(pooled(problem), fit(problem))
-    # With itself left out, the pool's fit is the plain one too.
+def test_a_pool_of_itself_alone_is_the_plain_fit(name):
+    kind, settings = SETTINGS[name]
+    problem = replace(problem_of(LIFTED, **settings), kind=kind)
     require_equal(pooled(problem, problem.observations, leave_out=True), fit(problem))
 
 
 def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
     problem, other, late = problem_of(LIFTED, oracle=True), seen(SHAKEN), small.spoiled_future()
-    require_equal(pooled(problem), fit(problem))
     found = pooled(problem, other, leave_out=True)
     require_equal(found, pooled(replace(problem, observations=late), other, leave_out=True))
     own = fit(replace(problem, observations=other))
@@ -239,7 +234,7 @@ def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
 def test_recordings_share_one_unloaded_shape_and_one_unit():
     problem = problem_of(LIFTED, epochs=1, rest_shape=SHAPE)
     larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
-    run = PooledFit(problem, pool=[larger])
+    run = PooledFit(replace(problem, pool=[larger]))
     with torch.no_grad():
         run.parameters.unloaded.handles.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
     here, there = (member.parameters.physical()["rest_lengths"] for member in run._members)
@@ -250,12 +245,6 @@ def test_recordings_share_one_unloaded_shape_and_one_unit():
     run.set_rate(1.0)
     run.epoch()
     assert not np.array_equal(before["unloaded.handles"], run.parameters.copy()["unloaded.handles"])
-
-
-def test_a_field_in_a_pool_of_one_is_the_plain_fit():
-    field = config.SpringField(channels=4, hidden=16, bands=2)
-    problem = replace(problem_of(LIFTED, field=field, learning_rate=1e-2), kind="field")
-    require_equal(pooled(problem), fit(problem))
 
 
 def test_left_out_recordings_lend_their_nodes_alone():
@@ -295,7 +284,7 @@ def test_one_material_comes_nearer_to_two_recordings():
 
 
 def test_a_killed_fit_continues_exactly(tmp_path):
-    problem = problem_of(LIFTED, rest_length_bound=0.1)
+    problem = problem_of(LIFTED, rest_shape=SHAPE)
     whole = pooled(problem, seen(SHAKEN))
 
     class Killed(Exception):
@@ -318,11 +307,11 @@ def test_recordings_with_other_nodes_are_refused():
     other = seen(SHAKEN)
     fewer = replace(other, surface_points=other.surface_points[1:])
     with pytest.raises(InputError, match=r"as many nodes and controllers: 124 and 3; received 123 and 3 in small.*mocap\.rings"):
-        PooledFit(problem, pool=[fewer])
+        replace(problem, pool=[fewer])
 
     order = np.random.default_rng(0).permutation(other.object_points.shape[1])
     shuffled = replace(other, surface_points=other.surface_points[::-1], object_points=other.object_points[:, order])
     with pytest.raises(InputError, match=r"must have the same nodes"):
-        PooledFit(problem, pool=[shuffled])
+        PooledFit(replace(problem, pool=[shuffled]))
     with pytest.raises(InputError, match=r"at least one other recording is required where this one is left out"):
-        PooledFit(problem, leave_out=True)
+        replace(problem, leave_out=True)
