@@ -109,10 +109,9 @@ def make_capture(
     force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
 ) -> None:
     """Color and depth of a camera -> a capture folder. What was found is printed, and the next command."""
-    from neuspring.data.intake.images import pairs
+    from neuspring.data.intake.feeds import Bag, Raw, pairs
     from neuspring.data.intake.lenses import Board
     from neuspring.data.intake.make import Intake, make_capture
-    from neuspring.data.intake.recordings import Bag, Raw
 
     given = [option for option, value in (("--color", color), ("--bag", bag), ("--phystwin-raw", phystwin_raw)) if value]
     if len(given) != 1:

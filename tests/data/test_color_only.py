@@ -11,7 +11,7 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.data.check import check_layout
-from neuspring.data.intake.images import pairs
+from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.plausible_world import on_table

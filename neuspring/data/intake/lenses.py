@@ -25,7 +25,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_findings, pose_findings
-from neuspring.data.intake.images import Lens
+from neuspring.data.intake.feeds import Lens
 
 MATRIX = ("K", "intrinsics", "camera_matrix")
 OPEN3D = "intrinsic_matrix"

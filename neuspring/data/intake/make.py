@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,12 +16,12 @@ from pydantic import TypeAdapter
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
-from neuspring.core.findings import refuse
+from neuspring.core.findings import Finding, refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
-from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, Capture, Description, Writer, description_findings
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
 from neuspring.data.intake.depth import Unit, find_rate
-from neuspring.data.intake.images import CameraFeed, Paired
+from neuspring.data.intake.feeds import Bag, CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.data.intake.poses import (
     FrameChoice,
@@ -31,6 +31,7 @@ from neuspring.data.intake.poses import (
     by_table,
     choose,
     given_alone,
+    in_report,
     look,
     meters_of,
     plain,
@@ -39,7 +40,6 @@ from neuspring.data.intake.poses import (
     stored_as,
     straightened,
 )
-from neuspring.data.intake.recordings import Raw
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -56,11 +56,11 @@ class Intake:
     category: str
     """Kind of object: cloth, rope, package, ..."""
     views: Sequence[CameraFeed]
-    """One per camera: `views.pairs`, `bag.Bag`, `raw.Raw.views`. Color alone, without depth, is of one."""
+    """One per camera: `feeds.pairs`, `Bag`, `Raw.views`. Color alone, without depth, is of one."""
     rate: float | None = None
     """Frames per second at which it was filmed; None: that of the video."""
     frames: str = ""
-    """Which are kept, see `choice.chosen`; all by default."""
+    """Which are kept, see `poses.chosen`; all by default."""
     depth_unit: float | None = None
     """m per count; None: that of the source, or guessed."""
     intrinsics: Path | None = None
@@ -96,55 +96,72 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     if all(isinstance(view, Paired) and view.depth is None for view in intake.views):
         _require_for_color_alone(intake)
     choice = choose(intake.views, intake.frames)
+    findings = [one for check in CHECKS for one in check(intake.views, choice)]
+    refuse_errors(findings)
     rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
     names = [view.name for view in intake.views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
     placed, how = _place(intake, seen, unit)
-    used = {name: [choice.places[name][f] for f in sorted(choice.places[name])] for name in seen}
-    files = {view.name: view.files(used[view.name]) for view in intake.views}
-    description = _describe(intake, choice, rate, unit, seen, placed) | {
-        "provenance": {
-            "source": "make-capture",
-            "files": _digest([file for listed in files.values() for file in listed]),
-            "frames": choice.text(),
-            **({} if unit is None else {"depth unit": unit.text()}),
-            "poses": how,
-            "table": placed.table,
-            **{
-                option: f"sha256:{digest_file(path)}"
-                for option, path in (("intrinsics", intake.intrinsics), ("poses file", intake.poses))
-                if path is not None
-            },
-        }
-    }
-    made = parse(Description, description, "make-capture")
-    refuse(description_findings(Path("make-capture"), made))
+    made = _describe(intake, choice, rate, unit, seen, placed, how)
     _write(intake, made, choice, unit, seen, placed)
-    jumps = [f"warning: time jumps at {choice.jumps} places, where frame numbers are left out"] if choice.jumps else []
-    remarks = [f"warning: {remark}" for view in intake.views for remark in view.remarks]
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
     depth = "none, color alone" if unit is None else unit.text()
     lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {how}, up {placed.up}"]
     training = made.train_end or int(0.7 * made.frame_count)
     lines += [
         *placed.lines,
-        *jumps,
-        *remarks,
+        *map(in_report, findings),
         f"training frames: 0 to {training - 1}; future frames: {training} to {made.frame_count - 1}",
     ]
     return Capture.load(intake.folder), lines
 
 
+# What is odd or wrong in the files of the cameras, by name and level: errors are refused, warnings and notes stand in the report.
+# To add a check: a function of the feeds and the chosen frames that yields findings, and its name in CHECKS.
+
+
+def time_jumps(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """Frames that are left out between others."""
+    if choice.jumps:
+        yield _odd("time jumps", "--frames", f"at {choice.jumps} places, where frame numbers are left out")
+
+
+def images_alone(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """Color without depth, or depth without color."""
+    for view in views:
+        if isinstance(view, Paired) and view.alone:
+            yield _odd("images alone", view.path, f"camera {view.name}: {view.alone} images without their partner are left out")
+
+
+def dropped_pictures(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """Gaps in the time stamps of a video."""
+    for images in (images for view in views if isinstance(view, Paired) for images in view.sources):
+        if isinstance(images, VideoFile) and (count := images.dropped()):
+            text = f"{images.path}: about {count} pictures were dropped when it was filmed; time jumps there"
+            yield _odd("dropped pictures", images.path, text)
+
+
+def distortion_that_stays(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """A lens model of RealSense that OpenCV does not have."""
+    for view in views:
+        if isinstance(view, Bag) and not view.straightens:
+            largest = f"largest coefficient {abs(view.coefficients).max():.3g}"
+            text = f"{view.path}: distortion of the model {view.model} is not removed; {largest}"
+            yield _odd("lens model", view.path, text)
+
+
+def _odd(name: str, where: object, text: str) -> Finding:
+    return Finding(name=name, level="warning", where=str(where), text=text)
+
+
+CHECKS = (time_jumps, images_alone, dropped_pictures, distortion_that_stays)
+
+
 def _require_for_color_alone(intake: Intake) -> None:
     """Raise InputError for options that need depth, and without those that must stand in for it."""
-    deep = {
-        "--level": intake.level,
-        "--top-down": intake.top_down,
-        "--table-at": intake.table_at,
-        "--depth-unit": intake.depth_unit,
-    }
-    for option, value in deep.items():
+    for option in ("--level", "--top-down", "--table-at", "--depth-unit"):
+        value = getattr(intake, option[2:].replace("-", "_"))
         if value:
             raise InputError(option, "needs depth: with color alone the table is z = 0 as the poses say", "no --depth")
     if intake.intrinsics is None:
@@ -190,29 +207,52 @@ def _place(intake: Intake, seen: Mapping[str, SampledCamera], unit: Unit | None)
 
 
 def _describe(
-    intake: Intake, choice: FrameChoice, rate: float, unit: Unit | None, seen: Mapping[str, SampledCamera], placed: Placed
-) -> dict[str, Any]:
-    """The entries of capture.json."""
-    entries = []
+    intake: Intake,
+    choice: FrameChoice,
+    rate: float,
+    unit: Unit | None,
+    seen: Mapping[str, SampledCamera],
+    placed: Placed,
+    how: str,
+) -> Description:
+    """capture.json. Raises InputError."""
+    cameras = []
     for name, view in seen.items():
-        entry = Camera(name, *view.size, view.lens.matrix, placed.poses[name]).entry()
-        entries.append(TypeAdapter(type(entry)).dump_python(replace(entry, missing=choice.missing(name))))
+        entry = replace(Camera(name, *view.size, view.lens.matrix, placed.poses[name]).entry(), missing=choice.missing(name))
+        cameras.append(TypeAdapter(CameraEntry).dump_python(entry))
     is_counted = next(iter(seen.values())).unit is not None
-    whole = intake.raw is not None and not intake.frames
-    return {
+    train_end = intake.train_end
+    if train_end is None and intake.raw is not None and not intake.frames:
+        train_end = intake.raw.train_end
+    digest = hashlib.sha256()
+    used = {view.name: [place for _, place in sorted(choice.places[view.name].items())] for view in intake.views}
+    for path in dict.fromkeys(path for view in intake.views for path in view.files(used[view.name])):
+        digest.update(f"{path.name} {digest_file(path)}\n".encode())
+    provenance = {"source": "make-capture", "files": f"sha256:{digest.hexdigest()}", "frames": choice.text()}
+    if unit is not None:
+        provenance["depth unit"] = unit.text()
+    provenance |= {"poses": how, "table": placed.table}
+    for option, given in (("intrinsics", intake.intrinsics), ("poses file", intake.poses)):
+        if given is not None:
+            provenance[option] = f"sha256:{digest_file(given)}"
+    entries = {
         "format": 1,
         "name": intake.name,
         "category": intake.category,
         "frame_count": len(choice.numbers),
         "frame_rate": rate,
-        "cameras": tuple(entries),
+        "cameras": tuple(cameras),
         "depth": "none" if unit is None else "measured",
         "depth_unit": unit.meters if unit is not None and is_counted else 0.001,
         "depth_format": "png" if unit is None or is_counted else "npy",
         "up": placed.up,
-        "train_end": intake.train_end if intake.train_end is not None else intake.raw.train_end if intake.raw and whole else None,
+        "train_end": train_end,
         "masks": bool(intake.raw and intake.raw.ids),
+        "provenance": provenance,
     }
+    made = parse(Description, entries, "make-capture")
+    refuse(description_findings(Path("make-capture"), made))
+    return made
 
 
 def _write(
@@ -222,15 +262,16 @@ def _write(
     recipe["distortion"] = {name: view.lens.distortion.tolist() for name, view in seen.items()}
     begun = prepare(intake.folder, recipe, intake.force)
     writer, done = Writer(intake.folder, made), 0
-    total = sum(len(places) for places in choice.places.values())
-    progress = Progress(f"make-capture {intake.name}", total)
+    kinds: tuple[Literal["color", "depth"], ...] = ("color",) if unit is None else ("color", "depth")
+    progress = Progress(f"make-capture {intake.name}", sum(len(places) for places in choice.places.values()))
     for view in intake.views:
         straight, size = Straightener(seen[view.name].lens, seen[view.name].size), seen[view.name].size
-        frames = sorted(choice.places[view.name])
-        kept = written(writer, view.name, frames) if begun else set()
-        left = [frame for frame in frames if frame not in kept]
-        done += len(kept)
-        for frame, (color, depth) in zip(left, view.read([choice.places[view.name][f] for f in left]), strict=True):
+        places = dict(sorted(choice.places[view.name].items()))
+        if begun:
+            there = [f for f in places if all(writer.capture.path(kind, view.name, f).is_file() for kind in kinds)]
+            done += len(there[:-1])  # the last may be half written
+            places = {frame: place for frame, place in places.items() if frame not in there[:-1]}
+        for frame, (color, depth) in zip(places, view.read(list(places.values())), strict=True):
             require_aligned(view.path, view.name, color, depth, size)
             stored = None
             if depth is not None and unit is not None:
@@ -247,15 +288,7 @@ def _write(
     if intake.raw is not None and intake.raw.tracks is not None:
         tracks = intake.raw.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
     writer.finish(tracks)
-    close(intake.folder)
-
-
-def _digest(files: Sequence[Path]) -> str:
-    """SHA-256 over names and contents."""
-    digest = hashlib.sha256()
-    for path in dict.fromkeys(files):
-        digest.update(f"{path.name} {digest_file(path)}\n".encode())
-    return f"sha256:{digest.hexdigest()}"
+    (intake.folder / RECIPE).unlink()
 
 
 RECIPE = ".make-capture.json"
@@ -280,27 +313,12 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
         if not (force and ours):
             remedy = "Choose another folder" + (", or give --force, which replaces its images." if ours else ".")
             raise InputError(folder, "--output must be a new or empty folder", what, remedy)
-        kept = [name for name in PRECIOUS if (folder / name).exists()]
-        if kept:
-            raise InputError(
-                folder, "--force does not remove masks, marks, clicks or tracks", " and ".join(kept), "Move them away first."
-            )
+        if kept := [name for name in PRECIOUS if (folder / name).exists()]:
+            rule = "--force does not remove masks, marks, clicks or tracks"
+            raise InputError(folder, rule, " and ".join(kept), "Move them away first.")
         (folder / CAPTURE).unlink(missing_ok=True)
         for kind in ("color", "depth"):
             if (folder / kind).is_dir():
                 shutil.rmtree(folder / kind)
     write_text(path, json.dumps(recipe, indent=1) + "\n")
     return False
-
-
-def written(writer: Writer, camera: str, frames: list[int]) -> set[int]:
-    """The frames of an interrupted folder that are complete: all with their images, but the last, which may be half written."""
-    capture = writer.capture
-    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth") if capture.has_depth else ("color",)
-    there = [f for f in frames if all(capture.path(kind, camera, f).is_file() for kind in kinds)]
-    return set(there[:-1])
-
-
-def close(folder: Path) -> None:
-    """The capture is complete."""
-    (folder / RECIPE).unlink(missing_ok=True)

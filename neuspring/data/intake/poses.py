@@ -14,7 +14,7 @@ import numpy as np
 
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
-from neuspring.core.findings import refuse
+from neuspring.core.findings import Finding, refuse
 from neuspring.data.capture import Camera
 from neuspring.data.intake.depth import (
     Plane,
@@ -28,8 +28,8 @@ from neuspring.data.intake.depth import (
     planes,
     pose_on,
 )
-from neuspring.data.intake.images import CameraFeed, Lens, Pair, open_images
-from neuspring.data.intake.lenses import Board, Sighting, Straightener, depth_ratio, require_lens, sight
+from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, open_images
+from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.data.plausible_world import color_alone_findings, table_findings
 
 FEWEST = 5
@@ -241,7 +241,15 @@ def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[P
         sighting = sight(path, board, pictures, view.lens.matrix)
         poses[name] = sighting.camera_to_world
         line = f"board, camera {name}: {sighting.corners} corners, {sighting.error:.2f} pixels rms"
-        lines.append(line if images or not view.depths else line + _compare(path, sighting, view))
+        if view.depths and not images:
+            ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
+            ratio = float(np.median(ratios)) if ratios else 1.0
+            if abs(ratio - 1) > RATIO:
+                wrong = f"the square is {ratio:.3g} times as long as --board says, or --depth-unit is off by {1 / ratio:.3g}"
+                rule = f"depth must place the board where its size does, within {RATIO:.0%}"
+                raise InputError(path, rule, f"{ratio:.3f} times as far", f"Either {wrong}.")
+            line += f", depth {ratio:.3f} of its distance" if ratios else "; too little depth on it to check its size"
+        lines.append(line)
     return poses, lines
 
 
@@ -284,8 +292,8 @@ def stand(
         for side in ([up] if up else ["+z", "-z"])
     }
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
-    refuse([d for d in judged[side] if d.level == "error"])
-    lines += [f"{'warning: ' if d.level == 'warning' else ''}{d.message}" for d in judged[side]]
+    refuse(one for one in judged[side] if one.level == "error")
+    lines += [in_report(one) for one in judged[side]]
     text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 
@@ -298,9 +306,13 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
     judged = color_alone_findings(where, Camera(name, *view.size, view.lens.matrix, pose), up)
-    refuse([d for d in judged if d.level == "error"])
-    lines = tuple(f"{'warning: ' if d.level == 'warning' else ''}{d.message}" for d in judged)
-    return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=lines)
+    refuse(one for one in judged if one.level == "error")
+    return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
+
+
+def in_report(one: Finding) -> str:
+    """A finding as a line of the report."""
+    return f"warning: {one.message}" if one.level == "warning" else one.message
 
 
 def _point(seen: SampledCamera, at: tuple[float, float]) -> np.ndarray:
@@ -327,16 +339,3 @@ def _pictures(path: Path, view: SampledCamera) -> list[np.ndarray]:
             raise InputError(path, rule, f"{picture.shape[1]} x {picture.shape[0]}")
         pictures.append(straight.color(picture))
     return pictures
-
-
-def _compare(path: Path, sighting: Sighting, view: SampledCamera) -> str:
-    """The board's distance by depth. Raises InputError where it contradicts the board's size."""
-    ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
-    if not ratios:
-        return "; too little depth on it to check its size"
-    ratio = float(np.median(ratios))
-    if abs(ratio - 1) > RATIO:
-        remedy = f"Either the square is {ratio:.3g} times as long as --board says, or --depth-unit is off by {1 / ratio:.3g}."
-        rule = f"depth must place the board where its size does, within {RATIO:.0%}"
-        raise InputError(path, rule, f"{ratio:.3f} times as far", remedy)
-    return f", depth {ratio:.3f} of its distance"

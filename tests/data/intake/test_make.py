@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
-from neuspring.data.intake.images import pairs
+from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import RECIPE, Intake, make_capture
 from tests.support import realsense

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.images import ImageFolder, VideoFile, pairs
+from neuspring.data.intake.feeds import ImageFolder, VideoFile, pairs
 from neuspring.data.intake.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
 
@@ -94,7 +94,7 @@ def test_color_and_depth_pair_by_their_numbers_and_else_by_their_order(tmp_path)
     (root / "depth_0" / "frame_12.png").unlink()
     view = pairs([root / "color_0"], [root / "depth_0"])[0]
     assert view.numbers == [10, 11, 13, 14, 15, 16]
-    assert view.remarks == ["camera 0: 1 images without their partner are left out"]
+    assert view.alone == 1
     color, depth = next(view.read([2]))
     np.testing.assert_array_equal(depth, counts(seen(camera(), 3)[1]))
     np.testing.assert_array_equal(color, seen(camera(), 3)[0])

@@ -1,0 +1,463 @@
+"""What one camera gave, in the order of time: folders of images, videos, RealSense files, PhysTwin's raw layout.
+
+An image source has pictures of one kind (color or depth). A feed is one camera: color and depth in pairs, or color alone, with what
+the files say about the camera. `ImageFolder` and `VideoFile` are sources, `Paired` and `Bag` feeds. All have
+
+    path         for messages
+    numbers      of every picture or pair, ascending: that in its name, or its place, from 0
+    rate         frames per second, where the files know
+    read(places) the pictures or pairs at ascending places
+    files(places) the files that hold them
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+
+import cv2
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
+from neuspring.core.files import load_json
+from neuspring.core.findings import refuse
+from neuspring.data import phystwin
+from neuspring.data.capture import Camera
+from neuspring.data.unpickle import load_pickle
+
+if TYPE_CHECKING:
+    import av
+
+T = TypeVar("T")
+Kind = Literal["color", "depth"]
+PICTURES = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
+VIDEOS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
+DEEP = ("gray16le", "gray16be")
+"""Pixel formats of a video that holds depth. Those of 10 and 12 bits would be scaled when they are read."""
+LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
+GAP = 1.5
+"""Pictures this many times farther apart than usual have others missing between them."""
+
+
+def _picked(path: Path, pictures: Iterable[T], places: Sequence[int]) -> Iterator[T]:
+    """Those at ascending places. Raises InputError where the file ends early."""
+    wanted = list(places)
+    for place, picture in enumerate(pictures):
+        if not wanted:
+            return
+        if place == wanted[0]:
+            wanted.pop(0)
+            yield picture
+    if wanted:
+        raise InputError(path, f"a picture {wanted[0]} is required", "the file ends before it")
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Images in one folder, in the order of their names, in which runs of digits count as numbers: 10 comes after 9."""
+
+    path: Path
+    kind: Kind
+    rate = None
+
+    @cached_property
+    def paths(self) -> list[Path]:
+        """Its images. Raises InputError where there are none, or of two formats."""
+        found = [path for path in self.path.iterdir() if path.suffix.lower() in PICTURES[self.kind] and path.name[0] != "."]
+        endings = sorted({path.suffix.lower() for path in found})
+        if len(endings) != 1:
+            rule = f"{self.kind} images of one format are required ({' '.join(PICTURES[self.kind])})"
+            raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
+        # re.split with a group alternates text and digits.
+        return sorted(
+            found, key=lambda path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)]
+        )
+
+    @cached_property
+    def numbers(self) -> list[int]:
+        """The numbers at the end of the names where they differ in nothing else, else places from 0."""
+        matches = [match for path in self.paths if (match := re.fullmatch(r"(.*?)([0-9]{1,9})", path.stem))]
+        numbers = [int(match[2]) for match in matches]
+        counted = len({match[1] for match in matches}) == 1 and len(set(numbers)) == len(self.paths)
+        return numbers if counted else list(range(len(self.paths)))
+
+    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
+        """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
+        for path in self.files(places):
+            if path.suffix.lower() == ".npy":
+                try:
+                    image = np.load(path, allow_pickle=False)
+                except (OSError, ValueError, EOFError) as error:
+                    raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
+            else:
+                image = cv2.imread(str(path), cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
+                if image is None:
+                    raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from the camera.")
+                image = image[..., ::-1] if self.kind == "color" else image
+            yield require_kind(path, self.kind, image)
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """One per picture."""
+        return [self.paths[place] for place in places]
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video; depth needs a gray one of 16 bits."""
+
+    path: Path
+    kind: Kind
+
+    @cached_property
+    def _times(self) -> list[Fraction]:
+        """s, of every picture, ascending. Raises InputError for a file without video, or one that is stored turned."""
+        with _opened(self.path) as container:
+            stream = container.streams.video[0]
+            if self.kind == "depth" and stream.codec_context.pix_fmt not in DEEP:
+                remedy = "Color maps and 8 bits lose the depth: store gray16le in FFV1 (mkv), or a folder of 16-bit PNG."
+                raise InputError(self.path, "a depth video must be gray with 16 bits", stream.codec_context.pix_fmt, remedy)
+            if self.kind == "depth" and stream.codec_context.name not in LOSSLESS:
+                rule = f"a depth video must be lossless ({' '.join(LOSSLESS)})"
+                raise InputError(self.path, rule, stream.codec_context.name, "Store gray16le in FFV1 (mkv).")
+            first = next(container.decode(stream), None)
+            if first is not None and first.rotation:
+                remedy = "Write it upright, as the intrinsics are: ffmpeg -i VIDEO -crf 12 upright.mp4"
+                raise InputError(self.path, "a video must be stored upright", f"turned by {first.rotation} degrees", remedy)
+        with _opened(self.path) as container:
+            stream = container.streams.video[0]
+            base = stream.time_base or Fraction(1)
+            return sorted(packet.pts * base for packet in container.demux(stream) if packet.pts is not None and packet.size)
+
+    @cached_property
+    def _steps(self) -> np.ndarray:
+        """s, from each picture to the next."""
+        return np.diff([float(time) for time in self._times])
+
+    @property
+    def numbers(self) -> list[int]:
+        """Places from 0."""
+        return list(range(len(self._times)))
+
+    @property
+    def rate(self) -> float | None:
+        """The mean distance of pictures decides, as time stamps may be whole milliseconds; gaps of dropped ones do not count."""
+        steps = self._steps
+        return float(1 / steps[steps <= GAP * np.median(steps)].mean()) if len(steps) else None
+
+    def dropped(self) -> int:
+        """Pictures that are missing in between."""
+        steps = self._steps
+        return int(np.round(steps[steps > GAP * np.median(steps)] / np.median(steps) - 1).sum()) if len(steps) else 0
+
+    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
+        """As a folder. The video is decoded from its beginning. Raises InputError where it ends early."""
+        form = "rgb24" if self.kind == "color" else "gray16le"
+        with _opened(self.path) as container:
+            try:
+                for frame in _picked(self.path, container.decode(container.streams.video[0]), places):
+                    yield require_kind(self.path, self.kind, frame.to_ndarray(format=form))
+            except needed("av").error.FFmpegError as error:
+                raise InputError(self.path, "this video must be readable", str(error)) from error
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """The video."""
+        return [self.path]
+
+
+ImageSource: TypeAlias = ImageFolder | VideoFile
+
+
+def open_images(path: Path, kind: Kind) -> ImageSource:
+    """A folder or a video. Raises InputError for anything else."""
+    if path.is_dir():
+        return ImageFolder(path, kind)
+    if path.is_file() and path.suffix.lower() in VIDEOS:
+        return VideoFile(path, kind)
+    received = "nothing there" if not path.exists() else f"a {path.suffix or 'plain'} file"
+    raise InputError(path, f"a folder of {kind} images ({' '.join(PICTURES[kind])}) or a video ({' '.join(VIDEOS)})", received)
+
+
+def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
+    """The image, if it is RGB of 8 bits, or depth of one channel: 16 bits or more, or floating point. Raises InputError."""
+    received = f"{image.dtype} of shape {image.shape}"
+    if kind == "color":
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(path, "color must be 8-bit RGB [H, W, 3]", received)
+        return image
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[..., 0]
+    if image.ndim != 2:
+        remedy = "A picture of depth in colors is none: export the raw depth (16-bit PNG or npy)."
+        raise InputError(path, "depth must have one channel [H, W]", received, remedy)
+    if image.dtype.kind not in "uif" or image.dtype.itemsize < 2:
+        remedy = "8 bits cannot hold it: export the raw depth (16-bit PNG or npy)."
+        raise InputError(path, "depth must be integers of at least 16 bits, or floating point", received, remedy)
+    return image
+
+
+def _opened(path: Path) -> av.container.InputContainer:
+    needed("av")
+    import av
+
+    try:
+        container = av.open(str(path))
+    except (av.error.FFmpegError, OSError) as error:
+        raise InputError(path, "this file must be a readable video", str(error)) from error
+    if not container.streams.video:
+        container.close()
+        raise InputError(path, "this file must have a video stream", "none")
+    return container
+
+
+Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
+"""RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
+COMMON = 0.5
+"""Color and depth are paired by their numbers if this part of them is common, else by their order."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """A camera's intrinsics."""
+
+    matrix: np.ndarray
+    """K [3, 3], pixels."""
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Coefficients of OpenCV's model (4, 5, 8, 12 or 14); none: no distortion."""
+    size: tuple[int, int] | None = None
+    """(width, height) for which it holds, where it is said."""
+
+
+@dataclass(frozen=True, eq=False)
+class Paired:
+    """Color and depth of two folders or videos, or color alone."""
+
+    name: str
+    color: ImageSource
+    depth: ImageSource | None
+    unit: float | None = None
+    lens: Lens | None = None
+    pose: np.ndarray | None = None
+
+    @property
+    def path(self) -> Path:
+        """That of color."""
+        return self.color.path
+
+    @cached_property
+    def _pairs(self) -> list[tuple[int, int, int]]:
+        """(number, place of color, place of depth). Raises InputError where they cannot be paired."""
+        if self.depth is None:
+            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
+        left, right = ({number: place for place, number in enumerate(images.numbers)} for images in (self.color, self.depth))
+        common = sorted(left.keys() & right.keys())
+        if len(common) >= COMMON * max(len(left), len(right)) and len(common):
+            return [(number, left[number], right[number]) for number in common]
+        if len(left) == len(right):
+            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
+        rule = f"camera {self.name} needs as many depth images as color images, or the same numbers in their names"
+        remedy = "Where both have time stamps for names, copy the nearest pairs to two folders first."
+        raise InputError(self.depth.path, rule, f"{len(right)} for {len(left)}, {len(common)} numbers in common", remedy)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Of the pairs."""
+        return [number for number, *_ in self._pairs]
+
+    @property
+    def rate(self) -> float | None:
+        """That of the color video."""
+        return self.color.rate
+
+    @property
+    def sources(self) -> list[ImageSource]:
+        """Color, and depth where there is any."""
+        return [self.color] if self.depth is None else [self.color, self.depth]
+
+    @property
+    def alone(self) -> int:
+        """Images without a partner."""
+        return max(len(images.numbers) for images in self.sources) - len(self._pairs)
+
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
+        """With depth all of them, or none."""
+        pairs = [self._pairs[place] for place in places]
+        colors = self.color.read([left for _, left, _ in pairs])
+        if self.depth is None:
+            return zip(colors, [None] * len(pairs), strict=True)
+        return zip(colors, self.depth.read([right for *_, right in pairs]), strict=True)
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """Those of color, then those of depth."""
+        pairs = [self._pairs[place] for place in places]
+        deep = [] if self.depth is None else self.depth.files([right for *_, right in pairs])
+        return self.color.files([left for _, left, _ in pairs]) + deep
+
+
+def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[CameraFeed]:
+    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
+
+    Raises InputError.
+    """
+    if len(colors) > 1 and not depths:
+        rule = "without depth one camera is required: color alone is of one view"
+        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
+    if not colors or (depths and len(colors) != len(depths)):
+        rule = "as many folders or videos of depth as of color are required, one each per camera"
+        raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
+    names = names or tuple(map(str, range(len(colors))))
+    if len(names) != len(colors) or len(set(names)) < len(names):
+        raise InputError("--cameras", f"{len(colors)} different names are required", " ".join(names))
+    deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
+    return [
+        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
+    ]
+
+
+MODULE = "pyrealsense2"
+PATIENCE = 5000
+"""ms until the next frames of a file; none within it: the file ends."""
+MODELS = {"none": True, "brown_conrady": True, "modified_brown_conrady": False, "inverse_brown_conrady": False}
+"""Whether OpenCV's coefficients (k1, k2, p1, p2, k3) mean the same."""
+
+
+class Bag:
+    """One camera's recording in a RealSense file. Every pass plays the file once; the first, here, counts its frames."""
+
+    pose = None
+
+    def __init__(self, name: str, path: Path) -> None:
+        """Raises InputError."""
+        self.name, self.path = name, path
+        count = 0
+        for profile, _, _ in self._play(True):
+            if not count:
+                stream = profile.get_stream(_library().stream.color)
+                self.rate = float(stream.fps())
+                self.unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
+                about = stream.as_video_stream_profile().get_intrinsics()
+                self.model = str(about.model).rpartition(".")[2]
+                self.coefficients = np.array(about.coeffs, dtype=float)
+                matrix = np.array([[about.fx, 0, about.ppx], [0, about.fy, about.ppy], [0, 0, 1.0]])
+                distortion = self.coefficients if self.straightens else np.zeros(0)
+                self.lens = Lens(matrix=matrix, distortion=distortion, size=(int(about.width), int(about.height)))
+            count += 1
+        if not count:
+            raise InputError(path, "pairs of color and depth are required", "none", "Record both streams.")
+        self.numbers = list(range(count))
+
+    @property
+    def straightens(self) -> bool:
+        """Whether its distortion can be removed."""
+        return not self.coefficients.any() or MODELS.get(self.model, False)
+
+    def read(self, places: Sequence[int]) -> Iterator[Pair]:
+        """Color with depth that is aligned to it. Raises InputError where the file ends early."""
+        return _picked(self.path, ((color, depth) for _, color, depth in self._play(False)), places)
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """The recording."""
+        return [self.path]
+
+    def _play(self, only_count: bool) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
+        """Profile, RGB and aligned depth of every pair whose color is new; empty images where they are only counted."""
+        library = _library()
+        if not self.path.is_file():
+            raise InputError(self.path, "a RealSense .bag file is required", "nothing there")
+        pipeline, settings = library.pipeline(), library.config()
+        settings.enable_device_from_file(str(self.path), repeat_playback=False)
+        try:
+            profile = pipeline.start(settings)
+        except RuntimeError as error:
+            raise InputError(self.path, "this file must be a RealSense recording", str(error)) from error
+        try:
+            profile.get_device().as_playback().set_real_time(False)
+            align, last = library.align(library.stream.color), -1
+            while True:
+                there, frames = pipeline.try_wait_for_frames(PATIENCE)
+                if not there:
+                    return
+                color, depth = frames.get_color_frame(), frames.get_depth_frame()
+                if not color or not depth or color.get_frame_number() == last:
+                    continue
+                last = color.get_frame_number()
+                if only_count:
+                    yield profile, np.zeros(0), np.zeros(0)
+                    continue
+                frames = align.process(frames)
+                color, depth = frames.get_color_frame(), frames.get_depth_frame()
+                image, kind = np.array(color.get_data()), str(color.get_profile().format()).rpartition(".")[2]
+                if kind == "bgr8":
+                    image = image[..., ::-1]
+                elif kind == "yuyv":
+                    image = cv2.cvtColor(image.view(np.uint8).reshape(*image.shape[:2], 2), cv2.COLOR_YUV2RGB_YUYV)
+                elif kind != "rgb8":
+                    raise InputError(self.path, "color must be rgb8, bgr8 or yuyv", kind)
+                yield profile, image, np.array(depth.get_data())
+        finally:
+            pipeline.stop()
+
+
+def _library() -> Any:
+    try:
+        return importlib.import_module(MODULE)
+    except ImportError as error:
+        remedy = f"Run `pip install {MODULE}`, or export the recording to folders (rs-convert) and use --color and --depth."
+        raise InputError("--bag", f"the package {MODULE} is required to read a .bag file", "not installed", remedy) from error
+
+
+CameraFeed: TypeAlias = Paired | Bag
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """A case in PhysTwin's raw layout."""
+
+    case: Path
+    views: list[Paired]
+    cameras: dict[str, Camera]
+    rate: float
+    train_end: int | None
+    """Of all its frames."""
+    tracks: np.ndarray | None
+    """[T, K, 3], m, in its world."""
+    ids: dict[str, dict[int, list[str]]]
+    """Detections of each label, by camera; empty without masks."""
+
+    @classmethod
+    def open(cls, case: Path) -> Raw:
+        """Read its calibration. Raises InputError."""
+        metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / phystwin.CALIBRATION)
+        refuse(phystwin.raw_findings(case, metadata, poses))
+        cameras = {camera.name: camera for camera in phystwin.cameras_of(metadata, poses)}
+        views = [
+            Paired(
+                name,
+                open_images(case / "color" / name, "color"),
+                open_images(case / "depth" / name, "depth"),
+                unit=0.001,
+                lens=Lens(matrix=camera.intrinsics, size=(camera.width, camera.height)),
+                pose=camera.camera_to_world,
+            )
+            for name, camera in cameras.items()
+        ]
+        frames = int(metadata["frame_num"])
+        return cls(
+            case,
+            views,
+            cameras,
+            float(metadata.get("fps", phystwin.RELEASED_FRAME_RATE)),
+            phystwin.train_end_of(case, frames),
+            phystwin.annotated(case, frames),
+            {name: phystwin.detections(case, name) for name in cameras} if (case / "mask").is_dir() else {},
+        )
+
+    def labels(self, camera: str, number: int) -> np.ndarray:
+        """Mask [H, W] uint8 of a camera's frame with this number in its name. Raises InputError."""
+        return phystwin.labels_of(self.case, self.cameras[camera], number, self.ids[camera])
