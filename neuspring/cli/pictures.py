@@ -19,17 +19,12 @@ from neuspring.data.capture import Camera, Capture
 from neuspring.perception.results import Masks
 from neuspring.play.results import Run, find
 from neuspring.play.results import Scene as Found
-from neuspring.report.figures.run import chosen_frames
-from neuspring.report.paper import sheet
-from neuspring.report.paper.body import TwinPicture, body_figure
-from neuspring.report.paper.cells import DrawingStyle, Error, Painter, Style
-from neuspring.report.paper.film import write_film
-from neuspring.report.paper.scene import Prediction, Scene, broad_side, seen_from, shown_points
-from neuspring.report.paper.strip import caption, strip_figure
-
-ELEVATION = 25.0
-"""Degrees above the horizon of a view that is not asked for."""
-
+from neuspring.report.draw import sheet
+from neuspring.report.draw.film import write_film
+from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style
+from neuspring.report.draw.scene import ELEVATION, Prediction, Scene, chosen_frames
+from neuspring.report.draw.strip import caption, strip_figure
+from neuspring.report.draw.twin import TwinPicture, twin_figure
 
 MEGABYTES = 2.0
 """Size of a film that a README loads at once."""
@@ -184,8 +179,7 @@ def draw_twin(picture: TwinOptions) -> None:
     if picture.background == "image" and scene.photo(picture.frame) is None:
         raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
     body = TwinPicture(
-        scene,
-        chosen.takes,
+        [(scene, take) for take in chosen.takes],
         picture.frame,
         tuple(dict.fromkeys(picture.by)),
         picture.style,
@@ -193,7 +187,7 @@ def draw_twin(picture: TwinOptions) -> None:
         chosen.images,
         chosen.device,
     )
-    sheet.save(body_figure(body, picture.width), picture.output, picture.dpi)
+    sheet.save(twin_figure(body, picture.width), picture.output, picture.dpi)
     print(
         f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, "
         f"camera {scene.camera.name}"
@@ -292,10 +286,7 @@ def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Predict
     if cameras and not turned:
         camera = cameras[a.camera or next(iter(cameras))]
         return Scene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
-    points = shown_points(observations, takes, frames)
-    azimuth = broad_side(points, observations.scenario.up) if a.azimuth is None else a.azimuth
-    elevation = ELEVATION if a.elevation is None else a.elevation
-    return Scene.of(observations, seen_from(points, observations.scenario.up, azimuth, elevation), takes, frames)
+    return Scene.from_side(observations, takes, frames, a.azimuth, ELEVATION if a.elevation is None else a.elevation)
 
 
 def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.figures.twin import COLORS, region_colors, stiffness_limits
+from neuspring.report.draw.twin import COLORS, region_colors, stiffness_limits
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
 DIVERGING = "coolwarm"

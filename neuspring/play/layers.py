@@ -16,7 +16,7 @@ from neuspring.core.artifacts import Observations, SplatCenters, Twin
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.play.colors import OVER, Scale, Springs, linear, node_colors
-from neuspring.report.figures.views import sample
+from neuspring.report.draw.sheet import sample
 from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin

@@ -18,7 +18,7 @@ from neuspring.play.colors import OVER, Springs, strain_scale
 from neuspring.play.controls import Controls, replay
 from neuspring.play.live import TOO_MUCH
 from neuspring.play.results import Run, Scene
-from neuspring.report.figures.views import sample
+from neuspring.report.draw.sheet import sample
 from neuspring.report.video import Video
 from neuspring.splats.draw import WHITE, picture, view_of
 from neuspring.splats.model import Gaussians

@@ -20,7 +20,7 @@ from neuspring.config.settings import Aim
 from neuspring.core.files import write_atomically, write_text
 from neuspring.core.table import Cell, Chip, Table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
-from neuspring.report.figures.benchmark import CLUSTERS, RATIOS, cluster_methods, clusters_figure, ratios_figure
+from neuspring.report.draw.benchmark import CLUSTERS, RATIOS, cluster_methods, clusters_figure, ratios_figure
 from neuspring.report.notes import differing_table, honest_notes
 from neuspring.report.study_cells import LEAST_SCENARIOS, ORACLE_LINE
 from neuspring.scores import failures, ratios

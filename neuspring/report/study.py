@@ -30,7 +30,7 @@ from neuspring.core.table import LATEX_PREAMBLE, Cell, Chip, Table, Tone
 from neuspring.report import study_cells
 from neuspring.report.benchmark import failure_table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
-from neuspring.report.figures.benchmark import cluster_methods, clusters_figure
+from neuspring.report.draw.benchmark import cluster_methods, clusters_figure
 from neuspring.report.notes import differing_table
 from neuspring.report.study_cells import (
     BETTER,

@@ -55,7 +55,7 @@ def appearance(
 
     from neuspring.core.files import write_table
     from neuspring.perception.results import masks_of_cameras
-    from neuspring.report.figures import images as figures
+    from neuspring.report.draw import images as figures
     from neuspring.splats.draw import orbit_view, picture
     from neuspring.splats.model import Gaussians
     from neuspring.splats.rasterize import choose_backend

@@ -58,7 +58,8 @@ def render(
     from neuspring.core.files import write_table
     from neuspring.core.text import Progress
     from neuspring.perception.results import masks_of_cameras
-    from neuspring.report.figures import images as figures
+    from neuspring.report.draw import images as figures
+    from neuspring.report.draw.scene import chosen_frames
     from neuspring.report.video import Video
     from neuspring.scores.lpips import Lpips
     from neuspring.scores.lpips_weights import configured
@@ -77,7 +78,7 @@ def render(
     splats, frames = posed(appearance, rollout, trajectory, images, device)
     predicted = len(trajectory.positions)
     rows: list[dict[str, Any]] = []
-    strip, film = figures.Strip(scenario, predicted), figures.FilmLayout(scenario)
+    shown, pairs = chosen_frames(scenario, predicted), {}
     first = next(iter(scored.views))
     files = run.beside(**{role: f"{role}.mp4" for role in (VIDEOS if images.video else ())})
     progress = Progress("render", scenario.frame_count)
@@ -91,16 +92,18 @@ def render(
                 scores = picture_scores(pair, lpips, unit_lpips=images.released_quirks.unit_lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in scores.items()]
                 if name == first and frame < predicted:
-                    strip.add(frame, pair)
+                    if frame in shown:
+                        pairs[frame] = pair
                     if videos:
-                        videos["video"].add(film.compared(frame, pair))
+                        videos["video"].add(figures.film_frame(scenario, frame, figures.panels(pair)))
             if videos and frame < predicted:
                 angle = 360 * frame / predicted
-                videos["turntable"].add(film.turned(frame, orbit_view(gaussians, scored.views[first], scored.backend, angle)))
+                twin = orbit_view(gaussians, scored.views[first], scored.backend, angle)
+                videos["turntable"].add(figures.film_frame(scenario, frame, {"twin": twin}))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
     files |= run.beside(frames="frames.parquet", strip="images.png")
-    strip.save(files["strip"])
+    figures.pairs_figure(scenario, shown, pairs, files["strip"])
     write_table(table, files["frames"])
     facts = {
         "backend": scored.backend,

@@ -129,7 +129,7 @@ def _artifacts(
     import numpy as np
     import pandas as pd
 
-    from neuspring.report.figures import run
+    from neuspring.report.draw import run
 
     artifacts: dict[str, list[Path]] = {}
     twin_file = stages.twin_file

@@ -12,7 +12,7 @@ from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.report import gallery
-from neuspring.report.figures.run import chosen_frames
+from neuspring.report.draw.scene import chosen_frames
 from neuspring.report.page import Options, write
 from neuspring.report.page.material import duration, hours, signed
 from neuspring.report.page.page import _answer

@@ -24,7 +24,7 @@ import pandas as pd
 from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT
-from neuspring.report.figures.images import FUTURE, TRAINING
+from neuspring.report.draw.sheet import FUTURE, TRAINING
 from neuspring.scores.image_points import point_errors, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import COVERED

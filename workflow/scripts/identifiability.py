@@ -37,6 +37,7 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib import pyplot as plt
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
@@ -47,8 +48,9 @@ from neuspring.core.files import write_text
 from neuspring.core.table import Table
 from neuspring.data.synthetic import toy
 from neuspring.experiments.benchmark import read_scenarios
-from neuspring.report.figures import twin as figures_twin
-from neuspring.report.figures import views as figures_views
+from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.sheet import save
+from neuspring.report.draw.twin import COLORS, TwinPicture
 from neuspring.scores import metrics
 from neuspring.scores.statistics import paired_differences
 from neuspring.twin.fit import FitProblem, fit
@@ -58,6 +60,8 @@ from neuspring.twin.rollout import roll_out
 SCENES = tuple(f"{shape}/shake/{law}" for shape in ("rope", "cloth", "blob") for law in ("smooth", "two_region"))
 NOISES = (0.0, 0.0005, 0.002)
 """Standard deviations of the observation noise, m."""
+LIMITS = (0.3, 1 / 0.3)
+"""Range of colors: stiffness over the geometric mean of the truth."""
 SHOWN = (0.0005, 0)
 """Noise [m] and seed of the picture."""
 CONSTANTS = {"start": 0.6, "constant": 1.0}
@@ -216,18 +220,17 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
     `scenes` is scene -> kind -> stiffness [N] of the object springs; shown relative to the truth's geometric mean.
     """
     figure, axes = plt.subplots(len(scenes), 4, figsize=(14, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
-    norm = LogNorm(0.3, 1 / 0.3)
     for row, (scene, kinds) in zip(axes, scenes.items(), strict=True):
         truth, unit = scene_of(scene, *SHOWN).truth, np.exp(np.log(kinds["truth"]).mean())
-        view = figures_views.side_view(figures_views.widest_axis(truth.topology.nodes), truth.simulation.up)
-        bounds = figures_views.limits(view.project(truth.topology.nodes))
-        slender = bool(np.divide(*np.ptp(bounds, axis=0)) > 5)
+        seen = Scene.from_side(scene_of(scene, *SHOWN).observations, [], [0])
         for axis, kind in zip(row, ("truth", *RATES), strict=False):
-            lines = figures_twin._draw_stiffness(axis, view, truth.topology, kinds[kind] / unit, norm)
-            axis.set(xlim=bounds[:, 0], ylim=bounds[:, 1], xlabel=view.labels[0], aspect="auto" if slender else "equal")
+            stiffness = truth.material.stiffness.copy()
+            stiffness[: len(kinds[kind])] = kinds[kind] / unit
+            material = replace(truth.material, stiffness=stiffness)
+            take = Prediction(kind, truth.topology.nodes[None], replace(truth, material=material))
+            TwinPicture([(seen, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, seen, take, "stiffness")
+            axis.set_aspect("equal")
             axis.set_title(f"{scene}: {kind}", fontsize=10)
-            axis.tick_params(labelleft=kind == "truth", labelsize=8)
-        row[0].set_ylabel(view.labels[1] + ("\n(stretched)" if slender else ""))
         for kind, color, shift in (("springs", "tab:orange", -0.012), ("field", "tab:blue", 0.012)):
             true, recovered = np.log10(kinds["truth"] / unit), np.log10(kinds[kind] / unit)
             label = f"{kind}, r = {np.corrcoef(true, recovered)[0, 1]:.2f}"
@@ -239,7 +242,9 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
             handle.set_alpha(1.0)
     label = "stiffness / geometric mean of the truth"
     ticks: dict[str, Any] = {"ticks": [0.3, 0.5, 1, 2, 3], "format": "{x:g}", "extend": "both"}
-    figure.colorbar(lines, ax=axes, label=label, location="bottom", aspect=60, shrink=0.6, pad=0.01, **ticks).minorticks_off()
+    figure.colorbar(
+        ScalarMappable(LogNorm(*LIMITS), COLORS), ax=axes, label=label, location="bottom", aspect=60, shrink=0.6, pad=0.01, **ticks
+    ).minorticks_off()
     figure.suptitle(f"Stiffness of object springs, noise {1e3 * SHOWN[0]:g} mm, seed {SHOWN[1]}")
     return figure
 
@@ -270,7 +275,7 @@ def main() -> None:
     write_text(options.output / "identifiability.md", text)
     shown = {scene: kinds for scene, kinds in shown.items() if len(kinds) == len(KINDS)}
     if shown:
-        figures_views.save(picture(shown), options.output / "identifiability.png")
+        save(picture(shown), options.output / "identifiability.png")
     print(text)
 
 

@@ -35,7 +35,7 @@ from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan, labels
 from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, Store, slots
-from neuspring.report.figures.views import DPI
+from neuspring.report.draw.sheet import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
 SHARED = ("simulation", "losses", "released_quirks")

@@ -27,7 +27,7 @@ from neuspring.report.benchmark import (
     transfer_blocks,
 )
 from neuspring.report.blocks import Block, Facts, Fold, Grid, Picture, Section, Text, Verdict, html_page
-from neuspring.report.figures.benchmark import CLUSTERS, RATIOS
+from neuspring.report.draw.benchmark import CLUSTERS, RATIOS
 from neuspring.report.page.curves import curves_section
 from neuspring.report.page.material import (
     Choice,

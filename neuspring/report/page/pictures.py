@@ -16,7 +16,7 @@ import numpy as np
 
 from neuspring.core.artifacts import Observations
 from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video
-from neuspring.report.figures.run import chosen_frames
+from neuspring.report.draw.scene import chosen_frames
 from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData, several
 
 QUALITY = 75

@@ -13,10 +13,9 @@ from matplotlib.colors import Normalize
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
-from neuspring.report.figures.images import WORST
-from neuspring.report.figures.twin import CONTROLLER
-from neuspring.report.paper.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
-from neuspring.report.paper.sheet import points_across
+from neuspring.data.capture import Camera
+from neuspring.report.draw.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.draw import COVERED, picture, view_of
 from neuspring.splats.rasterize import choose_backend
@@ -74,7 +73,13 @@ class Painter:
     """Paints panels of one scene; all panels share the range of errors."""
 
     def __init__(
-        self, scene: Scene, takes: Sequence[Prediction], frames: Sequence[int], manner: DrawingStyle, images: Images, device: str
+        self,
+        scene: Scene,
+        takes: Sequence[Prediction],
+        frames: Sequence[int],
+        manner: DrawingStyle,
+        images: Images,
+        device: str,
     ) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
         self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
@@ -117,12 +122,12 @@ class Painter:
     @property
     def error_label(self) -> str:
         """For the color bar."""
-        return "color difference" if self.manner.error == "color" else "distance to observed points [mm]"
+        return "color difference" if self.manner.error == "color" else "distance [mm]"
 
     def draw_observed(self, axis: Axes, frame: int) -> None:
         """The photo, or the observed points where the camera has none."""
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
-        self._empty(axis)
+        empty(axis, self.scene.view)
         if photo is not None:
             whole = self.manner.ground == "image" or labels is None
             self._image(axis, photo if whole or labels is None else masked(photo, labels))
@@ -131,12 +136,12 @@ class Painter:
             self._note(axis, f"camera {self.scene.camera.name} missed it")
         observations = self.scene.observations
         self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
-        self._hands(axis, frame)
+        hands(axis, self.scene, frame)
 
     def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
         """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
         take, photo = self.takes[which], self.scene.photo(frame)
-        self._empty(axis)
+        empty(axis, self.scene.view)
         below = faded(photo) if photo is not None and self.manner.ground == "image" else None
         if frame >= len(take.positions):
             self._note(axis, "diverged")
@@ -151,11 +156,11 @@ class Painter:
             observations = self.scene.observations
             self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN, alpha=0.5)
         self._points(axis, take.positions[frame], PREDICTED)
-        self._hands(axis, frame)
+        hands(axis, self.scene, frame)
 
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
         """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
-        self._empty(axis)
+        empty(axis, self.scene.view)
         take = self.takes[which]
         if frame >= len(take.positions):
             return
@@ -219,11 +224,6 @@ class Painter:
         size = self._size(axis, len(observations.nodes) if nodes else observations.object_points.shape[1])
         axis.scatter(flat[order, 0], flat[order, 1], s=size, alpha=alpha, zorder=3, **style, **edge)
 
-    def _hands(self, axis: Axes, frame: int) -> None:
-        flat, depth = self.scene.view.project(self.scene.hands(frame).astype(float))
-        flat, size = flat[depth > 0], 0.6 * self._size(axis, 100)
-        axis.scatter(flat[:, 0], flat[:, 1], s=size, marker="D", color=CONTROLLER, edgecolors="white", linewidths=0.25, zorder=4)
-
     def _size(self, axis: Axes, count: int) -> float:
         """Area of a dot, points^2: a third of what this many dots have if they fill the panel, within what can be seen."""
         width = points_across(axis)
@@ -233,15 +233,22 @@ class Painter:
         shown = self.scene.cut(rgb) if cut else rgb
         axis.imshow(shown, extent=_extent(shown.shape), interpolation="antialiased")
 
-    def _empty(self, axis: Axes) -> None:
-        """A panel of the size of the shown part, its pixel centers at whole coordinates."""
-        view = self.scene.view
-        axis.set(
-            xticks=[], yticks=[], xlim=(-0.5, view.width - 0.5), ylim=(view.height - 0.5, -0.5), aspect="auto", facecolor="white"
-        )
-        axis.set_autoscale_on(False)
-        for side in axis.spines.values():
-            side.set(linewidth=0.5, color="0.7")
+
+def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
+    """A panel of the size of a camera's picture, its pixel centers at whole coordinates."""
+    limits = {"xlim": (-0.5, view.width - 0.5), "ylim": (view.height - 0.5, -0.5)}
+    axis.set(xticks=[], yticks=[], **limits, aspect="auto", facecolor="white")
+    axis.set_autoscale_on(False)
+    for side in axis.spines.values():
+        side.set(linewidth=0.5, color="0.7", visible=framed)
+
+
+def hands(axis: Axes, scene: Scene, frame: int) -> None:
+    """The controllers of a frame."""
+    flat, depth = scene.view.project(scene.hands(frame).astype(float))
+    size = float(np.clip((0.021 * points_across(axis)) ** 2, 3.0, 14.0))
+    style: dict[str, Any] = {"marker": "D", "color": CONTROLLER, "edgecolors": "white", "linewidths": 0.25, "zorder": 5}
+    axis.scatter(flat[depth > 0, 0], flat[depth > 0, 1], s=size, **style)
 
 
 def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:

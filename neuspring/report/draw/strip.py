@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from neuspring.report.figures.images import FUTURE, TRAINING
-from neuspring.report.figures.views import place
-from neuspring.report.paper.cells import ERRORS, MM, Painter, distances
-from neuspring.report.paper.sheet import HEAD, LABEL, TEXT, color_bar, rgb
+from neuspring.report.draw.painter import ERRORS, MM, Painter, distances
+from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 
+LABEL, HEAD = 0.22, 0.4
+"""Room for the names of rows, and for the head of columns, inches."""
 GAP, BETWEEN = 0.03, 0.08
 """Between panels, and between methods, inches."""
 BAR, SIDE = 0.62, 0.03

@@ -7,8 +7,8 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
-from neuspring.report.figures.twin import CONTROLLER, region_colors
-from neuspring.report.paper.body import CROSSING, TwinPicture, body_figure, node_stiffness
+from neuspring.report.draw.sheet import CONTROLLER
+from neuspring.report.draw.twin import CROSSING, TwinPicture, node_stiffness, region_colors, twin_figure
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, painter
 
@@ -44,7 +44,7 @@ def uneven(scenario):
 
 def test_stiffer_springs_are_lighter(plain):
     scene, takes = uneven(plain)
-    body = TwinPicture(scene, takes, 0, ("stiffness",))
+    body = TwinPicture([(scene, take) for take in takes], 0, ("stiffness",))
     light = body.spring_colors(takes[0], "stiffness")[:, :3] @ LUMA
     inside = takes[0].twin.material.stiffness[: len(light)]
     assert (np.diff(light) >= -1e-9).all() and light[-1] > light[0] + 0.5
@@ -57,7 +57,7 @@ def test_all_twins_share_one_scale(plain):
         takes[1],
         twin=replace(takes[1].twin, material=replace(takes[1].twin.material, stiffness=takes[1].twin.material.stiffness / 10)),
     )
-    body = TwinPicture(scene, [takes[0], soft], 0, ("stiffness",))
+    body = TwinPicture([(scene, takes[0]), (scene, soft)], 0, ("stiffness",))
     assert body.norm.vmin < 20 and body.norm.vmax > 5e3
     first, second = (body.spring_colors(take, "stiffness")[:, :3] @ LUMA for take in (takes[0], soft))
     assert (second <= first).all() and (second < first).any()
@@ -73,7 +73,7 @@ def test_a_node_has_the_mean_of_its_springs(plain):
 
 def test_regions_have_a_color_each_and_springs_between_them_are_dark(plain):
     scene, takes = uneven(plain)
-    body, labels = TwinPicture(scene, takes, 0, ("region",)), takes[0].twin.topology.labels
+    body, labels = TwinPicture([(scene, take) for take in takes], 0, ("region",)), takes[0].twin.topology.labels
     assert np.array_equal(body.node_colors(takes[0], "region"), region_colors(3)[labels])
     ends = labels[takes[0].twin.topology.springs[: takes[0].twin.topology.object_spring_count]]
     colors, same = body.spring_colors(takes[0], "region"), ends[:, 0] == ends[:, 1]
@@ -83,7 +83,7 @@ def test_regions_have_a_color_each_and_springs_between_them_are_dark(plain):
 
 def test_columns_of_methods_rows_of_quantities_and_a_legend_for_each(plain):
     scene, takes = uneven(plain)
-    figure = body_figure(TwinPicture(scene, takes, 0, ("stiffness", "region")), 5.0)
+    figure = twin_figure(TwinPicture([(scene, take) for take in takes], 0, ("stiffness", "region")), 5.0)
     panels = [axis for axis in figure.axes if axis.get_xlim()[0] == -0.5]
     assert len(panels) == 4 and figure.get_figwidth() == pytest.approx(5.0)
     (bar,) = (axis for axis in figure.axes if axis not in panels)
@@ -104,7 +104,7 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
     scenario = filmed(tmp_path)
     scene, takes = uneven(scenario)
     axis = plt.figure().add_axes((0, 0, 1, 1))
-    TwinPicture(scene, takes, 4, ("region",), style="splats").paint(axis, takes[0], "region")
+    TwinPicture([(scene, take) for take in takes], 4, ("region",), style="splats").paint(axis, scene, takes[0], "region")
     shown = np.asarray(axis.images[0].get_array())
     opaque = np.unique(shown.reshape(-1, 3), axis=0).astype(float) / 255
     for color in region_colors(3)[:, :3]:

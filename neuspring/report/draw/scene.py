@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Observations, Twin, Up
+from neuspring.core.artifacts import Observations, Scenario, Twin, Up
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Camera, Capture
 from neuspring.splats.draw import frames_from_centers, skinned_frames
@@ -22,6 +22,8 @@ OPENING = math.radians(20)
 """Its angle of view: a long lens, so that near and far parts have almost one scale."""
 STEEPEST = 89.0
 """Degrees above or below the horizon; straight down no side of the picture is up."""
+ELEVATION = 25.0
+"""Degrees above the horizon of a view that is not asked for."""
 MARGIN = 0.04
 """Free space around what is shown, as a fraction of its larger side."""
 FLATTEST, TALLEST = 0.35, 1.3
@@ -170,6 +172,20 @@ class Scene:
         box = box_around(seen, camera, clip=capture is not None)
         return cls(observations, camera, box, capture, labels)
 
+    @classmethod
+    def from_side(
+        cls,
+        observations: Observations,
+        takes: Sequence[Prediction],
+        frames: Sequence[int],
+        azimuth: float | None = None,
+        elevation: float = ELEVATION,
+    ) -> Scene:
+        """What these frames show from any side, degrees (`seen_from`); without an azimuth from the broad side."""
+        points, up = shown_points(observations, takes, frames), observations.scenario.up
+        camera = seen_from(points, up, broad_side(points, up) if azimuth is None else azimuth, elevation)
+        return cls.of(observations, camera, takes, frames)
+
     @cached_property
     def view(self) -> Camera:
         """The camera of the shown part."""
@@ -220,6 +236,22 @@ def shown_points(observations: Observations, takes: Sequence[Prediction], frames
         np.clip(take.positions[frame], low - reach, high + reach) for take in takes for frame in rows if frame < len(take.positions)
     ]
     return np.concatenate([real, *near])
+
+
+def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
+    """Frames to show, in order, and their names. The trajectory has `frames` frames; it diverged if the scenario has more."""
+    last = scenario.frame_count - 1
+    # Where two fall together the later entry names the frame.
+    named = {
+        (scenario.train_end + last) // 2: "middle of the future",
+        last: "last frame",
+        scenario.train_end - 1: "end of training",
+        0: "start",
+    }
+    shown = {frame: name for frame, name in named.items() if frame < frames}
+    if frames <= last:
+        shown.setdefault(frames - 1, "last before divergence")
+    return dict(sorted(shown.items()))
 
 
 def over_white(rgba: np.ndarray, below: np.ndarray | None = None) -> np.ndarray:

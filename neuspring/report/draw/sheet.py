@@ -1,4 +1,4 @@
-"""What all pictures for papers share: sizes of text and margins, color bars, and how they are written."""
+"""What all pictures share: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -17,12 +20,19 @@ from neuspring.core.files import write_atomically
 
 TEXT = 8.0
 """Size of text, points, at the width that the picture is made for."""
-LABEL, HEAD = 0.22, 0.4
-"""Room for the names of rows, and for the head of columns, inches."""
 PICTURES, FILMS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
 WIDTHS, RESOLUTIONS = (1.5, 20.0), (50.0, 1200.0)
 """Least and greatest width, inches, and dots per inch."""
+DPI = 110
+"""Dots per inch of pictures of runs and benchmarks."""
 JPEG = 90
+TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
+"""Colors of the two parts of the time."""
+WORST = 0.5
+"""Color difference, of 1, at the end of error pictures."""
+CONTROLLER = "tab:red"
+MOST_SPRINGS = 20_000
+"""More springs than this are not drawn: lines would cover each other."""
 
 
 def require_ending(path: Path, endings: Sequence[str]) -> None:
@@ -54,6 +64,12 @@ def rgb(color: Sequence[int], shade: float = 1.0) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """New axes in a figure; all in inches from the lower left corner."""
+    across, high = figure.get_size_inches()
+    return figure.add_axes((left / across, bottom / high, width / across, height / high))
+
+
 def points_across(axis: Axes) -> float:
     """Width of a panel, points."""
     figure = axis.get_figure(root=True)
@@ -69,7 +85,14 @@ def color_bar(figure: Figure, axis: Axes, norm: Normalize, colors: str, label: s
     axis.tick_params(labelsize=TEXT - 1.5, width=0.4, length=2, pad=1.5, which="both")
 
 
-def save(figure: Figure, path: Path, dpi: float) -> Path:
+def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:
+    """Indices, ascending, of the springs to draw: all of them, or a random `most` that is the same every time."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
+
+
+def save(figure: Figure, path: Path, dpi: float = DPI) -> Path:
     """Write a figure as its ending says, atomically and the same each time, and close it; PDF with TrueType text."""
     kind = path.suffix.lower().removeprefix(".")
     # A date would make two equal pictures differ.

@@ -7,8 +7,8 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from neuspring.core.errors import InputError
-from neuspring.report.figures.images import FUTURE, TRAINING
-from neuspring.report.paper.film import HOLD, film_pictures, write_film
+from neuspring.report.draw.film import HOLD, film_pictures, write_film
+from neuspring.report.draw.sheet import FUTURE, TRAINING
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, painter
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.report.paper.scene import FLATTEST, TALLEST, box_around, broad_side, finer, part, seen_from
+from neuspring.report.draw.scene import FLATTEST, TALLEST, box_around, broad_side, finer, part, seen_from
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) * [0.3, 0.05, 0.1] + [1.0, 2.0, 0.4]

@@ -9,9 +9,9 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import PathCollection
 
 from neuspring.config.images import Images
-from neuspring.report.paper.cells import ERRORS, MM, Painter, distances
-from neuspring.report.paper.scene import Scene
-from neuspring.report.paper.strip import caption, rows_of, strip_figure
+from neuspring.report.draw.painter import ERRORS, MM, Painter, distances
+from neuspring.report.draw.scene import Scene
+from neuspring.report.draw.strip import caption, rows_of, strip_figure
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, observed, painter, takes
 

@@ -17,10 +17,8 @@ from PIL import Image
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.report.figures.images import FUTURE, TRAINING
-from neuspring.report.figures.views import place
-from neuspring.report.paper.cells import ERRORS, Painter
-from neuspring.report.paper.sheet import TEXT, color_bar, rgb
+from neuspring.report.draw.painter import ERRORS, Painter
+from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 from neuspring.report.video import Video
 
 DOTS = 110
@@ -35,24 +33,12 @@ CENTISECOND, SHORTEST = 100, 2
 """Of a second; browsers take a shorter time of a frame for 10."""
 LARGEST = 100.0
 """Megabytes."""
-CLOSE = 12
-"""Colors of a palette that differ by no more than this from an exact one are left out."""
+COLORS, QUALITY = 96, 23
+"""Colors of a GIF, and rate factor of an MP4 (`video.Video`)."""
 KEYS = 8
 """Frames from which the colors of a GIF are chosen."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """How coarse a film is: a part of its width, every how manieth frame, and colors (GIF) or the rate factor (MP4)."""
-
-    scale: float
-    every: int
-    quality: int
-
-
-GIF = (Step(1, 1, 128), Step(1, 2, 64), Step(0.75, 2, 64), Step(0.6, 2, 48), Step(0.5, 3, 32), Step(0.35, 4, 32))
-MP4 = (Step(1, 1, 22), Step(1, 1, 28), Step(0.75, 1, 30), Step(0.6, 2, 34), Step(0.4, 2, 38))
-"""The finest first."""
+LEAST_SCALE = 0.25
+"""A film that is still too large at this part of its width is refused."""
 
 
 @dataclass(frozen=True)
@@ -73,28 +59,32 @@ class Made:
 
 
 def write_film(painter: Painter, path: Path, width: int, speed: float = 1.0, megabytes: float = 2.0) -> Made:
-    """Write the film, coarser by steps until it fits. Raises InputError for a bad size or speed, and where nothing fits."""
+    """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
+
+    Raises InputError for a bad size or speed, and where nothing fits.
+    """
     _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed
     gif = path.suffix.lower() == ".gif"
-    smallest = math.inf
-    for number, step in enumerate(GIF if gif else MP4):
-        frames = painter.frames[:: step.every]
-        pictures = list(film_pictures(painter, frames, max(round(step.scale * width), 80)))
-        made = path.with_name(f".{path.name}.try{path.suffix}")
-        try:
-            write = _write_gif if gif else _write_mp4
-            write(made, pictures, rate / step.every, step.quality)
-            size = made.stat().st_size
-            smallest = min(smallest, size)
+    made, every, scale = path.with_name(f".{path.name}.try{path.suffix}"), 1, 1.0
+    try:
+        while True:
+            pictures = list(film_pictures(painter, painter.frames[::every], max(round(scale * width), 80)))
+            (_write_gif if gif else _write_mp4)(made, pictures, rate / every)
+            size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
             if size <= 1e6 * megabytes:
                 write_atomically(path, made.replace)
-                high, wide = pictures[0].shape[:2]
-                return Made(len(pictures), wide, high, rate / step.every, size, number > 0)
-        finally:
-            made.unlink(missing_ok=True)
-    remedy = "Name fewer --frames or methods, or write .mp4." if gif else "Name fewer --frames or methods."
-    raise InputError("--megabytes", f"the coarsest film has {smallest / 1e6:.2g} MB", megabytes, remedy)
+                return Made(len(pictures), wide, high, rate / every, size, scale < 1 or every > 1)
+            if scale <= LEAST_SCALE:
+                remedy = "Name fewer --frames or methods, or write .mp4." if gif else "Name fewer --frames or methods."
+                raise InputError("--megabytes", f"the coarsest film has {size / 1e6:.2g} MB", megabytes, remedy)
+            if gif and every == 1:
+                every = 2
+            else:
+                # A film has about as many bytes as pixels.
+                scale = max(0.95 * scale * math.sqrt(1e6 * megabytes / size), LEAST_SCALE)
+    finally:
+        made.unlink(missing_ok=True)
 
 
 def _require(width: int, speed: float, megabytes: float) -> None:
@@ -140,7 +130,7 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     if errors:
         panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
-        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label.replace(" to observed points", ""), extend="max")
+        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label, extend="max")
     clock = place(figure, EDGE, total - EDGE - CLOCK, width - 2 * EDGE, CLOCK)
     return figure, panels, clock
 
@@ -178,33 +168,20 @@ def _tell(painter: Painter, clock: Axes, frame: int) -> None:
         side.set_visible(False)
 
 
-def _write_mp4(path: Path, pictures: Sequence[np.ndarray], rate: float, quality: int) -> None:
-    with Video(path, rate, quality) as video:
+def _write_mp4(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
+    with Video(path, rate, QUALITY) as video:
         for picture in pictures:
             video.add(picture)
 
 
-def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float, colors: int) -> None:
+def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
-    palette = _palette(pictures, colors)
+    # One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
+    keys = np.unique(np.linspace(0, len(pictures) - 1, KEYS).astype(int))
+    palette = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(COLORS, method=Image.Quantize.MAXCOVERAGE)
     frames = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = np.round(CENTISECOND * np.arange(len(frames) + 1) / rate).astype(int)
     times = 10 * np.maximum(np.diff(ends), SHORTEST)
     times[-1] = max(times[-1], round(1000 * HOLD))
     more = {"duration": times.tolist(), "loop": 0, "optimize": False, "disposal": 1}
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **more)
-
-
-def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
-    """One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
-
-    Paper, text and the bar of time keep their colors exactly; what is close to them is left out, else it might be taken for them.
-    """
-    exact = np.array([(255, 255, 255), (0, 0, 0), TRAINING, FUTURE])
-    keys = np.unique(np.linspace(0, len(pictures) - 1, KEYS).astype(int))
-    every = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(colors - len(exact), method=Image.Quantize.MEDIANCUT)
-    found = np.array(every.getpalette()).reshape(-1, 3)
-    far = np.abs(found[:, None] - exact).max(axis=2).min(axis=1) > CLOSE
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.concatenate([exact, found[far]]).ravel().tolist())
-    return palette

@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from neuspring.report.figures.views import save
+from neuspring.report.draw.sheet import save
 from neuspring.scores.metrics import DISTANCES, averages
 
 RATIOS, CLUSTERS = "ratios.png", "clusters.png"

@@ -1,0 +1,273 @@
+"""Twins as bodies: springs or surface colored by stiffness, nodes by region, seen by any camera; and a histogram of stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from matplotlib import colormaps
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, to_rgba_array
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from scipy.spatial import cKDTree
+
+from neuspring.config.images import Images
+from neuspring.core.artifacts import Topology, Twin
+from neuspring.report.draw.painter import empty, hands
+from neuspring.report.draw.scene import Prediction, Scene, faded, finer, over_white
+from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
+from neuspring.splats.draw import picture, view_of
+from neuspring.splats.harmonics import C0
+from neuspring.splats.model import Gaussians
+from neuspring.splats.rasterize import choose_backend
+
+Quantity = Literal["stiffness", "region"]
+COLORS = "viridis"
+PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
+CROSSING = (0.35, 0.35, 0.35, 1.0)
+"""Springs between regions."""
+TITLE, GAP, BAR, EDGE = 0.22, 0.05, 0.75, 0.03
+"""Room for names of methods, between panels, for a color bar or names of regions, and at the edges, inches."""
+MOST_VECTORS = 2500
+"""More lines than this are stored as pixels: a page would open slowly."""
+FINE = 900
+"""Least width of a surface in pixels; nothing is compared with it, so it need not have the camera's."""
+LEAST_RATIO, DEEPEST = 2.0, 1e4
+"""Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it; largest ratio of a color range."""
+BINS = 41
+"""Odd, so that equal values sit in the middle of a bar, under the mark of the searched one."""
+
+
+def region_colors(count: int) -> np.ndarray:
+    """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
+    if count <= len(PALETTE):
+        return to_rgba_array(PALETTE[:count])
+    return np.asarray(colormaps["turbo"](np.linspace(0.05, 0.85, count)))
+
+
+def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
+    """Ends of a logarithmic color range, N, for stiffness [S], N.
+
+    All but the outermost 0.5 % on either side; at least a factor of 2 and at most one of 10^4 apart; positive whatever comes in.
+    """
+    positive = stiffness[stiffness > 0]
+    if not len(positive):
+        return 1.0, LEAST_RATIO
+    low, high = (float(value) for value in np.quantile(positive.astype(np.float64), [0.005, 0.995]))
+    return _widened(max(low, high / DEEPEST), high)
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    """The same range; a range narrower than a factor of 2 is widened to that about its geometric mean."""
+    if high >= LEAST_RATIO * low:
+        return low, high
+    middle = float(np.sqrt(low * high))
+    return middle / LEAST_RATIO**0.5, middle * LEAST_RATIO**0.5
+
+
+def node_stiffness(twin: Twin) -> np.ndarray:
+    """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any."""
+    count = twin.topology.object_spring_count
+    pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
+    nodes = len(twin.topology.nodes)
+    degree = np.bincount(pairs.ravel(), minlength=nodes)
+    total = np.bincount(pairs.ravel(), np.repeat(np.log(values), 2), minlength=nodes)
+    typical = float(np.median(np.log(values))) if count else 0.0
+    return np.asarray(np.exp(np.where(degree > 0, total / np.maximum(degree, 1), typical)))
+
+
+@dataclass(frozen=True, eq=False)
+class TwinPicture:
+    """Twins in one frame, and what their colors say: a column for each of `takes`, seen in the scene beside it."""
+
+    columns: Sequence[tuple[Scene, Prediction]]
+    frame: int
+    quantities: Sequence[Quantity]
+    style: Literal["springs", "splats"] = "springs"
+    ground: Literal["white", "image"] = "white"
+    images: Images = Images()
+    device: str = "cpu"
+    limits: tuple[float, float] | None = None
+    """Of stiffness, N; None: those of the twins."""
+
+    @cached_property
+    def norm(self) -> LogNorm:
+        """The range of stiffness, N, that all twins share."""
+        if self.limits:
+            return LogNorm(*self.limits)
+        twins = [_twin(take) for _, take in self.columns]
+        return LogNorm(*stiffness_limits(np.concatenate([t.material.stiffness[: t.topology.object_spring_count] for t in twins])))
+
+    def node_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
+        """RGBA [N, 4]."""
+        twin = _twin(take)
+        if quantity == "stiffness":
+            return self._of_stiffness(node_stiffness(twin))
+        names, region = np.unique(twin.topology.labels, return_inverse=True)
+        return np.asarray(region_colors(len(names))[region])
+
+    def spring_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
+        """RGBA [S, 4] of object springs."""
+        topology, count = _twin(take).topology, _twin(take).topology.object_spring_count
+        if quantity == "stiffness":
+            return self._of_stiffness(_twin(take).material.stiffness[:count])
+        colors = self.node_colors(take, "region")[topology.springs[:count, 0]]
+        colors[_between(topology)] = CROSSING
+        return np.asarray(colors)
+
+    def _of_stiffness(self, values: np.ndarray) -> np.ndarray:
+        # A stiffness of 0 has no color on a log scale; it takes that of the lower end.
+        return np.asarray(colormaps[COLORS](self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))))
+
+    def paint(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
+        """One panel."""
+        view, photo = scene.view, scene.photo(self.frame)
+        empty(axis, view, framed=self.ground == "image")
+        shown = scene.cut(faded(photo)) if photo is not None and self.ground == "image" else None
+        if self.style == "splats":
+            surface = self._surface(scene, take, quantity)
+            ground = None if shown is None else cv2.resize(shown, surface.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+            shown = over_white(surface, ground)
+        if shown is not None:
+            extent = (-0.5, view.width - 0.5, view.height - 0.5, -0.5)
+            axis.imshow(shown, extent=extent, aspect="auto", interpolation="antialiased")
+        if self.style == "springs":
+            self._lines(axis, scene, take, quantity)
+        hands(axis, scene, self.frame)
+
+    def _lines(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
+        """Springs and nodes, the farthest first, so that the nearest are on top; by region also the springs of hands in frame 0."""
+        topology, nodes = _twin(take).topology, take.positions[self.frame].astype(float)
+        flat, depth = scene.view.project(nodes)
+        chosen = sample(topology.object_spring_count)
+        pairs = topology.springs[chosen]
+        order = np.argsort(-depth[pairs].mean(axis=1), kind="stable")
+        order = order[(depth[pairs[order]] > 0).all(axis=1)]
+        width = points_across(axis)
+        colors = self.spring_colors(take, quantity)[chosen][order]
+        thick = float(np.clip(0.06 * width / np.sqrt(max(len(order), 1)), 0.25, 1.4))
+        many = len(order) > MOST_VECTORS
+        axis.add_collection(LineCollection(list(flat[pairs[order]]), colors=colors, linewidths=thick, rasterized=many, zorder=2))
+        if quantity == "stiffness":
+            return
+        if not self.frame:
+            joined = topology.springs[topology.object_spring_count :]
+            ends = scene.view.project(np.concatenate([nodes, topology.controllers]))[0][joined]
+            style = {"colors": CONTROLLER, "linewidths": thick, "alpha": 0.5, "rasterized": many, "zorder": 2}
+            axis.add_collection(LineCollection(list(ends), **style))
+        near = np.argsort(-depth)
+        near = near[depth[near] > 0]
+        size = float(np.clip((0.2 * width) ** 2 / max(len(nodes), 1), 1.0, 14.0))
+        axis.scatter(flat[near, 0], flat[near, 1], c=self.node_colors(take, quantity)[near], s=size, linewidths=0, zorder=3)
+
+    def _surface(self, scene: Scene, take: Prediction, quantity: Quantity) -> np.ndarray:
+        """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
+        assert take.splats is not None
+        outer = take.positions[0][: scene.observations.surface_count]
+        nearest = cKDTree(outer).query(take.splats.means)[1]
+        rgb = self.node_colors(take, quantity)[nearest, :3]
+        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.images, self.device))
+        plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
+        painted: Gaussians = replace(gaussians, harmonics=plain)
+        view = view_of(finer(scene.view, FINE), self.images, self.device)
+        return picture(painted, view, choose_backend(self.images.backend, self.device))
+
+
+def twin_figure(body: TwinPicture, width: float, room: float = BAR) -> Figure:
+    """The picture, `width` inches wide: columns from left to right, quantities from top to bottom, each with its legend.
+
+    `room` is kept for legends on the right, inches; with more than a legend needs, that of regions counts nodes and springs.
+    """
+    shapes = [scene.view.width / scene.view.height for scene, _ in body.columns]
+    high = (width - 2 * EDGE - room - GAP * (len(shapes) - 1)) / sum(shapes)
+    total = TITLE + len(body.quantities) * (high + GAP) + EDGE
+    figure = plt.figure(figsize=(width, total))
+    lefts = EDGE + np.cumsum([0.0, *(high * shape + GAP for shape in shapes[:-1])])
+    for left, shape, (_, take) in zip(lefts, shapes, body.columns, strict=True):
+        where = ((left + high * shape / 2) / width, (total - TITLE + 0.05) / total)
+        figure.text(*where, take.label, ha="center", va="bottom", fontsize=TEXT)
+    legend, top = width - EDGE - room, total - TITLE
+    for quantity in body.quantities:
+        for left, shape, (scene, take) in zip(lefts, shapes, body.columns, strict=True):
+            body.paint(place(figure, left, top - high, high * shape, high), scene, take, quantity)
+        if quantity == "stiffness":
+            tall = min(high, 1.8)
+            cax = place(figure, legend + 0.1, top - 0.5 * (high + tall) + 0.06, 0.09, tall - 0.12)
+            color_bar(figure, cax, body.norm, COLORS, "stiffness [N]", extend="both")
+        else:
+            _regions(figure, body, legend, top - high / 2, counted=room > BAR)
+        top -= high + GAP
+    return figure
+
+
+def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, counted: bool) -> None:
+    """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
+    topology = max((_twin(take).topology for _, take in body.columns), key=lambda found: len(np.unique(found.labels)))
+    labels, sizes = np.unique(topology.labels, return_counts=True)
+    count, between, joined = len(labels), _between(topology), len(topology.springs) - topology.object_spring_count
+    lonely = len(topology.nodes) - len(np.unique(topology.springs[topology.springs < len(topology.nodes)]))
+    names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
+    dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
+    extra = [(CROSSING, "between", int(between.sum()), "springs")] if count > 1 and body.style == "springs" else []
+    if counted:
+        ends = topology.labels[topology.springs[: topology.object_spring_count]]
+        springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]
+        names = [f"{name}: {n} nodes, {s} springs" for name, n, s in zip(names, sizes, springs, strict=True)]
+        extra += [(CONTROLLER, "of hands", joined, "springs")] + ([("white", "without spring", lonely, "nodes")] if lonely else [])
+    for color, name, number, what in extra:
+        dots.append(Line2D([], [], color=color, linewidth=1.0))
+        names.append(f"{name}: {number} {what}" if counted else name)
+    style = {"fontsize": TEXT - 1.5, "frameon": False, "handlelength": 0.8, "handletextpad": 0.3, "borderaxespad": 0.1}
+    across, total = figure.get_size_inches()
+    figure.legend(dots, names, loc="center left", bbox_to_anchor=(left / across, middle / total), labelspacing=0.25, **style)
+
+
+def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float | None) -> None:
+    """Springs over log stiffness [S], N, in the colors of the body; the searched stiffness, N, is marked.
+
+    Values below the largest / 10^6 stand there, so that none is left out.
+    """
+    shown = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
+    low, high = _widened(float(shown.min()), float(shown.max()))
+    # Rounding must not push the extremes out of the outer bins.
+    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), BINS + 1)
+    counts, _ = np.histogram(shown, edges)
+    middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
+    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[COLORS](norm(middles)), edgecolor="0.4", lw=0.3)
+    middle = float(np.median(stiffness))
+    text = f"median {_newtons(middle)}"
+    if searched:
+        axis.axvline(searched, color=CONTROLLER, ls="--", lw=1.3)
+        text += f" = {middle / searched:.2f} $S_0$\ndashed: searched $S_0$ = {_newtons(searched)}"
+    axis.set(xscale="log", ylabel="springs")
+    axis.set_xlabel(f"stiffness [N]\n{text}", fontsize=TEXT - 1)
+    axis.tick_params(labelsize=TEXT - 1, which="both")
+    # Matplotlib labels the ticks between powers of ten when few powers are in view; over half a decade they would overlap.
+    if edges[-1] / edges[0] > 3:
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _newtons(value: float) -> str:
+    return f"{value:,.0f} N" if value >= 100 else f"{value:.3g} N"
+
+
+def _between(topology: Topology) -> np.ndarray:
+    """Whether an object spring joins two regions [S]."""
+    ends = topology.labels[topology.springs[: topology.object_spring_count]]
+    return np.asarray(ends[:, 0] != ends[:, 1])
+
+
+def _twin(take: Prediction) -> Twin:
+    assert take.twin is not None
+    return take.twin

@@ -1,0 +1,210 @@
+"""Pictures exist, hold what they say, and survive what runs can be: equal values, one region, divergence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import image
+from matplotlib import pyplot as plt
+from matplotlib.colors import LogNorm
+
+from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.report.draw import run as figures
+from neuspring.report.draw.scene import Prediction, chosen_frames
+from neuspring.report.draw.sheet import sample
+from neuspring.report.draw.twin import histogram, region_colors, stiffness_limits
+from neuspring.twin.topology import piecewise_topology, regions
+from tests.support import small
+
+HISTORIES = {
+    "search": pd.DataFrame(
+        {"step": [0, 1, 0, 1], "metric": ["cost", "cost", "best_cost", "best_cost"], "value": [2e-3, 1e6, 2e-3, 2e-3]}
+    ),
+    "fit": pd.DataFrame(
+        {"step": [0, 1, 0, 1], "metric": ["loss", "loss", "tail_loss", "tail_loss"], "value": [4e-3, 1e-4, 5e-3, 3e-3]}
+    ),
+}
+NAMES = {"errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png"}
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    left = plt.get_fignums()
+    plt.close("all")
+    assert not left, "figures must be closed"
+
+
+def observed() -> Observations:
+    return small.observations()
+
+
+def truth() -> Twin:
+    return small.scene().truth
+
+
+def predicted(shift: float = 0.01) -> Trajectory:
+    """The true motion, off by `shift` along y in all frames but the first."""
+    motion = small.scene().motion.copy()
+    motion[1:, :, 1] += shift
+    return Trajectory(positions=motion, frame_count=len(motion))
+
+
+def regional(count: int) -> Twin:
+    """The true twin with a topology of `count` regions."""
+    seen, twin = observed(), truth()
+    labels = regions(seen.nodes, count)
+    radius = list(np.linspace(0.03, 0.045, count))
+    topology = piecewise_topology(seen.nodes, seen.controller_points[0], labels, radius, [12] * count, 0.03, 8)
+    springs = len(topology.springs)
+    material = replace(twin.material, stiffness=np.geomspace(1e2, 1e5, springs), dashpot=np.ones(springs))
+    return replace(twin, topology=topology, material=material)
+
+
+def with_stiffness(twin: Twin, values: np.ndarray | float) -> Twin:
+    return replace(twin, material=replace(twin.material, stiffness=np.broadcast_to(values, len(twin.topology.springs))))
+
+
+def check_pictures(paths) -> set[str]:
+    """Names of the files; each must be a picture of sensible size with something in it."""
+    for path in paths:
+        pixels = image.imread(path)
+        height, width = pixels.shape[:2]
+        assert 300 < width < 2200 and 150 < height < 1600, path
+        assert pixels[..., :3].std() > 0.02, path
+        assert path.stat().st_size < 3e6, path
+    return {path.name for path in paths}
+
+
+def test_a_full_run_has_every_picture(tmp_path):
+    paths = figures.run_figures(observed(), predicted(), HISTORIES, "m", tmp_path / "plots", twin=regional(3), searched=3e3)
+    assert check_pictures(paths) == NAMES == set(figures.NAMES)
+    assert sorted(paths) == sorted((tmp_path / "plots").iterdir())
+
+
+def test_a_run_without_twin_and_trajectory_has_its_losses_alone(tmp_path):
+    (tmp_path / "topology.png").write_text("of an earlier run")
+    assert check_pictures(figures.run_figures(observed(), None, HISTORIES, "m", tmp_path)) == {"losses.png"}
+    assert not (tmp_path / "topology.png").exists()
+    assert figures.run_figures(observed(), None, {}, "m", tmp_path) == []
+
+
+def test_a_diverged_rollout_is_drawn_as_far_as_it_went(tmp_path):
+    positions = small.scene().motion[:4].astype(np.float32)
+    positions[3, 5] = 90.0
+    diverged = Trajectory(positions=positions, frame_count=small.FRAMES, diverged_frame=4, reason="far away")
+    assert check_pictures(figures.run_figures(observed(), diverged, {}, "m", tmp_path)) == {"errors.png", "motion.png"}
+    figure = figures.motion_figure(observed(), diverged, "m")
+    words = {text.get_text() for axis in figure.axes for text in axis.texts} | {text.get_text() for text in figure.texts}
+    assert {"diverged", "frame 3, 0.10 s", "observed", "m"} <= words
+    plt.close(figure)
+
+
+def test_the_motion_picture_says_how_far_nodes_are_from_their_points():
+    figure = figures.motion_figure(observed(), predicted(), "m")
+    assert [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text().endswith("mm")] == [
+        "0.0 mm",
+        *["10.0 mm"] * (len(chosen_frames(observed().scenario, small.FRAMES)) - 1),
+    ]
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("train_end", "frames", "expected"),
+    [
+        (70, 100, {0: "start", 69: "end of training", 84: "middle of the future", 99: "last frame"}),
+        (99, 100, {0: "start", 98: "end of training", 99: "last frame"}),
+        (100, 100, {0: "start", 99: "end of training"}),
+        (70, 40, {0: "start", 39: "last before divergence"}),
+        (70, 70, {0: "start", 69: "end of training"}),
+        (70, 1, {0: "start"}),
+    ],
+)
+def test_the_frames_of_the_motion_picture(train_end, frames, expected):
+    scenario = replace(observed().scenario, frame_count=100, train_end=train_end)
+    assert chosen_frames(scenario, frames) == expected
+
+
+@pytest.mark.parametrize("values", [5e3, 0.0, 1e-30, 1e5])
+def test_equal_stiffness_is_one_bar_and_one_color(tmp_path, values):
+    twin = with_stiffness(truth(), values)
+    paths = figures.run_figures(observed(), None, {}, "m", tmp_path, twin=twin, searched=values)
+    assert check_pictures(paths) == {"topology.png", "stiffness.png"}
+    low, high = stiffness_limits(twin.material.stiffness)
+    assert 0 < low < high <= 10 * low
+    assert max(bars(twin.material.stiffness)) == sum(bars(twin.material.stiffness)) == len(twin.material.stiffness)
+
+
+def bars(stiffness: np.ndarray) -> list[float]:
+    """Heights of the histogram's bars."""
+    figure, axis = plt.subplots()
+    histogram(axis, np.asarray(stiffness, float), LogNorm(*stiffness_limits(stiffness)), None)
+    plt.close(figure)
+    return [bar.get_height() for bar in axis.patches]
+
+
+def test_the_color_range_holds_most_springs_and_not_the_outliers():
+    stiffness = np.concatenate([np.geomspace(1e3, 1e4, 1000), [0.0, 1e-9]])
+    low, high = stiffness_limits(stiffness)
+    assert 900 < low < 1100 and 9000 < high <= 1e4
+    assert sum(bars(stiffness)) == len(stiffness)
+
+
+def test_the_searched_stiffness_is_marked():
+    twin = regional(2)
+    figure = figures.stiffness_figure(observed(), Prediction("m", twin.topology.nodes[None], twin), 3e3)
+    axis = figure.axes[-1]
+    assert [float(line.get_xdata()[0]) for line in axis.lines] == [3e3] and "3,000 N" in axis.get_xlabel()
+    plt.close(figure)
+
+
+def test_a_twin_without_object_springs_has_no_stiffness_picture(tmp_path):
+    twin = truth()
+    kept = slice(twin.topology.object_spring_count, None)
+    topology = replace(twin.topology, springs=twin.topology.springs[kept], rest_lengths=twin.topology.rest_lengths[kept])
+    material = replace(twin.material, stiffness=twin.material.stiffness[kept], dashpot=twin.material.dashpot[kept])
+    bare = replace(twin, topology=topology, material=material)
+    assert check_pictures(figures.run_figures(observed(), None, {}, "m", tmp_path, twin=bare)) == {"topology.png"}
+
+
+@pytest.mark.parametrize("count", [1, 2, 10, 14])
+def test_regions_are_counted_and_have_colors_of_their_own(count):
+    twin = regional(count)
+    body = figures._from_two_sides(observed(), Prediction("m", twin.topology.nodes[None], twin), "m", "region")
+    figure = figures.twin_figure(body, figures.WIDTH, figures.COUNTS)
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    nodes = [int(name.split(": ")[1].split(" nodes")[0]) for name in names if "nodes" in name]
+    springs = [int(name.rpartition(" springs")[0].split()[-1]) for name in names]
+    assert sum(nodes) == len(twin.topology.nodes) and len(nodes) == count and sum(springs) == len(twin.topology.springs)
+    assert any(name.startswith("between") for name in names) == (count > 1)
+    assert len(np.unique(region_colors(count), axis=0)) == count
+    plt.close(figure)
+
+
+def test_of_very_many_springs_a_fixed_random_part_is_drawn():
+    assert sample(100).tolist() == list(range(100))
+    chosen = sample(120_000)
+    assert len(np.unique(chosen)) == 20_000 and (np.diff(chosen) > 0).all()
+    np.testing.assert_array_equal(chosen, sample(120_000))
+
+
+@pytest.mark.parametrize("metrics", [("loss",), ("loss", "tail_loss"), ()])
+def test_losses_draw_what_the_history_has(metrics):
+    fit = HISTORIES["fit"]
+    figure = figures.losses_figure({"search": HISTORIES["search"], "fit": fit[fit["metric"].isin(metrics)]}, "m")
+    search, second = figure.axes
+    assert [text.get_text() for text in search.get_legend().get_texts()] == ["candidates", "best so far"]
+    assert search.get_yscale() == "log" and search.get_ylim()[1] < 1.0
+    assert len(second.lines) == len(metrics)
+    assert second.get_yscale() == ("log" if metrics else "linear")
+    plt.close(figure)
+
+
+def test_the_loss_of_a_baseline_has_no_unit_that_it_may_not_have():
+    history = pd.DataFrame({"step": [0, 1, 0, 1], "metric": ["loss", "loss", "mask", "mask"], "value": [1.0, 0.5, 9.0, 9.0]})
+    figure = figures.losses_figure({"train": history}, "m")
+    (axis,) = figure.axes
+    assert (axis.get_title(), axis.get_xlabel(), axis.get_ylabel()) == ("train", "step", "loss")
+    assert [list(line.get_ydata()) for line in axis.lines] == [[1.0, 0.5]]
+    plt.close(figure)
