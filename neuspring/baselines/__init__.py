@@ -100,7 +100,7 @@ class Baseline:
 
 def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
     if section.supervision == "masks":
-        return ("simulation.gravity", "images.backend", "images.released_quirks.corner_pixels")
+        return ("simulation.gravity", "images.backend", "images.corner_pixels")
     return ("simulation.gravity", "losses")
 
 

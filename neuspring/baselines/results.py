@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -12,6 +13,8 @@ import pandas as pd
 from neuspring.core.artifacts import Artifact, Trajectory
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop
 
+CHECKPOINT_EVERY = 5
+"""Epochs between checkpoints from which a killed training continues."""
 LIMIT = 10.0
 """m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""
 Model = TypeVar("Model", bound=Artifact)
@@ -62,8 +65,14 @@ class Training(Protocol[TrainedModel]):
     def restore(self, checkpoint: Checkpoint) -> None: ...
 
 
-def run_epochs(training: Training[Model], loop: TrainingLoop, metrics: Sequence[str], failure: str = "") -> Trained[Model]:
-    """Train for the epochs of the loop, or until `epoch` raises TrainingStopped, whose text becomes the failure."""
+def run_epochs(
+    training: Training[Model], metrics: Sequence[str], epochs: int, partial: Path | None, key: str, failure: str = ""
+) -> Trained[Model]:
+    """Train for so many epochs, or until `epoch` raises TrainingStopped, whose text becomes the failure.
+
+    Continues from the file `partial` if it holds a checkpoint with the same key.
+    """
+    loop = TrainingLoop("the training", "train", epochs, CHECKPOINT_EVERY, partial, key)
     if loop.restored:
         training.restore(loop.restored)
     for number in loop:

@@ -6,9 +6,7 @@ Both are adapted to captures with hands. The defaults are those of the public co
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
-
-from pydantic import Field
+from typing import Literal
 
 from neuspring.config.parse import Count, NonNegative, Positive, Section
 
@@ -26,20 +24,12 @@ class SpringGaus(Section):
     """Number K of nearest anchors that an anchor feels."""
     full_neighbors: Count = 16
     """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
-    bound_anchors: Count = 16
-    """Number of nearest anchors that a splat or a structure point follows."""
-    link_stiffness: NonNegative = 3e4
-    """Stiffness of the links, N per unit strain at 1 kg; it is not trained."""
     stiffness: Positive = 2000.0
     """Stiffness 10^kappa at the start, N at 1 kg."""
     damping: Positive = 0.2
     """Damping zeta at the start, N s at 1 kg."""
     substeps: Count = 50
     """Substeps per frame at the start."""
-    substeps_added: Count = 50
-    """Substeps that are added at each of `substeps_raised`, and whenever a frame fails."""
-    substeps_raised: tuple[Count, ...] = (25, 50)
-    """Iterations from which there are more substeps."""
     max_substeps: Count = 1000
     """Largest number of substeps; if a frame fails with so many, training ends as a failure of the run."""
     iterations: Count = 100
@@ -53,8 +43,6 @@ class SpringGaus(Section):
     vgg16: str | None = None
     """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
     downloaded."""
-    checkpoint_every: Annotated[int, Field(ge=1)] = 5
-    """Iterations between checkpoints from which a killed job continues."""
 
     def __post_init__(self) -> None:
         if self.full_neighbors > self.neighbors:
@@ -90,16 +78,9 @@ class GsDynamics(Section):
     """Motion of the tools that makes a step, m."""
     coverage: NonNegative = 0.03
     """Distance, m: no more particles are added once every point lies within it of a particle."""
-    dense_points: Count = 1000
-    """Largest number of tracks from which particles are drawn."""
-    smoothing_passes: Annotated[int, Field(ge=0)] = 10
-    """Passes of a moving average over three frames on the visible part of tracks, within the training frames."""
     outlier_deviations: NonNegative = 3.0
     """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
     drops none."""
-    min_visible: Count = 20
-    """Smallest number of tracks that must be seen in all frames of a window. Where fewer are, the window takes the tracks seen in
-    its history, and the losses leave out what is not seen."""
     yaw: bool = True
     """Turn each training window by a random angle about the vertical."""
     epochs: Count = 50
@@ -108,12 +89,6 @@ class GsDynamics(Section):
     """Optimizer steps per epoch, each on windows drawn at random."""
     learning_rate: Positive = 1e-3
     """Adam's learning rate."""
-    checkpoint_every: Count = 5
-    """Epochs between checkpoints from which a killed job continues."""
-
-    def __post_init__(self) -> None:
-        if self.min_visible > self.dense_points:
-            raise ValueError(f"min_visible: at most dense_points ({self.dense_points}), received {self.min_visible}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,6 @@ class Toy(Section):
 
     frames: Annotated[int, Field(ge=5)] = 60
     """Frames per scene; the first 70 % are for training."""
-    frame_rate: Positive = 30.0
-    """Frames per second."""
     noise: NonNegative = 0.0005
     """Standard deviation of the observation noise, m."""
     occlusion: Annotated[float, Field(ge=0, lt=1)] = 0.2
@@ -50,8 +48,6 @@ class Mocap(Section):
     """What holds an end. markers: its two markers, which leave its roll free. clamp: and a ring of `ring` points around each, which
     turns with the direction of the two without spinning, so that direction and roll are held. With a straight rest shape set
     `search.controller_rest: first_frame` too."""
-    train_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
-    """Fraction of the frames that are for training, the first ones."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from neuspring.config.parse import Count, NonNegative, Positive, Section
 
-Fraction = Annotated[float, Field(gt=0, lt=1)]
+ImageQuirk = Literal["second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +31,6 @@ class Appearance(Section):
     spacing: NonNegative = 0.0
     """Width of a voxel in pixels of the camera, at the object; there is one first splat per voxel. 0: one per point that was seen,
     as released."""
-    l1: NonNegative = 0.8
-    """Weight of the mean absolute difference of colors."""
     dssim: NonNegative = 0.4
     """Weight of 1 - SSIM; the released loss has this term twice, with 0.2 each."""
     mask: NonNegative = 0.8
@@ -48,40 +46,10 @@ class Appearance(Section):
     """Learning rate of opacity logits."""
     scale_rate: Positive = 5e-3
     """Learning rate of log scales."""
-    densify_from: Annotated[int, Field(ge=0)] = 500
-    """Steps before splats are cloned, split and pruned for the first time."""
-    densify_until: Annotated[int, Field(ge=0)] = 15_000
-    """Steps after which splats are no longer cloned, split and pruned."""
-    densify_every: Count = 100
-    """Steps between two rounds of cloning, splitting and pruning."""
-    densify_gradient: Positive = 2e-4
-    """Smallest mean gradient of a splat's place in the picture, per half picture, for which it is cloned or split."""
-    split_size: Positive = 0.01
-    """Size, as part of the extent, above which a splat is split; smaller ones are cloned."""
-    prune_opacity: Fraction = 0.005
-    """Opacity below which splats are removed."""
-    most_splats: Count = 300_000
-    """Largest number of splats."""
 
     def __post_init__(self) -> None:
         if self.fixed_radius is not None and not self.isotropic:
             raise ValueError("fixed_radius: splats of one radius are isotropic, received isotropic: false")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageQuirks(Section):
-    """Errors of the released evaluation of pictures; all are off by default."""
-
-    second_camera_intrinsics: bool = False
-    """Draw every view with the intrinsics of the second camera."""
-    any_alpha: bool = False
-    """Count every pixel as object whose 8-bit coverage is not zero; otherwise the coverage must be at least a half."""
-    unit_lpips: bool = False
-    """Leave the inputs of LPIPS in [0, 1]; otherwise they are in [-1, 1], as its networks were trained."""
-    corner_pixels: bool = False
-    """Use calibrated intrinsics unchanged, which are half a pixel off."""
-    degenerate_skinning: bool = False
-    """Let one node on a line of neighbors turn all nodes as it turns; several such nodes turn none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,12 +73,14 @@ class Images(Section):
     """Rasterizer. auto: gsplat on CUDA where it works (extra `gpu`), otherwise the platform's own (warp)."""
     views: Literal["first", "all"] = "first"
     """Cameras whose pictures are scored; the released evaluation takes the first."""
-    opacity: NonNegative = 0.1
-    """Opacity that a splat must exceed to be drawn when the twin moves, as released."""
-    frozen_skinning: bool = False
-    """Each splat follows the same nodes as in the first frame, as for real time; false: nodes are chosen anew in each frame."""
     video: bool = True
     """Write videos: observed, predicted and error side by side, and a turntable of the twin."""
     appearance: Appearance = field(default_factory=Appearance)
     lpips: LpipsWeights = field(default_factory=LpipsWeights)
-    released_quirks: ImageQuirks = field(default_factory=ImageQuirks)
+    released_quirks: tuple[ImageQuirk, ...] = ()
+    """Errors of the released evaluation of pictures that are made on purpose. second_camera_intrinsics: every view has the
+    intrinsics of the second camera. any_alpha: a pixel counts as object whose 8-bit coverage is not zero, not only from a half on.
+    unit_lpips: the inputs of LPIPS stay in [0, 1]; its networks were trained with [-1, 1]. degenerate_skinning: one node on a line
+    of neighbors turns all nodes as it turns; several such nodes turn none."""
+    corner_pixels: bool = False
+    """One more of these errors, of training too: calibrated intrinsics are used unchanged, half a pixel off."""

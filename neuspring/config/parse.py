@@ -38,47 +38,41 @@ class Section:
 T = TypeVar("T")
 REMOVED = "removed; commit 7308a7b is the last that has it"
 """The sentence for what lost its trial."""
-RENAMED = {
-    "controller_path": REMOVED,
-    "drag_quadratic": REMOVED,
-    "colour_rate": "color_rate",
-    "neighbourhood": "neighborhood",
-    "outlier_neighbours": "outlier_neighbors",
-    "carry_over": REMOVED,
-    "average_seeds": REMOVED,
-    "ranges": "now variables.NAME: {low: ..., high: ...}",
-    "scales": "now variables.NAME: {scale: ...}",
-    "start": "of a search now variables.NAME: {start: ...}",
-    "betas": "a constant of neuspring/twin/fit.py now",
-    "freed_sigma": "a constant of neuspring/twin/search.py now",
-    "hand_knots": "a constant of neuspring/twin/hand_paths.py now",
-    "polish.step": "a constant of neuspring/twin/polish.py now",
-    "polish.tolerance": "a constant of neuspring/twin/polish.py now",
-    "last_frame": REMOVED,
-    "warmup_scenarios": "a third of the scenarios now",
+_LEFT = {
+    REMOVED: """
+        controller_path drag_quadratic carry_over average_seeds last_frame losses.alpha simulation.mass search.clusters extra
+        bending_reach homogeneous_epochs fit.warmup_epochs schedule fit.clip_gradient_norm weight_decay rest_lengths_by field.scale
+        field.controllers rest_length_bound rest_prior rest_learning_rate
+    """,
+    "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
+    "now color_rate": "colour_rate",
+    "now neighborhood": "neighbourhood",
+    "now outlier_neighbors": "outlier_neighbours",
+    "now variables.NAME: {low: ..., high: ...}": "ranges",
+    "now variables.NAME: {scale: ...}": "scales",
+    "of a search now variables.NAME: {start: ...}": "start",
+    "now lift.released": "sequential_motion_filter coordinate_outliers whole_pixels depth_window",
+    "a third of the scenarios now": "warmup_scenarios",
+    "a constant in neuspring/config/search.py now": "polish.share",
+    "a constant beside its user in neuspring/twin now": "betas freed_sigma hand_knots polish.step polish.tolerance",
+    "a constant beside its user in neuspring/data now": "toy.frame_rate mocap.train_fraction",
+    "a constant beside its user in neuspring/splats now": """
+        appearance.l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
+    """,
+    "a constant beside its user in neuspring/baselines now": """
+        min_visible bound_anchors link_stiffness substeps_added substeps_raised spring_gaus.checkpoint_every
+        dense_points smoothing_passes gs_dynamics.checkpoint_every
+    """,
+    "a constant beside its user in neuspring/perception now": """
+        marks.smoothness marks.reach opencv.smoothing opencv.smallest hand_prompt box_threshold text_threshold
+        opencv.window opencv.levels opencv.forward_backward opencv.reacquire likeness lift.least_neighbors agreement release_after
+        shape.margin shape.tolerance shape.smoothing shape.bend_reach shape.thin shape.bend back_fraction
+        sample.surface sample.interior color.beneath color.hands_apart color.hand_radius color.samples color.band color.cell
+        color.grip_reach grip_length
+    """,
 }
-RENAMED |= dict.fromkeys(
-    (
-        *("losses.alpha", "simulation.mass", "search.clusters", "extra", "bending_reach"),
-        *("homogeneous_epochs", "fit.warmup_epochs", "schedule", "fit.clip_gradient_norm", "weight_decay"),
-        *("rest_lengths_by", "field.scale", "field.controllers"),
-        *("rest_length_bound", "rest_prior", "rest_learning_rate"),
-    ),
-    REMOVED,
-)
-RENAMED |= dict.fromkeys(("sequential_motion_filter", "coordinate_outliers", "whole_pixels", "depth_window"), "lift.released")
-RENAMED |= dict.fromkeys(
-    (
-        *("perception.segment.marks.smoothness", "perception.segment.marks.reach"),
-        *("perception.segment.opencv.smoothing", "perception.segment.opencv.smallest"),
-        *("perception.track.opencv.levels", "perception.track.opencv.forward_backward", "perception.lift.least_neighbors"),
-        *("perception.shape.margin", "perception.shape.tolerance", "perception.shape.smoothing", "perception.shape.bend_reach"),
-        *("perception.sample.surface", "perception.sample.interior"),
-        *(f"perception.color.{name}" for name in ("beneath", "hands_apart", "hand_radius", "samples", "band", "cell")),
-    ),
-    "a constant beside its user in neuspring/perception now",
-)
-"""Keys of older versions -> their name now, or a sentence that says where they went. An entry is a key or its dotted path."""
+RENAMED = {key: sentence for sentence, keys in _LEFT.items() for key in keys.split()}
+"""Keys of older versions -> a sentence that says where they went. An entry is a key, or the end of its dotted path."""
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
@@ -103,8 +97,9 @@ def _describe(problem: Any) -> str:
     path = ".".join(str(part) for part in problem["loc"] if not str(part).startswith("constrained")) or "(top level)"
     value = problem["input"]
     if problem["type"] == "unexpected_keyword_argument":
-        now = RENAMED.get(path) or RENAMED.get(path.rpartition(".")[2])
-        return f"{path}: unknown key" + (f" ({now if ' ' in now else f'now {now}'})" if now else "")
+        parts = path.split(".")
+        now = next((RENAMED[end] for n in range(len(parts)) if (end := ".".join(parts[n:])) in RENAMED), "")
+        return f"{path}: unknown key" + (f" ({now})" if now else "")
     if problem["type"] == "missing":
         return f"{path}: required, but missing"
     hint = ""

@@ -54,12 +54,6 @@ class OpenCvTracking(Section):
     """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
-    window: Annotated[int, Field(ge=5)] = 9
-    """Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
-    reacquire: bool = True
-    """Look for lost points again by their appearance in frame 0."""
-    likeness: Annotated[float, Field(gt=-1, lt=1)] = 0.85
-    """Smallest correlation of a patch that is found again with the point's patch of frame 0."""
     rim: NonNegative = 0.0
     """How far outside of its mask a point may lie, pixels, before it is lost: masks are off by pixels at tips and corners."""
 
@@ -74,12 +68,6 @@ class GroundedSam2(Section):
     """SAM 2: its name on the Hugging Face hub, or a folder."""
     prompt: str | None = None
     """Words for the object; null: the capture's category."""
-    hand_prompt: str = "hand"
-    """Words for hands."""
-    box_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.35
-    """Smallest score of a box."""
-    text_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Smallest score of a word for a box."""
     download: bool = False
     """Fetch weights that are not in the cache."""
 
@@ -104,8 +92,6 @@ class Lift(Section):
     """Distance, m, within which masks and motions look for neighbors."""
     outlier_neighbors: NonNegative = 40.0
     """Number of neighbors that a masked pixel must exceed, at a focal length of 430 pixels."""
-    agreement: Positive = 0.005
-    """Distance, m, within which at least half of a motion's neighbors must move alike."""
     controllers: Count = 30
     """Largest number of controller points."""
     least_controllers: Count = 30
@@ -122,8 +108,6 @@ class Lift(Section):
     release: Positive | None = None
     """Distance, m, between hand and object beyond which a hand has let go: its springs do not act. If it comes near the same part
     of the object again, it takes hold again. null: hands hold to the end, as released."""
-    release_after: Count = 10
-    """With `release`: frames without any hand in view after which hands have let go too, and the fewest that a hand is away."""
     released: bool = False
     """As the released processing: a track is lifted at its nearest whole pixel with its own depth, motions are judged in the order
     of the points, and a masked pixel that shares any one coordinate with an outlier is dropped."""
@@ -138,8 +122,6 @@ class ShapePriorSettings(Section):
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
     """auto: none for `thin` categories, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
     mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure what perception costs."""
-    thin: tuple[str, ...] = ("cloth", "package")
-    """Categories that need no prior."""
     voxel: Positive = 0.003
     """Side of a voxel of the visual hull, m."""
     back: Literal["none", "symmetry", "fraction"] = "symmetry"
@@ -147,12 +129,8 @@ class ShapePriorSettings(Section):
     carved, and this is not used). fraction: behind the seen surface by `back_fraction` of the silhouette's local width, rounded to
     its edge. symmetry: where the seen surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or
     `margin` behind what was seen."""
-    back_fraction: Positive = 1.2
-    """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
-    bend: bool = True
-    """Move the visible part of the mesh, once it is placed, to where it was seen; the rest follows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,10 +156,6 @@ class ColorSettings(Section):
     """Thickness of a sheet, m."""
     body_thickness: Positive = 0.8
     """Height of a body above the table in local widths of its silhouette, of all categories that are neither flat nor round."""
-    grip_reach: Positive = 0.02
-    """Distance from the object, m at the object, up to which pixels of a hand hold it in frame 0."""
-    grip_length: Positive = 0.04
-    """Distance from a hand's tip, its pixel farthest along the arm, up to which its pixels hold a sheet, m at the object."""
     hand_tilt: Finite = 0.0
     """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.variables.hand_tilt)."""
 

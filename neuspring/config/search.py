@@ -114,8 +114,6 @@ class Polish(Section):
 
     rounds: Annotated[int, Field(ge=0)] = 6
     """Most rounds; 0: no polish. A round takes a rollout, one more per variable for the slopes, and four for the damped steps."""
-    share: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Largest part of the budget `rollouts` that its rounds may take: a search of few rollouts has fewer rounds, or none."""
     variables: tuple[str, ...] = ("stiffness", "dashpot", "drag")
     """What is polished: variables that decide nothing of which springs and pairs there are; fixed ones are left out."""
 
@@ -183,7 +181,7 @@ class Search(Section):
         """As `polish_rounds`, for a number of polished variables."""
         if not polished:
             return 0
-        return min(self.polish.rounds, int(self.polish.share * self.rollouts) // round_rollouts(polished))
+        return min(self.polish.rounds, int(POLISH_SHARE * self.rollouts) // round_rollouts(polished))
 
     @property
     def cma_rollouts(self) -> int:
@@ -202,3 +200,5 @@ def round_rollouts(polished: int) -> int:
 
 TRIALS = 4
 """Damped steps that a round of the polish tries."""
+POLISH_SHARE = 0.25
+"""Largest part of the budget `rollouts` that the polish may take: a search of few rollouts has fewer rounds, or none."""

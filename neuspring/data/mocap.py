@@ -81,6 +81,8 @@ RECORD_RATE = 100.0
 MIN_MARKERS = 6
 """Two controllers at either end and at least two observed markers."""
 MIN_FRAMES = 4
+TRAIN_FRACTION = 0.7
+"""Of the frames, the first ones."""
 MIN_DISTANCE = 1e-4
 """Nodes must be farther apart than this, m; otherwise their spring would have no length."""
 RELEASED_SAMPLES = 500
@@ -110,10 +112,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     if frames < MIN_FRAMES:
         rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
         raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller start or stride.")
-    train_end = int(settings.train_fraction * frames)
-    if train_end < 2:
-        rule = f"mocap.train_fraction = {settings.train_fraction} must leave a frame after frame 0 for training"
-        raise InputError(file, rule, f"{train_end} of {frames} frames", "Choose a larger fraction.")
+    train_end = int(TRAIN_FRACTION * frames)
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]

@@ -67,9 +67,7 @@ class Source:
         The source must have all frames: the nodes carry splats from each to the next.
         """
         images, wanted = Images(), set(frames)
-        carried = skinned_frames(
-            prune_by_opacity(self.require_splats(), images.opacity), self.positions[: max(frames) + 1], images, "cpu"
-        )
+        carried = skinned_frames(prune_by_opacity(self.require_splats()), self.positions[: max(frames) + 1], images, "cpu")
         return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
 
     def require_splats(self) -> Splats:

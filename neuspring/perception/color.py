@@ -35,6 +35,10 @@ BAND = 30.0
 """How far from the object points beside it were drawn, pixels."""
 BENEATH = 0.03
 """What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
+GRIP_REACH = 0.02
+"""Distance from the object up to which pixels of a hand hold it in frame 0, m at the object."""
+GRIP_LENGTH = 0.04
+"""Distance from a hand's tip, its pixel farthest along the arm, up to which its pixels hold a sheet, m at the object."""
 HANDS_APART = 0.04
 """Distance between the grips of different hands, m at the object."""
 HAND_RADIUS = 0.08
@@ -177,8 +181,8 @@ def lift_color(
     known = np.zeros((frames, len(places)), bool)
     known[0] = True
     # A hand above a sheet hides more of it than its fingers hold.
-    length = settings.grip_length if first.kind == "flat" else np.inf
-    sizes = (settings.grip_reach, HANDS_APART, length)
+    length = GRIP_LENGTH if first.kind == "flat" else np.inf
+    sizes = (GRIP_REACH, HANDS_APART, length)
     held = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
     if not held:
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", "Mark the hands in frame 0.")

@@ -25,6 +25,8 @@ LEAST_FOR_POSE = 3
 """Points that a rigid motion needs."""
 ALWAYS = np.zeros((0, 0), dtype=bool)
 """All controllers hold in all frames."""
+RELEASE_AFTER = 10
+"""Frames without any hand in view after which hands have let go, and the fewest that a hand is away."""
 GUIDES = 5
 """Followed points of the object that say which part of it is near a hand."""
 
@@ -169,7 +171,7 @@ def holding(
     body is known in the training frames: later a hand lets go only by leaving the view, and takes no hold.
 
     A hand lets go after a frame in which it was within `release` of the body: as soon as it is seen farther away, or when no hand
-    was in view for `release_after` frames. If it is near again fewer than `release_after` frames later it has not let go. Later it
+    was in view for RELEASE_AFTER frames. If it is near again fewer than RELEASE_AFTER frames later it has not let go. Later it
     takes hold again, if the part of the body that it is near lay within `release` of its controllers in frame 0, where springs are
     made; else it holds nothing any more.
     """
@@ -194,7 +196,7 @@ def holding(
             here = np.flatnonzero(seen[frame])
             own = pixels[label[here[cKDTree(points[frame, here]).query(pixels)[1]]] == number] if len(pixels) else pixels
             apart[frame] = body.nearest(frame, np.concatenate([controllers[frame, members], own]))
-        for begin, end in _gaps(apart <= settings.release, apart > settings.release, in_view, settings.release_after):
+        for begin, end in _gaps(apart <= settings.release, apart > settings.release, in_view, RELEASE_AFTER):
             valid[begin:end, members] = False
             if end == len(points):
                 break

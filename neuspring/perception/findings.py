@@ -211,7 +211,7 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
     found, where = [], "lifted tracks"
     both = lifted.object_visibility[:-1] & lifted.object_visibility[1:]
     share = float(lifted.object_motion_valid[:-1].sum() / max(int(both.sum()), 1))
-    remedy = "Look at tracks.png and lifted.png; perception.lift has neighborhood and agreement."
+    remedy = "Look at tracks.png and lifted.png; perception.lift has neighborhood."
     if both.any() and share < TRUSTED:
         value, rule = f"{share:.0%} of the object's motions are trusted", f"at least {TRUSTED:.0%} are expected"
         found.append(finding("motion not trusted", "warning", where, value, rule, remedy))

@@ -24,6 +24,8 @@ DEPTH_WINDOW = 3
 """Side of the window, pixels, whose median depth inside the mask a track gets."""
 LEAST_NEIGHBORS = 5
 """Smallest number of neighbors of a motion that is trusted, itself included."""
+AGREEMENT = 0.005
+"""m, within which at least half of a motion's neighbors must move alike, as released."""
 STRIDE = 3
 """Of the pixels of object and hands each third says how near they are."""
 
@@ -185,7 +187,7 @@ def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
 def _simultaneous(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
     """Every point judged by all others: independent of their order."""
     pairs = cKDTree(points).query_pairs(settings.neighborhood, output_type="ndarray")
-    alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < settings.agreement
+    alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < AGREEMENT
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
     agreeing = np.bincount(pairs[alike].ravel(), minlength=len(points)) + 1
     return (count >= LEAST_NEIGHBORS) & (agreeing >= 0.5 * count)
@@ -196,7 +198,7 @@ def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.nd
     valid = np.ones(len(points), dtype=bool)
     for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighborhood)):
         neighbors = np.array([j for j in near if valid[j]], dtype=int)
-        alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < settings.agreement
+        alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < AGREEMENT
         valid[i] = len(neighbors) >= LEAST_NEIGHBORS and alike.sum() >= 0.5 * len(neighbors)
     return valid
 

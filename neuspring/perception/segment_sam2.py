@@ -23,6 +23,9 @@ from neuspring.perception.frames import frames_of
 from neuspring.perception.marks.carry import CameraFilm, Carried, Cues, doubt_of, frame_mask, over_capture
 from neuspring.perception.marks.marks import Mark
 
+BOX_SCORE, WORD_SCORE = 0.35, 0.25
+"""Least scores of a box, and of a word for it, as released."""
+
 
 @dataclass(frozen=True)
 class Models:
@@ -51,12 +54,12 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     images = [capture.color(camera, frame) for frame in frames]
     prompt = settings.prompt or capture.description.category
     detections = detect(images[0], prompt, settings, models, device)
-    is_hand = [settings.hand_prompt.lower() in detection.words.replace(".", " ").split() for detection in detections]
+    is_hand = ["hand" in detection.words.replace(".", " ").split() for detection in detections]
     if all(is_hand) or not any(is_hand):
         missing = "hand" if detections and not any(is_hand) else "object"
         where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
-        rule = f"the prompt {prompt!r} and {settings.hand_prompt!r} must find an object and a hand"
-        remedy = "Set perception.segment.grounded_sam2.prompt to words for the object, or lower box_threshold."
+        rule = f"the prompt {prompt!r} and 'hand' must find an object and a hand"
+        remedy = "Set perception.segment.grounded_sam2.prompt to other words for the object."
         raise InputError(where, rule, f"no {missing} among {[detection.words for detection in detections]}", remedy)
     labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
     for frame, masks in zip(frames, propagate(images, detections, models, device), strict=True):
@@ -142,15 +145,15 @@ def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Model
     """Boxes of an RGB image that the prompt finds, best first."""
     import torch
 
-    words = f"{prompt}. {settings.hand_prompt}."
+    words = f"{prompt}. hand."
     inputs = models.detector_processor(images=image, text=words.lower(), return_tensors="pt").to(device)
     with torch.inference_mode():
         outputs = models.detector(**inputs)
     result = models.detector_processor.post_process_grounded_object_detection(
         outputs,
         inputs["input_ids"],
-        threshold=settings.box_threshold,
-        text_threshold=settings.text_threshold,
+        threshold=BOX_SCORE,
+        text_threshold=WORD_SCORE,
         target_sizes=[image.shape[:2]],
     )[0]
     rows = zip(result["boxes"].tolist(), result["text_labels"], result["scores"].tolist(), strict=True)

@@ -41,6 +41,10 @@ from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
 
+THIN = ("cloth", "package")
+"""Categories that need no prior."""
+BACK_FRACTION = 1.2
+"""Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
 MARGIN = 0.02
 """m around the cloud of frame 0 within which voxels are carved."""
 TOLERANCE = 0.004
@@ -86,7 +90,7 @@ def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
 def _prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
     backend = settings.backend
     if backend == "auto":
-        backend = "none" if capture.description.category in settings.thin else "visual_hull"
+        backend = "none" if capture.description.category in THIN else "visual_hull"
     if backend == "visual_hull":
         return visual_hull(capture, masks, cloud, settings)
     if backend == "mesh":
@@ -148,7 +152,7 @@ def one_sided(
     filled = np.where(labels == OBJECT, front(labels == OBJECT, depth, near, far), depth)
     if settings.back == "none":
         return filled, None
-    return filled, back(labels, filled, camera.intrinsics[0, 0], settings.back, settings.back_fraction)
+    return filled, back(labels, filled, camera.intrinsics[0, 0], settings.back, BACK_FRACTION)
 
 
 def _consistent(
@@ -291,8 +295,7 @@ def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, setti
         raise InputError("perception.shape.mesh", "backend: mesh needs a file", "null", "Name a GLB, PLY or OBJ file.")
     vertices, faces = read_mesh(Path(settings.mesh))
     vertices, rms = place(vertices, faces, cloud)
-    if settings.bend:
-        vertices = bend(vertices, faces, capture, masks, cloud, settings)
+    vertices = bend(vertices, faces, capture, masks, cloud, settings)
     return ShapePrior(vertices=vertices, faces=faces, backend="mesh", facts={"alignment_rms": rms})
 
 

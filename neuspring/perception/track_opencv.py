@@ -22,8 +22,12 @@ LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""
 FORWARD_BACKWARD = 0.5
 """Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
+WINDOW = 9
+"""Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
 PATCH = 9
 """Side of compared patches, pixels."""
+LIKENESS = 0.85
+"""Least correlation of a patch that is found again with the point's patch of frame 0."""
 GUIDES = 6
 """Nearest living points of frame 0, whose motion says where a lost point may be."""
 VOTERS = 8
@@ -95,8 +99,7 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
         if alive.any():
             place[alive], alive[alive] = _follow(before, now, place[alive], settings, flow)
         alive &= inside(place, now.shape)
-        if settings.reacquire:
-            alive |= _reacquire(first, now, start, place, alive, settings)
+        alive |= _reacquire(first, now, start, place, alive, settings)
         alive &= _held(labels[frame], place, own, settings.rim)
         for label in np.unique(own):
             _outvote(start, place, alive, own == label)
@@ -119,7 +122,7 @@ def _follow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the next frame [n, 2], and whether going back returns to the start [n]."""
     if flow is None:
-        return lucas_kanade(before, now, points, points, settings.window)
+        return lucas_kanade(before, now, points, points, WINDOW)
     there, back = flow.calc(before, now, None), flow.calc(now, before, None)  # type: ignore[call-overload]
     moved = points + _sample(there, points)
     returned = moved + _sample(back, moved)
@@ -152,11 +155,11 @@ def _reacquire(
     if len(guides) >= GUIDES:
         nearest = guides[cKDTree(start[guides]).query(start[lost], k=GUIDES)[1]]
         guess = start[lost] + np.median((place - start)[nearest], axis=1)
-    moved, ok = lucas_kanade(first, now, start[lost], guess, settings.window)
-    ok &= np.linalg.norm(moved - guess, axis=1) < settings.window
+    moved, ok = lucas_kanade(first, now, start[lost], guess, WINDOW)
+    ok &= np.linalg.norm(moved - guess, axis=1) < WINDOW
     ok &= inside(moved, now.shape)
     if ok.any():
-        ok[ok] = likeness(first, now, start[lost][ok], moved[ok]) > settings.likeness
+        ok[ok] = likeness(first, now, start[lost][ok], moved[ok]) > LIKENESS
         place[lost[ok]] = moved[ok]
         again[lost[ok]] = True
     return again

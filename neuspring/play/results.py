@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import META, DamagedFile, read_head
@@ -79,7 +78,7 @@ class Run:
         require_small(self.splats_path, MOST_BYTES)
         splats = Splats.load(self.splats_path)
         # As pictures (stages/render.py): where a method's own model moves them, all of them are drawn.
-        return splats if self.centers_path else prune_by_opacity(splats, Images().opacity)
+        return splats if self.centers_path else prune_by_opacity(splats)
 
     @cached_property
     def centers(self) -> SplatCenters | None:

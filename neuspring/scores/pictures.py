@@ -144,17 +144,17 @@ class Scored:
     def of(cls, capture: Capture, perceived: Mapping[str, Masks], images: Images, device: str) -> Scored:
         """The cameras that `images.views` asks for. Raises InputError if a second camera is asked for and there is none."""
         quirks, cameras = images.released_quirks, list(capture.cameras.values())
-        if quirks.second_camera_intrinsics and len(cameras) < 2:
-            rule = "images.released_quirks.second_camera_intrinsics needs a second camera"
+        if "second_camera_intrinsics" in quirks and len(cameras) < 2:
+            rule = "images.released_quirks: second_camera_intrinsics needs a second camera"
             raise InputError(capture.folder / CAPTURE, rule, f"{len(cameras)} camera")
-        borrowed = cameras[1] if quirks.second_camera_intrinsics else None
+        borrowed = cameras[1] if "second_camera_intrinsics" in quirks else None
         scored = cameras[: 1 if images.views == "first" else None]
         views = {camera.name: view_of(camera, images, device, borrowed) for camera in scored}
         # Scores should not depend on the segmentation under test, where the capture comes with masks of its own.
         own = capture.description.masks
         labels = {} if own else {name: perceived[name].labels for name in views}
         source = "given" if own else next(iter(perceived.values())).backend
-        covered = 1 if quirks.any_alpha else COVERED
+        covered = 1 if "any_alpha" in quirks else COVERED
         return cls(capture, labels, source, views, choose_backend(images.backend, device), covered)
 
     def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:

@@ -22,29 +22,30 @@ from neuspring.splats.view import View
 
 COVERED = 128
 """Coverage, of 255, from which a pixel counts as object: a half."""
+LEAST_OPACITY = 0.1
+"""A splat must exceed it to be drawn when the twin moves, as released."""
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
 def view_of(camera: Camera, images: Images, device: str, borrowed: Camera | None = None) -> View:
     """The view of a calibrated camera, or with the intrinsics of another one."""
     intrinsics = (borrowed or camera).intrinsics
-    shift = 0.0 if images.released_quirks.corner_pixels else 0.5
+    shift = 0.0 if images.corner_pixels else 0.5
     return View.of(camera.camera_to_world, intrinsics, camera.width, camera.height, device, shift)
 
 
-def prune_by_opacity(splats: Splats, opacity: float) -> Splats:
-    """Splats above an opacity. Raises NumericalFailure where none is."""
-    dense = 1 / (1 + np.exp(-splats.opacity_logits)) > opacity
+def prune_by_opacity(splats: Splats) -> Splats:
+    """Splats that are opaque enough to be moved. Raises NumericalFailure where none is."""
+    dense = 1 / (1 + np.exp(-splats.opacity_logits)) > LEAST_OPACITY
     if not dense.any():
-        raise NumericalFailure(f"appearance: no splat has an opacity above {opacity}")
+        raise NumericalFailure(f"appearance: no splat has an opacity above {LEAST_OPACITY}")
     return Splats(**{field.name: getattr(splats, field.name)[dense] for field in fields(Splats)})
 
 
 def skinned_frames(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
     """The splats in every frame of a trajectory [F, N, 3], m."""
     start = Gaussians.of(splats, device)
-    quirk = images.released_quirks.degenerate_skinning
-    skin = Skin(positions[0], device=device, frozen=images.frozen_skinning, released_degeneracy=quirk)
+    skin = Skin(positions[0], device=device, released_degeneracy="degenerate_skinning" in images.released_quirks)
     for means, quaternions in skin.carry(positions, start.means, start.quaternions):
         yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
 

@@ -1,6 +1,6 @@
 """SSIM of pictures, and what training of splats minimizes, on one view of frame 0.
 
-    L = l1 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
+    L = 0.8 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
 
 C color, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
 object. Means are over all pixels. What hands hide is not compared: there everything is zero on both sides.
@@ -32,10 +32,12 @@ SIGMA = 1.5
 """px."""
 C1 = 0.01**2
 C2 = 0.03**2
+L1 = 0.8
+"""Weight of the mean absolute difference of colors, as released."""
 HAND_MARGIN, REFERENCE_WIDTH = 8.0, 848
 """Hands are dilated by a square of so many pixels in an image of this width; pixels within are not compared."""
 WINDOW = 12
-"""Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost l1 and mask alone."""
+"""Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost color and mask alone."""
 
 
 def check_pair(where: str, a: torch.Tensor, b: torch.Tensor) -> None:
@@ -138,7 +140,7 @@ class Shot:
 def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
     """The training loss of one picture."""
     color = rendered.rgb * shot.known[..., None]
-    total = settings.l1 * (color - shot.color).abs().mean()
+    total = L1 * (color - shot.color).abs().mean()
     if settings.dssim:
         top, bottom, left, right = shot.box
         pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.color)]

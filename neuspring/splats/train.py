@@ -33,6 +33,15 @@ DEGREE_EVERY = 1000
 POSITION_RATE_END, POSITION_STEPS = 1.6e-6, 30_000
 """Learning rate of means after so many steps, per extent; log-linear before."""
 ROTATION_RATE = 1e-3
+DENSIFY_FROM, DENSIFY_UNTIL, DENSIFY_EVERY = 500, 15_000, 100
+"""Steps between which splats are cloned, split and pruned, and steps between two rounds of it, as released."""
+DENSIFY_GRADIENT = 2e-4
+"""Least mean gradient of a splat's place in the picture, per half picture, for which it is cloned or split."""
+SPLIT_SIZE = 0.01
+"""Size, as part of the extent, above which a splat is split; smaller ones are cloned."""
+MOST_SPLATS = 300_000
+PRUNE_OPACITY = 0.005
+"""Splats below it are removed."""
 PRUNE_RADIUS, PRUNE_SIZE = 20.0, 0.1
 """After the first reset of opacities, splats are removed whose radius ever exceeded so many pixels, or this part of the extent."""
 RECORD_EVERY = 10
@@ -102,21 +111,21 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
     history: dict[str, list[float]] = {"step": [], "loss": [], "splats": []}
     progress = Progress("appearance", settings.iterations)
     # Splats that the last step adds would not be trained.
-    last_change = min(settings.densify_until, settings.iterations)
+    last_change = min(DENSIFY_UNTIL, settings.iterations)
     for step, shot in zip(range(1, settings.iterations + 1), _shuffled(shots, generator), strict=False):
         optimizer.schedule(step)
         rendered = optimizer.gaussians.draw(shot.view, degree=(step - 1) // DEGREE_EVERY, backend=backend)
         value = loss(rendered, shot, settings)
         number = float(value.detach())
         value.backward()  # type: ignore[no-untyped-call]
-        if step < settings.densify_until:
+        if step < DENSIFY_UNTIL:
             statistics.add(rendered, shot.view.width, shot.view.height)
         optimizer.step()
         optimizer.require_usable(step)
         if step % RECORD_EVERY == 0 or step == settings.iterations:
             for name, entry in {"step": step, "loss": number, "splats": len(optimizer)}.items():
                 history[name].append(float(entry))
-        if settings.densify_from < step < last_change and step % settings.densify_every == 0:
+        if DENSIFY_FROM < step < last_change and step % DENSIFY_EVERY == 0:
             splats, after_reset = vars(optimizer.gaussians), step > RESET_EVERY
             stay, added = densify(splats, statistics, settings, optimizer.extent, after_reset, generator)
             optimizer.replace(stay, added)
@@ -255,13 +264,13 @@ def densify(
     """
     size = torch.exp(splats["log_scales"]).amax(1)
     mean_pull = statistics.pull / statistics.seen.clamp_min(1)
-    coarse = mean_pull > settings.densify_gradient
-    room = max(settings.most_splats - len(size), 0)
+    coarse = mean_pull > DENSIFY_GRADIENT
+    room = max(MOST_SPLATS - len(size), 0)
     # The coarsest ones first where there is no room for all.
     if int(coarse.sum()) > room:
         coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean_pull, room).indices, True) & coarse
     # A split makes smaller splats, so splats of a fixed radius are cloned.
-    split = coarse & (size > settings.split_size * extent) & (settings.fixed_radius is None)
+    split = coarse & (size > SPLIT_SIZE * extent) & (settings.fixed_radius is None)
     added = {name: tensor[coarse & ~split] for name, tensor in splats.items()}
     if split.any():
         children = {name: tensor[split].repeat_interleave(CHILDREN, 0) for name, tensor in splats.items()}
@@ -279,7 +288,7 @@ def densify(
 
 def _superfluous(splats: Mapping[str, torch.Tensor], settings: Appearance, extent: float, after_reset: bool) -> torch.Tensor:
     """Faint splats [N], after a reset also huge ones."""
-    faint = torch.sigmoid(splats["opacity_logits"]) < settings.prune_opacity
+    faint = torch.sigmoid(splats["opacity_logits"]) < PRUNE_OPACITY
     if not after_reset or settings.fixed_radius:
         return faint
     return faint | (torch.exp(splats["log_scales"]).amax(1) > PRUNE_SIZE * extent)

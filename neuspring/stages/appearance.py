@@ -28,7 +28,7 @@ NEAR_SEEN = 1.5
 @stage(
     output="{scenario}/{looks}/{seed}/appearance.json",
     reads=lambda settings, given: (
-        *("images.backend", "images.appearance", "images.released_quirks.corner_pixels"),
+        *("images.backend", "images.appearance", "images.corner_pixels"),
         # Perception has not lifted the masks of processed data.
         *(() if given.get("lifted") else ("perception.lift",)),
     ),

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from neuspring import config
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError, NumericalFailure
@@ -28,11 +27,10 @@ VIDEOS = ("video", "turntable")
     reads=(
         "images.backend",
         "images.views",
-        "images.opacity",
-        "images.frozen_skinning",
         "images.video",
         "images.lpips",
         "images.released_quirks",
+        "images.corner_pixels",
     ),
     gpu="always",
     memory_mb=8000,
@@ -89,7 +87,7 @@ def render(
                 if not capture.has(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
-                scores = picture_scores(pair, lpips, unit_lpips=images.released_quirks.unit_lpips)
+                scores = picture_scores(pair, lpips, unit_lpips="unit_lpips" in images.released_quirks)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in scores.items()]
                 if name == first and frame < predicted:
                     if frame in shown:
@@ -111,7 +109,7 @@ def render(
         "views": list(scored.views),
         "splats": len(splats.means),
         "lpips": lpips if isinstance(lpips, str) else "computed",
-        "quirks": sorted(name for name, on in config.plain(images.released_quirks).items() if on),
+        "quirks": sorted([*images.released_quirks, *["corner_pixels"] * images.corner_pixels]),
         "unseen_surface": appearance.record.facts["unseen_surface"],
         # Nothing but black on both sides: such frames have no finite PSNR.
         "empty_frames": int(np.isinf(table.loc[table["frame"] < predicted, "value"]).sum()),
@@ -131,7 +129,7 @@ def posed(
 
     splats = Splats.load(appearance.file("splats"))
     if not rollout.has("centers"):
-        splats = prune_by_opacity(splats, images.opacity)
+        splats = prune_by_opacity(splats)
         return splats, skinned_frames(splats, trajectory.positions, images, device)
     return splats, frames_from_centers(splats, SplatCenters.load(rollout.file("centers")).positions, device)
 

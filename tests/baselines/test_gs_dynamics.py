@@ -133,7 +133,7 @@ def test_shifts_along_the_ground_change_nothing_and_heights_do():
 def test_yaw_is_learned_and_not_built_in():
     points, tools, quarter = cloud(), cloud(3, 1), torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     assert float((moves(points @ quarter.T, tools @ quarter.T) - moves(points, tools) @ quarter.T).abs().max()) > 1e-4
-    settings = GsDynamics(width=8, noise=0.0, batch=4, min_visible=1)
+    settings = GsDynamics(width=8, noise=0.0, batch=4)
     rules, recipe = resolve(settings, "sloth")
     windows = Windows.of(walk(10), settings, "cpu")
     turned, plain = (draw(windows, rules, replace(recipe, yaw=yaw), torch.Generator().manual_seed(0)) for yaw in (True, False))
@@ -171,13 +171,13 @@ def test_steps_of_a_window_are_of_tool_motion():
     assert window_frames(tools[:, :1], GsDynamics()).shape == (0, 8)
 
 
-def test_unseen_tracks_are_no_particles_and_no_targets():
+def test_unseen_tracks_are_no_particles_and_no_targets(monkeypatch):
     tracks = walk(12)
     visible = tracks.visible.copy()
     visible[6, :5] = False
     points = np.where(visible[..., None], tracks.points, 100.0).astype(np.float32)
     hidden = replace(tracks, points=points, visible=visible)
-    settings = GsDynamics(width=8, batch=16, noise=0.0, min_visible=20)
+    settings = GsDynamics(width=8, batch=16, noise=0.0)
     rules, recipe = resolve(settings, "sloth")
     windows = Windows.of(hidden, settings, "cpu")
     touched = (windows.frames == 6).any(dim=1)
@@ -185,8 +185,8 @@ def test_unseen_tracks_are_no_particles_and_no_targets():
     batch = draw(windows, rules, recipe, torch.Generator().manual_seed(0))
     assert batch.history.abs().max() < 1 and batch.targets.abs().max() < 1 and batch.known.all()
     # Too few are seen throughout: those seen in the history take part, and what is not seen is no target.
-    few = replace(settings, min_visible=28)
-    windows = Windows.of(hidden, few, "cpu")
+    monkeypatch.setattr("neuspring.baselines.gs_dynamics.windows.MIN_VISIBLE", 28)
+    windows = Windows.of(hidden, settings, "cpu")
     in_history = (windows.frames[:, :3] == 6).any(dim=1)
     assert not windows.usable[in_history, :5].any() and windows.usable[~in_history].all()
     batch = draw(windows, replace(rules, coverage=0.0), recipe, torch.Generator().manual_seed(0))
@@ -243,8 +243,6 @@ def test_presets_and_what_replaces_them():
 
 
 def test_wrong_settings_and_weights_are_refused():
-    with pytest.raises(InputError, match="min_visible: at most dense_points"):
-        config.parse(GsDynamics, {"min_visible": 30, "dense_points": 20}, "here")
     with pytest.raises(InputError, match="tools: unknown key"):
         config.parse(GsDynamics, {"tools": "centroids"}, "here")
     with pytest.raises(InputError, match=r"gs_dynamics.weights: \d+ weights are required; received 7"):

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -18,10 +19,17 @@ from neuspring.config.baselines import Baselines, GsDynamics
 from neuspring.core.artifacts import Observations, Scenario
 
 PLAIN = GsDynamics(
-    width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0, smoothing_passes=0,
-    coverage=0.0, length_weight=0.0, future=1, checkpoint_every=1, learning_rate=3e-3,
+    width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0,
+    coverage=0.0, length_weight=0.0, future=1, learning_rate=3e-3,
 )  # fmt: skip
 RULES = resolve(PLAIN, "sloth")[0]
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch):
+    """Tracks are taken as they are, and a checkpoint is written after each epoch."""
+    monkeypatch.setattr("neuspring.baselines.gs_dynamics.windows.SMOOTHING_PASSES", 0)
+    monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
 
 
 def cloud(count: int, seed: int) -> np.ndarray:

@@ -23,7 +23,7 @@ from neuspring.config.baselines import SpringGaus
 from neuspring.core.errors import NumericalFailure
 
 FRAME = 1 / 30
-SMALL = SpringGaus(anchors=72, neighbors=12, full_neighbors=8, substeps=150, substeps_raised=(), link_stiffness=3e3, damping=1.0)
+SMALL = SpringGaus(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
 
 
 def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
@@ -36,7 +36,7 @@ def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
 def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGaus = SMALL, **changed) -> SpringGausModel:
     graph = AnchorGraph.between(anchors, controllers, settings.neighbors)
     world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
-    return SpringGausModel.start(graph, settings, **world)
+    return replace(SpringGausModel.start(graph, settings, **world), link_stiffness=3e3)
 
 
 def test_the_soft_vector_at_its_start():
@@ -139,7 +139,7 @@ def test_a_frame_and_its_gradient_are_those_of_the_reference(dtype, close):
 
 def test_a_gradient_after_another_frame_is_still_its_own():
     anchors = bar()
-    model = model_of(anchors, anchors[:3] + 0.005, replace(SMALL, link_stiffness=300.0))
+    model = replace(model_of(anchors, anchors[:3] + 0.005), link_stiffness=300.0)
     solver = AnchorSolver(model, model, 30, dtype=torch.float64)
     x = torch.tensor(model.anchors, dtype=torch.float64, requires_grad=True)
     hand, found = torch.tensor(anchors[:3] + 0.005), parameters(72, 12)
@@ -204,10 +204,11 @@ def test_what_the_model_made_itself_is_fitted_back():
     assert after < 0.15 * before and after < 0.025 * way
 
 
-def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(capsys):
+def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(capsys, monkeypatch):
+    monkeypatch.setattr("neuspring.baselines.spring_gaus.train.SUBSTEPS_ADDED", 150)
     hands = swing(6)
     start = model_of(bar(), hands[0])
-    settings = replace(SMALL, iterations=2, substeps=10, substeps_added=150, max_substeps=160)
+    settings = replace(SMALL, iterations=2, substeps=10, max_substeps=160)
     trained = run(Problem(replace(start, substeps=10), hands, pull_in, settings))
     assert not trained.failure and trained.model.substeps == 160
     assert "160 substeps from here on" in capsys.readouterr().out
@@ -252,7 +253,9 @@ def test_a_failure_keeps_the_parameters_of_the_last_complete_iteration():
         np.testing.assert_array_equal(getattr(failed.model, name), getattr(whole.model, name))
 
 
-def test_a_killed_training_continues_to_the_same_model(tmp_path):
+def test_a_killed_training_continues_to_the_same_model(tmp_path, monkeypatch):
+    monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr("neuspring.baselines.spring_gaus.train.SUBSTEPS_RAISED", (1,))
     hands = swing(6)
     start = model_of(bar(), hands[0])
     partial = tmp_path / "partial.npz"
@@ -262,7 +265,7 @@ def test_a_killed_training_continues_to_the_same_model(tmp_path):
             raise KeyboardInterrupt
         return anchors.square().sum()
 
-    settings = replace(SMALL, iterations=4, checkpoint_every=1, substeps=50, substeps_raised=(1,))
+    settings = replace(SMALL, iterations=4, substeps=50)
     stop = 4
     whole = run(Problem(start, hands, objective, settings))
     stop = 2

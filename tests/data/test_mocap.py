@@ -164,7 +164,6 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) ->
     [
         (Mocap(stride=20), "stride = 20"),
         (Mocap(start=37), "mocap.start = 37"),
-        (Mocap(train_fraction=0.05), "train_fraction"),
         (Mocap(radius=1e-5), "mocap.radius"),
     ],
 )

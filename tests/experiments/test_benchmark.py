@@ -78,10 +78,10 @@ def test_methods(tmp_path: Path) -> None:
 def test_searches(tmp_path: Path) -> None:
     found = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
-    made = load("search: {rollouts: 44, sigma: 0.25, polish: {share: 0.5}}")
+    made = load("search: {rollouts: 44, sigma: 0.25, polish: {variables: [drag]}}")
     merged = tables.with_search(made, found["pieces"], "pieces").search
     assert (merged.rollouts, merged.sigma) == (33, 0.25)
-    assert (merged.polish.rounds, merged.polish.share) == (1, 0.5)
+    assert (merged.polish.rounds, merged.polish.variables) == (1, ("drag",))
     assert tables.with_search(made, found["uniform"], "uniform").search == made.search
 
 
@@ -308,7 +308,6 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
             "method bad, settings: .*full_neighbors: at most",
         ),
         ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
-        ("{model: gs_dynamics, settings: {min_visible: 5000}, description: x}", "method bad, settings: .*min_visible: at most"),
         ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],
 )

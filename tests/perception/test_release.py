@@ -13,7 +13,13 @@ from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
 FRAMES = 30
-SETTINGS = Lift(release=0.05, release_after=5)
+SETTINGS = Lift(release=0.05)
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    """A hand lets go after five frames out of view."""
+    monkeypatch.setattr("neuspring.perception.controllers.RELEASE_AFTER", 5)
 
 
 def scene(away: np.ndarray):

@@ -159,11 +159,12 @@ def test_marks_without_an_object_start_nothing(capture):
         segment_sam2.carry(capture, "0", [mark("hand", "click", [(5, 5)])], GroundedSam2(), "cpu", Models(None, None, None, None))
 
 
-def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path):
+def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path, monkeypatch):
     torch.manual_seed(0)
     model, processor = detector_models(tmp_path)
-    settings = GroundedSam2(box_threshold=0.001, text_threshold=0.001)
-    detections = segment_sam2.detect(capture.color("0", 0), "toy", settings, Models(model, processor, None, None), "cpu")
+    monkeypatch.setattr(segment_sam2, "BOX_SCORE", 0.001)
+    monkeypatch.setattr(segment_sam2, "WORD_SCORE", 0.001)
+    detections = segment_sam2.detect(capture.color("0", 0), "toy", GroundedSam2(), Models(model, processor, None, None), "cpu")
     assert detections
     assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
     assert all(len(d.box) == 4 and np.isfinite(d.box).all() for d in detections)
@@ -186,7 +187,7 @@ def test_hands_lie_over_the_object_and_missing_frames_stay_empty(capture, monkey
 @pytest.mark.parametrize(("words", "what"), [("toy", "no hand"), ("hand", "no object")])
 def test_what_the_prompt_does_not_find_is_said(capture, monkeypatch, words, what):
     monkeypatch.setattr(segment_sam2, "detect", lambda *_: [Detection((0.0, 0.0, 9.0, 9.0), words, 0.9)])
-    with pytest.raises(InputError, match=rf"{what} among \['{words}'\].*or lower box_threshold"):
+    with pytest.raises(InputError, match=rf"{what} among \['{words}'\].*other words for the object"):
         segment_sam2.segment(capture, "0", GroundedSam2(), "cpu", Models(None, None, None, None))
 
 

@@ -15,6 +15,8 @@ from tests.support.captures import describe, entry
 
 SHIFT = np.array([1.5, -0.75])
 """Pixels per frame."""
+NEVER = 2.0
+"""A correlation that no patch has: no point is found again."""
 
 
 def texture(size: int = 300) -> np.ndarray:
@@ -54,16 +56,17 @@ def error(tracks: track_opencv.Followed, frame: int) -> np.ndarray:
 @pytest.mark.parametrize("method", ["lucas_kanade", "dis"])
 def test_points_move_with_the_texture(video, method):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200, window=9), 0)
+    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200), 0)
     seen = tracks.visible[2]
     assert seen.mean() > 0.8
     assert np.median(error(tracks, 2)[seen]) < 0.25
 
 
-def test_hidden_points_are_lost_and_found_again(video):
+def test_hidden_points_are_lost_and_found_again(video, monkeypatch):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9), 0)
-    without = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, window=9, reacquire=False), 0)
+    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400), 0)
+    monkeypatch.setattr(track_opencv, "LIKENESS", NEVER)
+    without = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400), 0)
     behind = (np.abs(tracks.pixels[0, :, 0] + 3 * SHIFT[0] - 56) < 4) & (np.abs(tracks.pixels[0, :, 1] + 3 * SHIFT[1] - 45) < 10)
     assert behind.sum() > 10
     assert tracks.visible[3][behind].mean() < 0.3
@@ -72,9 +75,10 @@ def test_hidden_points_are_lost_and_found_again(video):
     assert np.median(error(tracks, 7)[again]) < 0.5
 
 
-def test_missing_frames_are_bridged(video):
+def test_missing_frames_are_bridged(video, monkeypatch):
     capture, labels = video
-    tracks = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200, window=15), 0)
+    monkeypatch.setattr(track_opencv, "WINDOW", 15)
+    tracks = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200), 0)
     assert not tracks.visible[[3, 4]].any()
     seen = tracks.visible[5]
     assert seen.mean() > 0.5
@@ -97,21 +101,21 @@ def test_an_empty_mask_has_no_points(video):
     assert tracks.pixels.shape == (8, 0, 2)
 
 
-def test_points_come_back_after_a_frame_without_a_mask(video):
+def test_points_come_back_after_a_frame_without_a_mask(video, monkeypatch):
     capture, labels = video
+    monkeypatch.setattr(track_opencv, "LIKENESS", 0.5)
     gap = labels.copy()
     gap[1] = 0
-    settings = OpenCvTracking(points=200, likeness=0.5)
+    settings = OpenCvTracking(points=200)
     plain, holed = (track_opencv.track(capture, "0", masks, settings, 0).visible for masks in (labels, gap))
     assert not holed[1].any()
     assert holed[2].sum() > 0.8 * plain[2].sum()
 
 
-def test_points_leave_a_mask_that_stays_behind_unless_its_rim_is_wide(video):
+def test_points_leave_a_mask_that_stays_behind_unless_its_rim_is_wide(video, monkeypatch):
     capture, labels = video
-    tight, wide = (
-        track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, reacquire=False, rim=rim), 0) for rim in (0.0, 20.0)
-    )
+    monkeypatch.setattr(track_opencv, "LIKENESS", NEVER)
+    tight, wide = (track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, rim=rim), 0) for rim in (0.0, 20.0))
     places = np.round(wide.pixels[2]).astype(int)
     outside = wide.visible[2] & (labels[2, places[:, 1], places[:, 0]] == 0)
     assert outside.sum() > 10

@@ -65,7 +65,7 @@ def test_pictures_and_gradients_are_handed_on(stand_in, degree):
         assert torch.allclose(mine, other, atol=1e-3 * float(mine.abs().max()) + 1e-6)
 
 
-def test_density_adapts_alike(stand_in):
+def test_density_adapts_alike(stand_in, monkeypatch):
     changes = []
     for backend in ("warp", "gsplat"):
         splats = [tensor.detach().requires_grad_() for tensor in random_splats(4, 50, torch.float32)]
@@ -80,9 +80,8 @@ def test_density_adapts_alike(stand_in):
             "opacity_logits": torch.logit(splats[3].detach(), 1e-6),
         }
         threshold = float((statistics.pull / statistics.seen.clamp_min(1)).median())
-        stay, added = densify(
-            named, statistics, Appearance(densify_gradient=threshold), 1.0, False, torch.Generator().manual_seed(0)
-        )
+        monkeypatch.setattr("neuspring.splats.train.DENSIFY_GRADIENT", threshold)
+        stay, added = densify(named, statistics, Appearance(), 1.0, False, torch.Generator().manual_seed(0))
         changes.append((stay, len(added["means"])))
     assert changes[0][1] == changes[1][1] > 5
     assert torch.equal(changes[0][0], changes[1][0])

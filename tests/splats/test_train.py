@@ -20,7 +20,18 @@ from tests.support.filmed import EYES, intrinsics
 
 SIZE = (96, 64)
 HELD_OUT = (0.1, -0.55, 0.35)
-FAST = Appearance(iterations=300, degree=0, densify_from=10_000)
+FAST = Appearance(iterations=300, degree=0)
+
+
+@pytest.fixture
+def dense(monkeypatch):
+    """Sets when and where density adapts: `dense(FROM=5)` sets train.DENSIFY_FROM."""
+
+    def change(**values: float) -> None:
+        for name, value in values.items():
+            monkeypatch.setattr(f"neuspring.splats.train.{name}", value)
+
+    return change
 
 
 def view_from(eye, size=SIZE) -> View:
@@ -75,10 +86,11 @@ def test_known_splats_are_recovered_from_three_views():
     assert quality(splats, held_out) > 25
 
 
-def test_training_is_deterministic_and_follows_its_seed():
+def test_training_is_deterministic_and_follows_its_seed(dense):
     truth = known_splats(40)
     shots = shots_of(truth)
-    settings = dataclasses.replace(FAST, iterations=40, densify_from=5, densify_every=10, densify_gradient=1e-5, degree=1)
+    dense(DENSIFY_FROM=5, DENSIFY_EVERY=10, DENSIFY_GRADIENT=1e-5)
+    settings = dataclasses.replace(FAST, iterations=40, degree=1)
     start = first_splats(truth.means, np.full((40, 3), 0.5), settings, 0.002)
     one, same, other = (train(start, shots, settings, seed, "warp").splats for seed in (0, 0, 1))
     assert np.array_equal(one.means, same.means)
@@ -86,13 +98,14 @@ def test_training_is_deterministic_and_follows_its_seed():
     assert one.means.shape != other.means.shape or not np.array_equal(one.means, other.means)
 
 
-def test_the_number_of_splats_grows_where_they_are_too_coarse():
+def test_the_number_of_splats_grows_where_they_are_too_coarse(dense):
     truth = known_splats()
     shots = shots_of(truth)
-    settings = dataclasses.replace(FAST, iterations=160, densify_from=40, densify_every=40, position_rate=1e-3)
+    settings = dataclasses.replace(FAST, iterations=160, position_rate=1e-3)
     start = first_splats(truth.means[::10], np.full((20, 3), 0.5), settings, 0.002)
+    fixed = train(start, shots, settings, 0, "warp")
+    dense(DENSIFY_FROM=40, DENSIFY_EVERY=40)
     grown = train(start, shots, settings, 0, "warp")
-    fixed = train(start, shots, dataclasses.replace(settings, densify_from=10_000), 0, "warp")
     assert len(grown.splats.means) > 2 * len(start.means) == 2 * grown.first
     assert grown.history["loss"][-1] < fixed.history["loss"][-1]
     assert grown.history["splats"][-1] == len(grown.splats.means)
@@ -119,7 +132,9 @@ def test_densify_clones_small_splits_large_and_removes_faint_and_huge():
     assert (added["means"][1:] - named(splats)["means"][1]).norm(dim=1).max() < 5 * 0.02
     stay, _ = densify(named(splats), statistics, Appearance(), 1.0, True, generator)
     assert stay.tolist() == [True, False, False, False, False, True]
-    stay, added = densify(named(splats), statistics, Appearance(most_splats=6), 1.0, False, generator)
+    with pytest.MonkeyPatch.context() as few:
+        few.setattr("neuspring.splats.train.MOST_SPLATS", 6)
+        stay, added = densify(named(splats), statistics, Appearance(), 1.0, False, generator)
     assert len(added["means"]) == 0
     # New splats are judged as old ones are: no clone of a faint one, no huge child.
     statistics.pull[2] = statistics.pull[4] = 1.0
@@ -158,15 +173,15 @@ def test_hands_hide_pixels_around_them_and_wrong_sizes_are_named():
         Shot.of("0", view, color[:10], mask, hands, depth, 4.0)
 
 
-def test_training_that_breaks_is_a_numerical_failure():
+def test_training_that_breaks_is_a_numerical_failure(dense):
     truth = known_splats(40)
     shots = shots_of(truth)
     start = first_splats(truth.means, np.full((40, 3), 0.5), FAST, 0.002)
     with pytest.raises(NumericalFailure, match="splats are not finite"):
         train(start, shots, dataclasses.replace(FAST, scale_rate=1e4), 0, "warp")
-    faint = dataclasses.replace(FAST, densify_from=5, densify_every=10, prune_opacity=0.95)
+    dense(DENSIFY_FROM=5, DENSIFY_EVERY=10, PRUNE_OPACITY=0.95)
     with pytest.raises(NumericalFailure, match="removed the last splat"):
-        train(start, shots, faint, 0, "warp")
+        train(start, shots, FAST, 0, "warp")
 
 
 def test_the_first_splats_follow_the_points():
@@ -183,10 +198,10 @@ def test_the_first_splats_follow_the_points():
         first_splats(points[:2], colors[:2], Appearance(), 0.002)
 
 
-def test_a_fixed_radius_stays_whatever_is_trained():
+def test_a_fixed_radius_stays_whatever_is_trained(dense):
     shots = shots_of(known_splats())
-    settings = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004, densify_from=10, densify_every=10, densify_until=60)
-    settings = dataclasses.replace(settings, densify_gradient=1e-6, split_size=1e-4)
+    dense(DENSIFY_FROM=10, DENSIFY_EVERY=10, DENSIFY_UNTIL=60, DENSIFY_GRADIENT=1e-6, SPLIT_SIZE=1e-4)
+    settings = dataclasses.replace(FAST, iterations=60, fixed_radius=0.004)
     start = first_splats(known_splats().means, np.full((200, 3), 0.5), settings, 0.01)
     result = train(start, shots, settings, 0, "warp")
     assert len(result.splats.means) > 200, "what is too coarse is cloned, however large"
@@ -206,6 +221,6 @@ def test_faint_splats_are_left_out():
     splats = known_splats(10)
     logits = splats.opacity_logits.copy()
     logits[:4] = -5
-    assert len(prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits), 0.1).means) == 6
+    assert len(prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits)).means) == 6
     with pytest.raises(NumericalFailure, match="no splat"):
-        prune_by_opacity(splats, 0.99)
+        prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits - 10))

@@ -27,7 +27,7 @@ from tests.support import small
 from tests.support.filmed import FRAMES, film
 from tests.support.pictured import Scene, pictured
 
-POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbors=8, full_neighbors=6, bound_anchors=6)
+POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbors=8, full_neighbors=6)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
 NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002, particles=20)
 
@@ -106,7 +106,7 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
 
 
 def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen):
-    stiff = replace(POINTS, stiffness=1e12, substeps=1, substeps_added=1, max_substeps=2)
+    stiff = replace(POINTS, stiffness=1e12, substeps=1, max_substeps=2)
     run = run_all(seen, "spring_gaus", settings(spring_gaus=stiff))
     record = json.loads(run.read_text())
     trained = StageRecord.load(run.with_name("train.json"))

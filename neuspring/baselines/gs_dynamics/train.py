@@ -30,7 +30,7 @@ from neuspring.baselines.gs_dynamics.model import (
 )
 from neuspring.baselines.gs_dynamics.windows import Tracks, Windows, executed
 from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
-from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 
 METRICS = ("loss", "position_loss", "length_loss")
 
@@ -211,8 +211,7 @@ def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     """Train on the tracks of the training frames; continue a checkpoint with the same key."""
     training, settings = Training(request), request.settings.baselines.gs_dynamics
     if len(training.windows):
-        loop = TrainingLoop("the training", "train", settings.epochs, settings.checkpoint_every, request.partial, request.key())
-        return run_epochs(training, loop, METRICS)
+        return run_epochs(training, METRICS, settings.epochs, request.partial, request.key())
     # A network that learned nothing must not move the object at random.
     with torch.no_grad():
         for parameter in training.network.head[-1].parameters():
@@ -221,4 +220,4 @@ def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     if executed(request.observations.controller_points, settings.step):
         frames = request.observations.scenario.train_end
         failure = f"training did not start: no window of a tool that moves {settings.step} m in {frames} training frames"
-    return run_epochs(training, TrainingLoop("the training", "train", 0, 1, None, ""), METRICS, failure)
+    return run_epochs(training, METRICS, 0, None, "", failure)

@@ -19,6 +19,13 @@ from neuspring.core.geometry import farthest
 
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
 """Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
+DENSE_POINTS = 1000
+"""Most tracks from which particles are drawn."""
+MIN_VISIBLE = 20
+"""Least tracks that must be seen in all frames of a window. Where fewer are, the window takes those seen in its history, and the
+losses leave out what is not seen."""
+SMOOTHING_PASSES = 10
+"""Of a moving average over three frames on the visible part of tracks."""
 LAST_ACCEPTED = 0.75
 """Part of a step that suffices for the last training frame to end a step."""
 
@@ -47,8 +54,8 @@ class Tracks:
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
         inliers = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
-        indices = inliers[farthest(points[0, inliers], settings.dense_points)]
-        smooth = smoothed(points[:, indices], visible[:, indices], settings.smoothing_passes)
+        indices = inliers[farthest(points[0, inliers], DENSE_POINTS)]
+        smooth = smoothed(points[:, indices], visible[:, indices], SMOOTHING_PASSES)
         tools = upright(observations.controller_points[train], up)
         return cls(smooth, visible[:, indices], tools, points.shape[1] - len(inliers))
 
@@ -150,12 +157,12 @@ class Windows:
     def of(cls, tracks: Tracks, settings: GsDynamics, device: str) -> Windows:
         """All windows in which at least one track may become a particle.
 
-        These are tracks visible in all frames of the window. Fallback if fewer than `min_visible`: visible in the history only.
+        These are tracks visible in all frames of the window. Fallback if fewer than MIN_VISIBLE: visible in the history only.
         """
         frames = window_frames(tracks.tools, settings)
         seen: np.ndarray = tracks.visible[frames]
         throughout = seen.all(axis=1)
-        enough = throughout.sum(axis=1, keepdims=True) >= settings.min_visible
+        enough = throughout.sum(axis=1, keepdims=True) >= MIN_VISIBLE
         usable = np.where(enough, throughout, seen[:, :HISTORY].all(axis=1))
         nonempty = usable.any(axis=1)
         arrays = (frames[nonempty], usable[nonempty], tracks.points, tracks.visible, tracks.tools)

@@ -22,6 +22,8 @@ SHORTEST_LINK = 1e-4
 """Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
 NEAREST = 1e-12
 """Distances to anchors are floored here before a weight is computed from them, m."""
+BOUND_ANCHORS = 16
+"""Nearest anchors that a splat or a structure point follows."""
 GROUND_LOGIT = -1.0
 """rho at the start."""
 
@@ -139,9 +141,8 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
             up_sign=up_sign,
             gravity=gravity,
             ground=ground,
-            link_stiffness=settings.link_stiffness,
             full_neighbors=settings.full_neighbors,
-            bound_anchors=settings.bound_anchors,
+            bound_anchors=BOUND_ANCHORS,
         )
 
     def tensors(self, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:

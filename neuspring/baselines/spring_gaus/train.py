@@ -24,7 +24,7 @@ from neuspring.baselines.spring_gaus.model import AnchorGraph, Follower, SpringG
 from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.config import Config
 from neuspring.config.baselines import SpringGaus
-from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
+from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.perception.results import masks_of_cameras
@@ -40,6 +40,8 @@ SOFT_RATE = GROUND_RATE = 1e-3
 CLIP = 1.0
 """Largest norm of the gradient of each tensor by itself."""
 ADAM_EPSILON = 1e-15
+SUBSTEPS_ADDED, SUBSTEPS_RAISED = 50, (25, 50)
+"""Substeps that are added at these iterations, and whenever a frame fails."""
 METRICS = ("loss", "gradient_norm", "substeps")
 
 
@@ -109,10 +111,7 @@ def silhouettes(
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
     """Train; continue from `partial` if it holds a checkpoint with the same key."""
-    settings = problem.settings
-    training = Training(problem)
-    loop = TrainingLoop("the training", "train", settings.iterations, settings.checkpoint_every, partial, key)
-    return run_epochs(training, loop, METRICS)
+    return run_epochs(Training(problem), METRICS, problem.settings.iterations, partial, key)
 
 
 class Training:
@@ -144,7 +143,7 @@ class Training:
     def add_substeps(self) -> bool:
         """Take more substeps per frame; False if no more are allowed."""
         settings = self.problem.settings
-        more = min(self.substeps + settings.substeps_added, settings.max_substeps)
+        more = min(self.substeps + SUBSTEPS_ADDED, settings.max_substeps)
         raised = more > self.substeps
         if raised:
             self.use_substeps(more)
@@ -152,7 +151,7 @@ class Training:
 
     def epoch(self, number: int) -> dict[str, float]:
         """One pass over the frames. Raises TrainingStopped where a frame fails with the most substeps."""
-        if number in self.problem.settings.substeps_raised:
+        if number in SUBSTEPS_RAISED:
             self.add_substeps()
         x, v = self.rest, torch.zeros_like(self.rest)
         losses, largest = [], 0.0

@@ -19,6 +19,7 @@ from neuspring.physics import reference, stability
 from neuspring.twin.topology import uniform_topology
 
 TRAIN_FRACTION = 0.7
+FRAME_RATE = 30.0
 RUN = (3, 8)
 """Shortest and longest occlusion, frames."""
 ANNOTATED = 16
@@ -137,7 +138,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     shape = SHAPES[parts[0]]()
     truth = _true_twin(row, shape, parts[2], settings)
-    times = np.arange(settings.frames) / settings.frame_rate
+    times = np.arange(settings.frames) / FRAME_RATE
     hands = hand_motion(parts[1], shape.hands, times)
     rest = truth.topology.nodes.astype(np.float64)
     motion, _ = reference.rollout(reference.Scene.of(truth), rest, np.zeros_like(rest), hands)
@@ -158,7 +159,7 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twi
         contact_friction=0.3,
         contact_distance=0.01,
     )
-    frame_time = 1.0 / settings.frame_rate
+    frame_time = 1.0 / FRAME_RATE
     simulation = Simulation(frame_time=frame_time, substeps=1, up="+z", ground=row.ground, self_collision=row.self_collision)
     twin = Twin(topology=topology, material=material, simulation=simulation)
     # Half of what stability allows, so that the truth's own time-stepping error stays small.
@@ -180,7 +181,7 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
         category=row.category,
         frame_count=frames,
         train_end=int(TRAIN_FRACTION * frames),
-        frame_rate=settings.frame_rate,
+        frame_rate=FRAME_RATE,
         up="+z",
         ground=row.ground,
         self_collision=row.self_collision,

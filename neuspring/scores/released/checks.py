@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from neuspring.config import Fit
-from neuspring.config.images import ImageQuirks, Images
+from neuspring.config.images import Images
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.text import Progress
@@ -241,9 +241,8 @@ SCORED = ("psnr", "ssim", "lpips", "iou")
 RELEASED = Images(
     # gsplat since version 1.5 has another threshold of coverage than the released evaluation; ours has the same.
     backend="warp",
-    released_quirks=ImageQuirks(
-        second_camera_intrinsics=True, any_alpha=True, unit_lpips=True, corner_pixels=True, degenerate_skinning=True
-    ),
+    released_quirks=("second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning"),
+    corner_pixels=True,
 )
 """How the released pictures were made and scored: first view, every quirk."""
 LIFTED = 1e-4
@@ -299,9 +298,9 @@ def frame_scores(
     cameras = read_cameras(case.folder)
     if len(cameras) < 2:
         raise InputError(case.folder / phystwin.METADATA, "a second camera is required: pictures have its intrinsics", len(cameras))
-    camera, borrowed = cameras[0], cameras[1] if images.released_quirks.second_camera_intrinsics else None
+    camera, borrowed = cameras[0], cameras[1] if "second_camera_intrinsics" in images.released_quirks else None
     view = view_of(camera, images, device, borrowed)
-    splats = prune_by_opacity(Splats.load(case.splats), images.opacity)
+    splats = prune_by_opacity(Splats.load(case.splats))
     positions = read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
     progress = Progress(f"pictures {case.name}", len(positions))
     rows = []
@@ -321,5 +320,5 @@ def _scores(
     observed = read_picture(case.colors / name, camera)
     mask = read_picture(case.object_masks / name, camera, gray=True)
     human = read_picture(case.human_masks / name, camera, gray=True)
-    pair = Pair.of(observed, rendered, mask, human, 1 if quirks.any_alpha else COVERED)
-    return picture_scores(pair, lpips, unit_lpips=quirks.unit_lpips)
+    pair = Pair.of(observed, rendered, mask, human, 1 if "any_alpha" in quirks else COVERED)
+    return picture_scores(pair, lpips, unit_lpips="unit_lpips" in quirks)

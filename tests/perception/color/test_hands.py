@@ -122,7 +122,7 @@ def test_the_way_along_an_arm_is_within_its_mask():
 
 
 @pytest.mark.parametrize(("category", "fingers"), [("cloth", True), ("toy", False)])
-def test_sheets_alone_are_held_by_fingers_alone(tmp_path, category, fingers):
+def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category, fingers):
     capture = paint(tmp_path, category=category, frames=3)
     labels = np.stack([capture.mask("0", frame) for frame in range(3)])
     y, x = np.nonzero(labels[0] == HANDS)
@@ -132,8 +132,8 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, category, fingers):
     y, x = np.nonzero(labels[0] == OBJECT)
     pixels = np.repeat(np.stack([x, y], axis=1)[None, ::50].astype(np.float32), 3, axis=0)
     tracks = PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="test")
-    settings = ColorSettings(grip_length=3 * first.pixel_size)
-    _, image = lift_color(capture, labels, tracks, first, settings, 30)
+    monkeypatch.setattr("neuspring.perception.color.GRIP_LENGTH", 3 * first.pixel_size)
+    _, image = lift_color(capture, labels, tracks, first, ColorSettings(), 30)
     assert (len(image.hand_of) < 30) == fingers
 
 
