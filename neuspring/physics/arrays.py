@@ -118,7 +118,6 @@ class Buffers:
         self.views: dict[str, Any] = {}
         self.indices: dict[str, torch.Tensor] = {}
         self.constants: dict[str, torch.Tensor] = {}
-        self._arguments: tuple[Any, Any, Any] | None = None
         self.history = self.substeps if differentiable else 1
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
         total = nodes + controllers
@@ -224,13 +223,9 @@ class Buffers:
         spare = self.groups * self.width - self.twins
         return torch.cat([values, values[-1:].expand(spare, *values.shape[1:])]) if spare else values
 
+    @functools.cached_property
     def arguments(self) -> tuple[Any, Any, Any]:
-        """(Model, State, Adjoint) of these arrays, made at the first call, when every term has added its own."""
-        if self._arguments is None:
-            self._arguments = self._assembled()
-        return self._arguments
-
-    def _assembled(self) -> tuple[Any, Any, Any]:
+        """(Model, State, Adjoint) of these arrays, made when first asked for: every term has added its own by then."""
         sim, kinds = self.simulation, structs(self.real, self.width)
         plain = {
             "nodes": self.nodes,
@@ -254,10 +249,6 @@ class Buffers:
                     setattr(struct, name, plain[name])
             made.append(struct)
         return tuple(made)
-
-    def slot(self, step: int) -> int:
-        """Where x and v before substep `step` lie."""
-        return step % self.slots
 
     def launch(self, kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
         """Run a kernel on `size` threads."""

@@ -10,7 +10,7 @@ The twins of a group share a list: a bit per lane says whose partner a node is.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import warp as wp
@@ -22,21 +22,6 @@ from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
-
-
-class Kernels(NamedTuple):
-    """Kernels of this file for one scalar type and width."""
-
-    place: Any
-    find: Any
-
-
-class Functions(NamedTuple):
-    """Functions of this file for one scalar type and width."""
-
-    collided: Any
-    """(model, state, slot, inner slot, i, g) -> velocities of node i after the impulses."""
-    collided_adjoint: Any
 
 
 def allocate(b: Buffers) -> None:
@@ -70,16 +55,17 @@ def overflow(b: Buffers) -> torch.Tensor:
 
 def find_candidates(b: Buffers, reach: float) -> None:
     """List the partners of every node at the start of the frame; `reach` is the largest contact distance, m."""
-    made, views, size = kernels(b.real, b.width), b.views, (b.nodes, b.groups)
-    model, state, _ = b.arguments()
-    b.launch(load(made.place, b.device), size, model, state, views["grid_points"])
+    place, find = (load(kernel, b.device) for kernel in kernels(b.real, b.width))
+    views, size = b.views, (b.nodes, b.groups)
+    model, state, _ = b.arguments
+    b.launch(place, size, model, state, views["grid_points"])
     views["grid"].build(views["grid_points"], reach, groups=views["grid_groups"])
-    b.launch(load(made.find, b.device), size, model, state, views["grid"].id, views["overflow"])
+    b.launch(find, size, model, state, views["grid"].id, views["overflow"])
 
 
 @functools.cache
-def kernels(real: Any, width: int) -> Kernels:
-    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def kernels(real: Any, width: int) -> tuple[Any, Any]:
+    """(place, find): kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Model, State, _ = structs(real, width)
     column = lane.column
@@ -149,12 +135,12 @@ def kernels(real: Any, width: int) -> Kernels:
         model.near_count[i, g] = count
 
     unique = wp.kernel(module="unique", enable_backward=False)
-    return Kernels(unique(place), unique(find))
+    return unique(place), unique(find)
 
 
 @functools.cache
-def functions(real: Any, width: int) -> Functions:
-    """Functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def functions(real: Any, width: int) -> tuple[Any, Any]:
+    """(collided, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
@@ -190,6 +176,7 @@ def functions(real: Any, width: int) -> Functions:
 
     @wp.func
     def collided(model: Model, state: State, slot: int, inner: int, i: int, g: int) -> Vector:
+        """Velocities of node i after the impulses."""
         x = state.x[slot, i, g]
         v = state.after[inner, i, g]
         total = Vector()
@@ -283,4 +270,4 @@ def functions(real: Any, width: int) -> Functions:
                     mu[q] = mu[q] + hmu
                     adjoint.contact_mu[i, g] = mu
 
-    return Functions(collided, collided_adjoint)
+    return collided, collided_adjoint

@@ -15,7 +15,7 @@ x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import warp as wp
 
@@ -28,28 +28,14 @@ MIN_TANGENT = 1e-6
 """Tangential speeds are floored here when dividing, m/s."""
 
 
-class Velocity(NamedTuple):
-    """Controllers and velocities, for one scalar type and width."""
-
-    move_controller: Any
-    updated: Any
-    """(v, force, gravity, dt, delta, 1 / m) -> v'."""
-    updated_adjoint: Any
-    """(v', dL/dv', dt, delta, 1 / m) -> dL/d(v), dL/d(force), dL/d(delta)."""
-
-
-class Position(NamedTuple):
-    """Positions, for one scalar type and width."""
-
-    moved: Any
-    """(x, v, dt, up, e, mu, obstacles [O, 16], which only obstacles.py reads) -> x', v'."""
-    moved_adjoint: Any
-    """(x, v, dt, up, e, mu, dL/dx', dL/dv', obstacles) -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)."""
-
-
 @functools.cache
-def velocity(real: Any, width: int) -> Velocity:
-    """Functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def velocity(real: Any, width: int) -> tuple[Any, Any, Any]:
+    """Three functions for a scalar type, wp.float32 or wp.float64, and a number of lanes:
+
+    move_controller    puts a controller where it is at the end of a substep
+    updated            (v, force, gravity, dt, delta, 1 / m) -> v'
+    updated_adjoint    (v', dL/dv', dt, delta, 1 / m) -> dL/d(v), dL/d(force), dL/d(delta)
+    """
     lane = lanes(real, width)
     Number, Vector, dot, scaled = lane.Number, lane.Vector, lane.dot, lane.scaled
     Model, State, _ = structs(real, width)
@@ -57,7 +43,6 @@ def velocity(real: Any, width: int) -> Velocity:
 
     @wp.func
     def move_controller(model: Model, state: State, step: int, slot: int, c: int, g: int):
-        """Put a controller where it is at the end of a substep."""
         travel = state.end[c, g] - state.begin[c, g]
         fraction = Number()
         for q in range(width):
@@ -76,12 +61,16 @@ def velocity(real: Any, width: int) -> Velocity:
         adj_v = scaled(adj_after, decay)
         return adj_v, scaled(scaled(adj_v, dt), light), adj_decay
 
-    return Velocity(move_controller, updated, updated_adjoint)
+    return move_controller, updated, updated_adjoint
 
 
 @functools.cache
-def position(real: Any, width: int) -> Position:
-    """Functions for a scalar type and a number of lanes."""
+def position(real: Any, width: int) -> tuple[Any, Any]:
+    """Two functions for a scalar type and a number of lanes. Only obstacles.py reads the obstacles [O, 16]:
+
+    moved            (x, v, dt, up, e, mu, obstacles) -> x', v'
+    moved_adjoint    (x, v, dt, up, e, mu, dL/dx', dL/dv', obstacles) -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)
+    """
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
@@ -160,4 +149,4 @@ def position(real: Any, width: int) -> Position:
                     adj_mu[q] = gmu
         return adj_x, adj_v, adj_e, adj_mu
 
-    return Position(moved, moved_adjoint)
+    return moved, moved_adjoint

@@ -19,7 +19,7 @@ import warp as wp
 
 from neuspring.physics.arrays import Buffers
 from neuspring.physics.lanes import lanes
-from neuspring.physics.motion import APPROACH, MIN_TANGENT, Position
+from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 NEVER = 1e30
 """s; the time of an impact that does not come."""
@@ -33,7 +33,7 @@ def allocate(b: Buffers) -> None:
 
 
 @functools.cache
-def position(real: Any, width: int) -> Position:
+def position(real: Any, width: int) -> tuple[Any, Any]:
     """Functions for a scalar type and a number of lanes: those of motion.py, among obstacles [O, 16]."""
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
@@ -189,4 +189,4 @@ def position(real: Any, width: int) -> Position:
                 adj_mu[q] = gmu
         return adj_x, adj_v, adj_e, adj_mu
 
-    return Position(moved, moved_adjoint)
+    return moved, moved_adjoint

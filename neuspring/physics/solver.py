@@ -165,7 +165,7 @@ class FrameSolver:
     @property
     def last(self) -> int:
         """The slot that holds the end of a frame."""
-        return self.buffers.slot(self.buffers.substeps)
+        return self.buffers.substeps % self.buffers.slots
 
     def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: Parameters
@@ -232,7 +232,7 @@ class FrameSolver:
     def launch_forward(self) -> None:
         """A frame (`frame.py`)."""
         b, k = self.buffers, self._kernels
-        model, state, _ = b.arguments()
+        model, state, _ = b.arguments
         if not b.threads:
             b.launch(k.forward, b.groups, model, state)
             return
@@ -245,7 +245,7 @@ class FrameSolver:
     def launch_backward(self) -> None:
         """The adjoint of a frame."""
         b, k = self.buffers, self._kernels
-        arguments, size = b.arguments(), (b.nodes, b.groups)
+        arguments, size = b.arguments, (b.nodes, b.groups)
         if not b.threads:
             b.launch(k.backward, b.groups, *arguments)
             return

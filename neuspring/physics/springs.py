@@ -11,22 +11,13 @@ partners in ascending order both ways, so both give the same numbers.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from neuspring.physics.arrays import Buffers, structs
 from neuspring.physics.lanes import lanes
-
-
-class Functions(NamedTuple):
-    """Functions of this file for one scalar type and width."""
-
-    add_row: Any
-    add_row_adjoint: Any
-    gathered: Any
-    gathered_adjoint: Any
 
 
 def allocate(b: Buffers, pairs: np.ndarray) -> None:
@@ -50,8 +41,8 @@ def allocate(b: Buffers, pairs: np.ndarray) -> None:
 
 
 @functools.cache
-def functions(real: Any, width: int) -> Functions:
-    """Functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
+    """(add_row, its adjoint, gathered, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
@@ -166,4 +157,4 @@ def functions(real: Any, width: int) -> Functions:
         adjoint.x[i, g] = adj_x
         adjoint.v[i, g] = adj_v
 
-    return Functions(add_row, add_row_adjoint, gathered, gathered_adjoint)
+    return add_row, add_row_adjoint, gathered, gathered_adjoint

@@ -116,9 +116,12 @@ def rest_spectrum(
 def twin_spectrum(twin: Twin) -> Spectrum:
     """The spectrum of a twin at rest."""
     topology, material = twin.topology, twin.material
-    k = material.stiffness.astype(np.float64) / topology.rest_lengths
-    c = material.dashpot.astype(np.float64)
-    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, k, c, material.mass)
+    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, *_strengths(twin), material.mass)
+
+
+def _strengths(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """Y / l0 and gamma of each spring [S]."""
+    return twin.material.stiffness.astype(np.float64) / twin.topology.rest_lengths, twin.material.dashpot.astype(np.float64)
 
 
 def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
@@ -128,10 +131,9 @@ def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float)
 
 def check(twin: Twin) -> None:
     """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
-    topology, material, simulation = twin.topology, twin.material, twin.simulation
-    k = material.stiffness.astype(np.float64) / topology.rest_lengths
-    c = material.dashpot.astype(np.float64)
-    if gershgorin(topology.springs, len(topology.nodes), k, c, material.mass).load(simulation.substep) < LIMIT:
+    topology, simulation = twin.topology, twin.simulation
+    bound = gershgorin(topology.springs, len(topology.nodes), *_strengths(twin), twin.material.mass)
+    if bound.load(simulation.substep) < LIMIT:
         return
     spectrum = twin_spectrum(twin)
     if spectrum.load(simulation.substep) >= LIMIT:

@@ -81,10 +81,9 @@ def _twin_predictor(learned: Before, settings: Config, device: str) -> Predictor
 
     def predict(observations: Observations) -> tuple[Trajectory, int, dict[str, float]]:
         safety = settings.simulation.safety
-        result = move(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
-        moved = result.twin
+        moved, laid = move(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
         velocity = initial_velocity(observations, moved.simulation.initial_velocity)
         trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
-        return trajectory, moved.counts["springs"] * moved.counts["substeps"], result.facts
+        return trajectory, moved.counts["springs"] * moved.counts["substeps"], laid.facts if laid else {}
 
     return predict

@@ -19,8 +19,6 @@ from neuspring.config import SpringField as Settings
 
 AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
-FEWEST_TEXELS = 2
-"""Bilinear interpolation needs two texels per side."""
 
 
 def midpoints(canonical: np.ndarray, springs: np.ndarray) -> np.ndarray:
@@ -37,9 +35,9 @@ def in_cube(points: np.ndarray) -> np.ndarray:
     return mapped
 
 
-def adaptive_resolution(springs: int, factor: float = 0.85) -> int:
-    """N = round(factor sqrt(|E|)), at least 2."""
-    return max(round(factor * math.sqrt(springs)), FEWEST_TEXELS)
+def adaptive_resolution(springs: int, factor: float) -> int:
+    """N = round(factor sqrt(|E|)), at least 2, as bilinear interpolation needs."""
+    return max(round(factor * math.sqrt(springs)), 2)
 
 
 def fourier(values: torch.Tensor, bands: int) -> torch.Tensor:
@@ -128,7 +126,7 @@ class SpringField(nn.Module):
         self.planes = None
         if settings.triplane:
             self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.texel_scale, generator)
-        widths = [self._encoded_width(), settings.hidden, settings.hidden, outputs]
+        widths = [self.encoded().shape[1], settings.hidden, settings.hidden, outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         with torch.no_grad():
             for layer in self.layers:
@@ -138,15 +136,6 @@ class SpringField(nn.Module):
                     tensor.uniform_(-bound, bound, generator=generator)
             for tensor in self.layers[-1].parameters():
                 tensor.zero_()
-
-    def _encoded_width(self) -> int:
-        s = self.settings
-        width = 0
-        if s.triplane:
-            width += s.channels * (2 * s.bands if s.fourier in ("feature", "both") else 1)
-        if s.fourier in ("coordinates", "both"):
-            width += 3 * 2 * s.bands
-        return width
 
     def encoded(self) -> torch.Tensor:
         """Inputs of the MLP [S, width]: the plane feature and the coordinates, each transformed as the settings say."""

@@ -24,7 +24,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuspring import config
 from neuspring.core.artifacts import ImageObservations, Observations, Twin
 
 KNOTS = 3
@@ -40,11 +39,6 @@ def names(image: ImageObservations) -> tuple[str, ...]:
     return ("hand_tilt", "hand_size", *(f"hand_depth.{k}" for k in range(KNOTS * image.hands)))
 
 
-def start(image: ImageObservations, search: config.Search) -> dict[str, float]:
-    """The values that the search begins with; those of `controller_points`."""
-    return {name: float(getattr(search.variables, name.partition(".")[0]).start) for name in names(image)}
-
-
 def with_hands(observations: Observations, twin: Twin) -> Observations:
     """The observations with the controllers where the twin's hands are; of captures with depth, as they are."""
     if observations.image is None or not twin.hands:
@@ -56,18 +50,12 @@ def hand_points(observations: Observations, values: Mapping[str, float]) -> np.n
     """Controllers [T, C, 3], m, for values of the variables `names`."""
     image = observations.image
     assert image is not None
-    return place(image, observations.controller_points[0].astype(np.float64), hand_depths(observations, values))
-
-
-def hand_depths(observations: Observations, values: Mapping[str, float]) -> np.ndarray:
-    """z(t) / z(0) of each hand [T, H]."""
-    image, scenario = observations.image, observations.scenario
-    assert image is not None
-    return depths_of(image, values, scenario.train_end, scenario.up_sign)
+    depths = depths_of(image, values, observations.scenario.train_end, observations.scenario.up_sign)
+    return place(image, observations.controller_points[0].astype(np.float64), depths)
 
 
 def depths_of(image: ImageObservations, values: Mapping[str, float], train_end: int, up: float) -> np.ndarray:
-    """As `hand_depths`; up is +1 or -1."""
+    """z(t) / z(0) of each hand [T, H]; up is +1 or -1."""
     factors = np.array([value for name, value in values.items() if name.startswith("hand_depth.")]).reshape(image.hands, -1)
     share = values["hand_size"]
     plane = plane_depths(image, values["hand_tilt"], up)

@@ -45,6 +45,11 @@ class Registration:
     extent: float
     """Diagonal of the source's bounding box along its principal axes, m."""
 
+    @property
+    def facts(self) -> dict[str, float]:
+        """Residuals, m, stretch, and the extent, m."""
+        return {name: getattr(self, name) for name in ("rigid_residual", "residual", "stretch", "extent")}
+
 
 def register(source: np.ndarray, target: np.ndarray, others: np.ndarray) -> Registration:
     """Map target points [M, 3], m, onto source points [N, 3], m; `others` [C, 3] follow the nearest target point."""

@@ -53,24 +53,16 @@ def roll_out(
     progress: Callable[[int], None] | None = None,
     velocity: np.ndarray | None = None,
     valid: np.ndarray | None = None,
+    *,
+    check: bool = True,
 ) -> Trajectory:
     """Simulate over controller_points [T, C, 3], m, from velocity [N, 3], m/s (none: at rest). Divergence is a named result.
 
-    `valid` [T, C]: when each controller holds; empty or none: always. Raises Unstable if the substep is beyond the stability bound.
+    `valid` [T, C]: when each controller holds; empty or none: always. Raises Unstable if the substep is beyond the stability bound,
+    unless `check` is false: the released simulator does not look.
     """
-    stability.check(twin)
-    return simulate(twin, controller_points, device, progress, velocity, valid)
-
-
-def simulate(
-    twin: Twin,
-    controller_points: np.ndarray,
-    device: str = "cpu",
-    progress: Callable[[int], None] | None = None,
-    velocity: np.ndarray | None = None,
-    valid: np.ndarray | None = None,
-) -> Trajectory:
-    """As `roll_out`, without the check of the substep: the released simulator has none."""
+    if check:
+        stability.check(twin)
     solver = solver_for(twin, device, differentiable=False)
     hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
     positions = [torch.tensor(twin.topology.nodes)]

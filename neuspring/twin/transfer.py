@@ -19,7 +19,7 @@ many more nodes are asked for as the body has more.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,32 +40,12 @@ SHORTEST = 1e-9
 """Shorter springs count as this long, m."""
 
 
-@dataclass(frozen=True)
-class Moved:
-    """A twin on another recording, and how the shapes fitted where the nodes are others."""
-
-    twin: Twin
-    registration: Registration | None
-
-    @property
-    def facts(self) -> dict[str, float]:
-        """Residuals, m, stretch, and the extent, m, of the registration; empty where the nodes are the same."""
-        r = self.registration
-        names = ("rigid_residual", "residual", "stretch", "extent")
-        return {name: getattr(r, name) for name in names} if r else {}
-
-
-def rebase(
-    twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
-) -> Twin:
-    """The twin of `move`, without the registration."""
-    return move(twin, observations, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time, safety=safety).twin
-
-
 def move(
     twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
-) -> Moved:
-    """The twin on the nodes and hands of another recording. The rest shape is frame 0 unless recorded.
+) -> tuple[Twin, Registration | None]:
+    """The twin on the nodes and hands of another recording, and how the shapes fitted where the nodes are others.
+
+    The rest shape is frame 0 unless recorded.
 
     Where both recordings have the same nodes in the same order (`corresponds`), a spring keeps its ends, stiffness, dashpot, and
     the ratio of its rest length to the distance of its ends where it has no force: in the rest shape, or in frame 0 where the
@@ -90,7 +70,7 @@ def move(
     )
     moved = replace(moved, simulation=simulation)
     count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
-    return Moved(replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps))), registration)
+    return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps))), registration
 
 
 def corresponds(topology: Topology, observations: Observations) -> bool:
@@ -313,4 +293,4 @@ def on_recording(twin: Twin, observations: Observations, quirks: config.Released
     if not corresponds(twin.topology, observations):
         name = f"pool, {observations.scenario.name}"
         raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
-    return rebase(twin, observations, keep_frame_time=quirks.frame_time_667)
+    return move(twin, observations, keep_frame_time=quirks.frame_time_667)[0]

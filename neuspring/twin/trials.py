@@ -8,7 +8,7 @@ nodes in order, in float64, so that a twin's cost does not depend on its batch, 
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -45,15 +45,9 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
     hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them; or those of each twin, [T, B, C, 3].
     """
     solver = solver_for(twins, device, differentiable=False)
-    count = len(twins)
-    nodes = torch.tensor(twins[0].topology.nodes, device=device)
-    solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
     sums = LossSums(solver, loss, velocity)
-    every = _of_each(hands, count)
-    for frame in range(1, len(hands)):
-        solver.advance(every[frame - 1], every[frame])
+    for frame in _frames(solver, twins, hands, velocity):
         sums.add(frame)
-        solver.go_on()
         if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and not sums.any_alive:
             break
     return [
@@ -65,22 +59,24 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], or
     [T, B, C, 3] of each twin, on the CPU."""
-    solver, count = solver_for(twins, device, differentiable=False), len(twins)
-    nodes = torch.tensor(twins[0].topology.nodes, device=device)
-    solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
-    every = _of_each(hands, count)
+    solver = solver_for(twins, device, differentiable=False)
     kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
-    for frame in range(1, len(hands)):
-        solver.advance(every[frame - 1], every[frame])
+    for _ in _frames(solver, twins, hands, velocity):
         for name, states in kept.items():
             states.append(solver.buffers.get_vectors(name, solver.last, solver.nodes).cpu())
-        solver.go_on()
     return torch.stack(kept["x"]), torch.stack(kept["v"])
 
 
-def _of_each(hands: torch.Tensor, twins: int) -> torch.Tensor:
-    """Hands [T, B, C, k] of each twin, if all share [T, C, k]."""
-    return hands if hands.dim() == 4 else hands[:, None].expand(-1, twins, -1, -1)
+def _frames(solver: FrameSolver, twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor) -> Iterator[int]:
+    """Simulate frame after frame: 1, 2, ... while the solver holds its end."""
+    count = len(twins)
+    nodes = torch.tensor(twins[0].topology.nodes, device=solver.device)
+    solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
+    every = hands if hands.dim() == 4 else hands[:, None].expand(-1, count, -1, -1)
+    for frame in range(1, len(hands)):
+        solver.advance(every[frame - 1], every[frame])
+        yield frame
+        solver.go_on()
 
 
 class LossSums:

@@ -68,7 +68,7 @@ def fill_net(values: Arrays) -> Buffers:
 def forces(values: Arrays, way: str) -> np.ndarray:
     b, kernels = fill_net(values), terms.kernels(len(values["x"]))
     b.tensors["force"].zero_()
-    model, state, _ = b.arguments()
+    model, state, _ = b.arguments
     launch(*((kernels.rows, 1) if way == "rows" else (kernels.links, (4, 1))), model, state)
     return b.get_vectors("force", count=b.nodes).numpy()
 
@@ -79,7 +79,7 @@ def force_adjoints(values: Arrays, weight: np.ndarray, way: str) -> Arrays:
         if name.startswith("adj_"):
             tensor.zero_()
     b.set_vectors("adj_force", torch.tensor(weight), slot=0)
-    launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments())
+    launch(*((kernels.rows_adjoint, 1) if way == "rows" else (kernels.links_adjoint, (4, 1))), *b.arguments)
     stiffness, inverse_length, dashpot = b.gradients()["springs"].numpy().transpose(2, 0, 1)
     state = {name: b.get_vectors(f"adj_{name}", count=b.nodes).numpy() for name in ("x", "v")}
     # d(1 / l0) = -d(l0) / l0^2
@@ -233,7 +233,7 @@ def fill_crowd(values: Arrays) -> Buffers:
 
 def collided(values: Arrays) -> np.ndarray:
     b = fill_crowd(values)
-    launch(terms.kernels(b.width).collide, (6, 1), *b.arguments()[:2])
+    launch(terms.kernels(b.width).collide, (6, 1), *b.arguments[:2])
     return b.get_vectors("moving", slot=0).numpy()
 
 
@@ -243,7 +243,7 @@ def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
         if name.startswith("adj_"):
             tensor.zero_()
     b.set_vectors("adj_moving", torch.tensor(weight))
-    launch(terms.kernels(b.width).collide_adjoint, (6, 1), *b.arguments())
+    launch(terms.kernels(b.width).collide_adjoint, (6, 1), *b.arguments)
     e, mu = (b.get_numbers(f"adj_contact_{name}").sum(dim=1).numpy() for name in ("e", "mu"))
     return {"x": b.get_vectors("adj_x", count=b.nodes).numpy(), "v": b.get_vectors("adj_after").numpy(), "e": e, "mu": mu}
 

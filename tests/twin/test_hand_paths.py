@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuspring.config import Search
 from neuspring.core.artifacts import ImageObservations, Twin
 from neuspring.twin import hand_paths
 from neuspring.twin.candidates import candidate
@@ -82,7 +81,7 @@ def test_a_patch_is_rigid_and_turns_about_the_ray():
 
 def test_frame_0_is_where_perception_put_the_grip():
     seen = colored.observed()
-    values = hand_paths.start(seen.image, Search()) | {"hand_depth.0": 1.1, "hand_tilt": 30.0}
+    values = {"hand_tilt": 30.0, "hand_size": 0.0, "hand_depth.0": 1.1, "hand_depth.1": 1.0, "hand_depth.2": 1.0}
     moved = hand_paths.hand_points(seen, values)
     np.testing.assert_allclose(moved[0], seen.controller_points[0], atol=1e-6)
     assert np.abs(moved[-1] - seen.controller_points[-1]).max() > 0.01

@@ -151,7 +151,7 @@ def test_a_search_moves_the_hands_and_reads_training_frames_alone():
         return float(np.linalg.norm(moved - true, axis=2)[end - 1].mean())
 
     assert found.cost < 0.5 * found.trace["cost"].iloc[0]
-    assert error(found.twin.hands) < error(hand_paths.start(problem.observations.image, settings))
+    assert error(found.twin.hands) < error(problem.decode(problem.encode()))
     image = problem.observations.image
     later = slice(end, None)
     pixels, visible = image.pixels.copy(), image.visible.copy()

@@ -37,7 +37,7 @@ def test_search_fit_rollout_and_transfer_carry_the_obstacles_of_a_scenario(tmp_p
     positions = roll_out(trained, seen.controller_points).positions
     free = replace(trained, simulation=replace(trained.simulation, obstacles=()))
     assert np.abs(positions - roll_out(free, seen.controller_points).positions).max() > 1e-3
-    assert move(free, seen).twin.simulation.obstacles == (SHELF,)
+    assert move(free, seen)[0].simulation.obstacles == (SHELF,)
 
 
 def test_files_without_obstacles_do_not_name_them_and_bad_ones_are_named(tmp_path):

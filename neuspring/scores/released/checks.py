@@ -36,7 +36,7 @@ from neuspring.scores.released.findings import Absent, Comparison, Tools, of_sco
 from neuspring.splats.draw import COVERED, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
 from neuspring.twin.candidates import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
-from neuspring.twin.rollout import simulate
+from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import uniform_topology
 
 DISTANCES = ("chamfer", "track_error")
@@ -170,7 +170,7 @@ def damped(twin: Twin, drag: float, dashpot: float) -> Twin:
 def replay(twin: Twin, controller_points: np.ndarray, device: str, label: str) -> Trajectory:
     """Simulate as the released simulator does: without our bound on the substep."""
     progress = Progress(f"replay {label}", len(controller_points) - 1)
-    return simulate(twin, controller_points, device, progress.update)
+    return roll_out(twin, controller_points, device, progress.update, check=False)
 
 
 def _prediction(case: Released, observations: Observations) -> np.ndarray:
