@@ -63,6 +63,11 @@ class Attempt:
     samples: list[list[float | None]] = field(default_factory=list)
     """[s since the start, CPU %, resident MiB, GPU %, GPU MiB], at most 120 rows."""
 
+    @property
+    def kind(self) -> Literal["cpu", "gpu"]:
+        """Where it ran."""
+        return "gpu" if self.devices else "cpu"
+
 
 @dataclass(frozen=True, kw_only=True)
 class JobRecord:

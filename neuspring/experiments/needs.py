@@ -83,14 +83,11 @@ def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:
     A request above the limit is an error here, before any job: Snakemake would clamp it.
     """
     wish = workflow.global_resources.get("gpu")
-    limit = wish.value if wish else None
     pool = gpu_pool(config.gpus, config.device, plan_only=workflow.output_settings.dryrun)
-    check_gpus(workflow.resource_settings.overwrite_resources, pool)
-    if pool:
-        workflow.register_resource("gpu", gpu_slots(pool, config.gpus.jobs_per_gpu, limit))
-    elif limit:
-        remedy = "Leave it out, or set device: cuda where there is one."
-        raise InputError("--resources gpu", "no job of this run can have a GPU", limit, remedy)
+    wishes = {rule: wishes["gpu"] for rule, wishes in workflow.resource_settings.overwrite_resources.items() if "gpu" in wishes}
+    check_gpus({rule: gpu.value for rule, gpu in wishes.items() if not gpu.is_evaluable()}, pool)
+    if slots := gpu_slots(pool, config.gpus.jobs_per_gpu, wish.value if wish else None):
+        workflow.register_resource("gpu", slots)
     return pool
 
 
@@ -119,21 +116,20 @@ def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[s
 def gpu_slots(pool: Sequence[str], jobs_per_gpu: int, limit: int | None) -> int:
     """How many jobs may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError if that cannot be."""
     slots = len(pool) * jobs_per_gpu
-    if limit is None:
+    where = "--resources gpu"
+    if limit and not pool:
+        raise InputError(where, "no job of this run can have a GPU", limit, "Leave it out, or set device: cuda where there is one.")
+    if limit is None or not pool:
         return slots
-    where, remedy = "--resources gpu", "Leave it out to use them all."
-    if limit > slots:
-        rule = f"there are {slots} GPU slots ({len(pool)} GPUs, gpus.jobs_per_gpu {jobs_per_gpu})"
-        raise InputError(where, rule, limit, remedy)
-    if limit < 1:
-        raise InputError(where, "jobs on a GPU need one", limit, f"{remedy} Use device: cpu for none.")
+    if not 1 <= limit <= slots:
+        rule = f"at least one, and there are {slots} GPU slots ({len(pool)} GPUs, gpus.jobs_per_gpu {jobs_per_gpu})"
+        raise InputError(where, rule, limit, "Leave it out to use them all. Use device: cpu for none.")
     return limit
 
 
-def check_gpus(rules: Mapping[str, Mapping[str, Any]], pool: Sequence[str]) -> None:
-    """Raise InputError if resources that were set for a rule (--set-resources) name more GPUs than this machine has."""
-    for rule, resources in rules.items():
-        wanted = resources["gpu"].value if "gpu" in resources and not resources["gpu"].is_evaluable() else 0
+def check_gpus(wishes: Mapping[str, Any], pool: Sequence[str]) -> None:
+    """Raise InputError if GPUs that were set for a rule (--set-resources) are more than this machine has."""
+    for rule, wanted in wishes.items():
         if isinstance(wanted, int) and wanted > len(pool):
             limit = f"a job has its GPUs at once, and there are {len(pool)} ({', '.join(pool) or 'none'})"
             raise InputError(f"--set-resources {rule}:gpu", limit, wanted, "Ask for fewer.")
@@ -156,23 +152,19 @@ class History:
         for record in records:
             for attempt in record.attempts:
                 for scenario in {"", record.scenario}:
-                    key = (record.rule, _kind(attempt.devices), scenario)
+                    key = (record.rule, attempt.kind, scenario)
                     memory[key] = max(memory[key], attempt.peak_memory_mb)
             ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
             if len(ends) > 1:
                 took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
                 for scenario in {"", record.scenario}:
-                    seconds[record.rule, _kind(record.attempts[ends[-1]].devices), scenario].append(took)
+                    seconds[record.rule, record.attempts[ends[-1]].kind, scenario].append(took)
         return cls(dict(seconds), dict(memory))
 
     def expected(self, rule: str, kind: Kind, scenario: str) -> float | None:
         """The median time of jobs of a rule, s: on the scenario, else on all; None where there was none."""
         times = self.seconds.get((rule, kind, scenario)) or self.seconds.get((rule, kind, ""))
         return statistics.median(times) if times else None
-
-
-def _kind(devices: Sequence[str]) -> Kind:
-    return "gpu" if devices else "cpu"
 
 
 class Needs:
@@ -213,40 +205,31 @@ class Needs:
         return asked
 
 
-@dataclass(frozen=True, kw_only=True)
-class Planned:
-    """A job that would run."""
-
-    rule: str
-    scenario: str = ""
-    kind: Kind = "cpu"
-
-
-def planned(jobs: Iterable[Any], needs: Needs) -> list[Planned]:
+def planned(jobs: Iterable[Any], needs: Needs) -> list[Key]:
     """Jobs of Snakemake's DAG; targets, which have no log, do nothing."""
     return [
-        Planned(
-            rule=JobRecord.of_log(needs.results, Path(job.log[0])).rule,
-            scenario=getattr(job.wildcards, "scenario", ""),
-            kind="gpu" if job.resources.get("gpu") else "cpu",
+        (
+            JobRecord.of_log(needs.results, Path(job.log[0])).rule,
+            "gpu" if job.resources.get("gpu") else "cpu",
+            getattr(job.wildcards, "scenario", ""),
         )
         for job in jobs
         if len(job.log)
     ]
 
 
-def plan(jobs: Iterable[Planned], history: History, slots: Mapping[Kind, int]) -> str:
+def plan(jobs: Iterable[Key], history: History, slots: Mapping[Kind, int]) -> str:
     """How many jobs there are, and the CPU- and GPU-time that they would take if each took the median of earlier ones."""
     hours: dict[tuple[str, Kind], float] = defaultdict(float)
     counts: dict[tuple[str, Kind], int] = defaultdict(int)
     unknown: dict[str, int] = defaultdict(int)
-    for job in jobs:
-        counts[job.rule, job.kind] += 1
-        seconds = history.expected(job.rule, job.kind, job.scenario)
+    for rule, kind, scenario in jobs:
+        counts[rule, kind] += 1
+        seconds = history.expected(rule, kind, scenario)
         if seconds is None:
-            unknown[job.rule] += 1
+            unknown[rule] += 1
         else:
-            hours[job.rule, job.kind] += seconds / 3600
+            hours[rule, kind] += seconds / 3600
     if not counts:
         return ""
     totals: dict[Kind, float] = {kind: sum(v for (_, k), v in hours.items() if k == kind) for kind in ("gpu", "cpu")}

@@ -54,7 +54,7 @@ def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
 def test_more_gpus_than_there_are_end_the_run_before_its_first_job(project):
     """What Snakemake was told reaches the checks of test_needs."""
     output = run_on_two_gpus(project, {}, "--resources", "gpu=3", "--dry-run", fails=True)
-    assert "--resources gpu: there are 2 GPU slots (2 GPUs, gpus.jobs_per_gpu 1); received 3" in output
+    assert "there are 2 GPU slots (2 GPUs, gpus.jobs_per_gpu 1); received 3" in output
     output = run_on_two_gpus(project, {}, "--dry-run", "--set-resources", "fit:gpu=3", fails=True)
     assert "--set-resources fit:gpu: a job has its GPUs at once, and there are 2 (0, 1); received 3" in output
 

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import pytest
-from snakemake.resources import Resource
 
 from neuspring import config
 from neuspring.config.settings import Gpus
@@ -11,7 +10,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.experiments import needs
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.needs import History, Needs, Planned, plan
+from neuspring.experiments.needs import History, Needs, plan
 from tests.support.project import ROOT, config_with
 
 
@@ -24,8 +23,8 @@ def record(rule, scenario, *attempts, devices=(), memory=0.0):
     return JobRecord(rule=rule, name=f"{rule}/{scenario}", log="", attempts=made, scenario=scenario)
 
 
-def job(rule, scenario="rope", kind="cpu"):
-    return Planned(rule=rule, scenario=scenario, kind=kind)
+def job(rule, kind="cpu"):
+    return rule, kind, "rope"
 
 
 def test_a_job_is_expected_to_take_the_median_of_its_scenario_else_of_all():
@@ -97,7 +96,7 @@ def test_gpu_slots_are_those_that_the_user_allows(monkeypatch, visible, settings
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     chosen = config.parse(config.Config, {"gpus": settings}, "test").gpus
     pool = needs.gpu_pool(chosen, device)
-    assert (pool, needs.gpu_slots(pool, chosen.jobs_per_gpu, limit) if pool else 0) == expected
+    assert (pool, needs.gpu_slots(pool, chosen.jobs_per_gpu, limit)) == expected
 
 
 @pytest.mark.parametrize(
@@ -106,7 +105,8 @@ def test_gpu_slots_are_those_that_the_user_allows(monkeypatch, visible, settings
         ("0,1", {"devices": [1, 2]}, "cuda", None, "every device must be one that this run may use; received 2; allowed: 0, 1"),
         ("", {}, "cuda", None, "device: cuda needs a GPU that this run may use, and there is none"),
         ("0,1", {"jobs_per_gpu": 2}, "cuda", 5, r"there are 4 GPU slots \(2 GPUs, gpus.jobs_per_gpu 2\); received 5"),
-        ("0,1", {}, "cuda", 0, "jobs on a GPU need one; received 0"),
+        ("", {}, "auto", 2, "no job of this run can have a GPU; received 2"),
+        ("0,1", {}, "cuda", 0, r"at least one, and there are 2 GPU slots .*received 0"),
     ],
 )
 def test_asking_for_more_than_there_is_ends_the_run_before_it_begins(monkeypatch, visible, settings, device, limit, message):
@@ -122,10 +122,9 @@ def test_a_plan_for_gpus_can_be_made_where_there_is_none(monkeypatch):
 
 
 def test_resources_set_for_a_rule_beyond_the_gpus_there_are_are_refused():
-    wishes = {"fit": {"gpu": Resource("gpu", 3)}, "search": {"mem_mb": Resource("mem_mb", 9000)}}
-    needs.check_gpus(wishes, ("0", "1", "2"))
+    needs.check_gpus({"fit": 3}, ("0", "1", "2"))
     with pytest.raises(InputError, match=r"--set-resources fit:gpu: .* there are 2 \(0, 1\); received 3"):
-        needs.check_gpus(wishes, ("0", "1"))
+        needs.check_gpus({"fit": 3}, ("0", "1"))
 
 
 def test_a_results_folder_that_cannot_be_written_ends_the_run_before_it_begins():

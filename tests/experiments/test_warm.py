@@ -18,7 +18,8 @@ def server(tmp_path_factory):
     """A warm process without libraries, which take seconds to import."""
     path = tmp_path_factory.mktemp("warm") / "socket"
     code = f"from neuspring.experiments.jobs import warm; warm.LIBRARIES = (); warm.main({str(path)!r})"
-    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    environment = os.environ | dict.fromkeys(warm.THREADS, "1")
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, env=environment)
     deadline = time.monotonic() + 60
     while not path.exists():
         assert process.poll() is None and time.monotonic() < deadline

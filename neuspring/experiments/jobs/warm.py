@@ -18,10 +18,9 @@ import importlib
 import json
 import os
 import runpy
-import select
+import selectors
 import signal
 import socket
-import socketserver
 import subprocess
 import sys
 import threading
@@ -39,8 +38,8 @@ LIBRARIES = ("numpy", "scipy.spatial", "pandas", "torch", "warp", "cv2", "trimes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SAFE_THREADS = {"jemalloc_bg_thd"}
 """Threads of libraries that prepare for a fork themselves."""
-MOST_FILES = 64
-"""Open files that a job inherits, at most."""
+MOST_FILES, PATIENCE = 64, 10.0
+"""Open files that a job inherits, at most; s that its request may take."""
 
 
 def die_with_parent() -> None:
@@ -114,12 +113,6 @@ def serve_while_running(path: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-class _Server(socketserver.ForkingMixIn, socketserver.UnixStreamServer):
-    """Forks a child per connection; closing it waits for the children."""
-
-    max_children, request_queue_size = 100_000, 64
-
-
 def main(path: str) -> None:
     """Import the libraries, then serve jobs until standard input is closed and no job is left."""
     if sys.platform != "linux":
@@ -140,66 +133,84 @@ def main(path: str) -> None:
     gc.collect()
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C also reaches the jobs' wrappers, which end them
-    with _Server(path, _Job) as server:
-        closed = sys.stdin.fileno()
-        while closed not in select.select([server.fileno(), closed], [], [])[0]:
-            server.handle_request()
-            server.service_actions()  # takes note of children that have ended
+    jobs: dict[int, socket.socket] = {}  # id of a job's process -> the connection to its wrapper
+    with socket.socket(socket.AF_UNIX) as server, selectors.DefaultSelector() as watched:
+        server.bind(path)
+        server.listen(64)
+        for file in (server, sys.stdin):
+            watched.register(file, selectors.EVENT_READ)
+        while jobs or sys.stdin in watched.get_map():
+            for key, _ in watched.select():
+                if key.fileobj is sys.stdin:
+                    watched.unregister(sys.stdin)
+                    watched.unregister(server)
+                    server.close()
+                elif key.fileobj is server:
+                    connection, _ = server.accept()
+                    try:
+                        pid = _begin(connection)
+                    except (OSError, ValueError):  # its wrapper has gone
+                        connection.close()
+                        continue
+                    jobs[pid] = connection
+                    for file in (os.pidfd_open(pid), connection):
+                        watched.register(file, selectors.EVENT_READ, pid)
+                elif key.data in jobs and key.fileobj is jobs[key.data]:
+                    # The wrapper says nothing more: its connection is readable when it has gone, and then its job ends too.
+                    os.kill(key.data, signal.SIGKILL)
+                    watched.unregister(key.fileobj)
+                elif key.data in jobs:
+                    status = os.waitstatus_to_exitcode(os.waitpid(key.data, 0)[1])
+                    with jobs.pop(key.data) as connection:
+                        if connection in watched.get_map():
+                            watched.unregister(connection)
+                        with contextlib.suppress(OSError):
+                            connection.sendall(f"{status}\n".encode())
+                    watched.unregister(key.fileobj)
+                    os.close(key.fd)
 
 
-class _Job(socketserver.BaseRequestHandler):
-    """In a child of the warm process: a job, watched until it has ended or its wrapper has gone."""
+def _begin(connection: socket.socket) -> int:
+    """Fork the process of a job that is asked for, and tell its id. Raises OSError, ValueError."""
+    connection.settimeout(PATIENCE)
+    length, files, *_ = socket.recv_fds(connection, 4, MOST_FILES)
+    with connection.makefile("rb") as stream:
+        request = json.loads(stream.read(int.from_bytes(length)))
+    if (pid := os.fork()) == 0:
+        _run(request, *files)
+    for file in files:
+        os.close(file)
+    with contextlib.suppress(OSError):
+        connection.sendall(f"{pid}\n".encode())
+    return pid
 
-    request: socket.socket
-    server: _Server
 
-    def handle(self) -> None:
+def _run(request: Mapping[str, Any], output: int, *held: int) -> None:
+    """In the job's own process: run the command and end. The files `held` stay open."""
+    status = 1
+    try:
         die_with_parent()
-        length, files, *_ = socket.recv_fds(self.request, 4, MOST_FILES)
-        with self.request.makefile("rb") as stream:
-            request = json.loads(stream.read(int.from_bytes(length)))
-        pid = os.fork()
-        if pid == 0:
-            self._run(request, *files)
-        for file in files:
-            os.close(file)
-        self.request.sendall(f"{pid}\n".encode())
-        # The wrapper says nothing more: its connection is readable when it has gone, and then its job ends too.
-        select.select([self.request.fileno(), os.pidfd_open(pid)], [], [])
-        if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
-            os.kill(pid, signal.SIGKILL)
-        status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        with contextlib.suppress(OSError):
-            self.request.sendall(f"{status}\n".encode())
-
-    def _run(self, request: Mapping[str, Any], output: int, *held: int) -> None:
-        """In the job's own process: run the command and end. The files `held` stay open."""
-        status = 1
-        try:
-            die_with_parent()
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            self.request.close()
-            self.server.socket.close()
-            nothing = os.open(os.devnull, os.O_RDONLY)
-            for source, target in ((nothing, 0), (output, 1), (output, 2)):
-                os.dup2(source, target)
-            os.close(nothing)
-            os.close(output)
-            os.chdir(request["folder"])
-            os.environ.clear()
-            os.environ.update(request["environment"])
-            sys.argv = ["neuspring", *request["arguments"]]
-            runpy.run_module("neuspring", run_name="__main__")
-            status = 0
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            # Skip the exit handlers that were inherited from the parent.
-            os._exit(status)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for source, target in ((nothing, 0), (output, 1), (output, 2)):
+            os.dup2(source, target)
+        os.close(nothing)
+        os.close(output)
+        os.chdir(request["folder"])
+        os.environ.clear()
+        os.environ.update(request["environment"])
+        sys.argv = ["neuspring", *request["arguments"]]
+        runpy.run_module("neuspring", run_name="__main__")
+        status = 0
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # Skip the exit handlers that were inherited from the parent.
+        os._exit(status)
 
 
 if __name__ == "__main__":

@@ -8,23 +8,35 @@ here.
 from __future__ import annotations
 
 import argparse
+import collections
 import contextlib
 import os
 import platform
+import resource
+import shlex
+import signal
+import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import psutil
 
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import FOLDER, GPU_NOTES, LOGS, Attempt, JobRecord, this_run
 from neuspring.core.lock import try_lock
-from neuspring.experiments.jobs import faults, gpus
-from neuspring.experiments.jobs.command import execute, say
+from neuspring.experiments.jobs import faults, gpus, warm
 
+TAIL = 200
+"""Lines of output that are searched for a cause of failure."""
+INTERVAL, MOST = 1.0, 120
+"""s between the first samples; the number of rows at which every second one is dropped and the interval doubles."""
+MIB = 2**20
 GIVEN = "given"
 POOL, SHARE = "NEUSPRING_GPUS", "NEUSPRING_JOBS_PER_GPU"
 """Environment: the devices that jobs share (or `given`: a cluster has chosen this job's), how many jobs a device takes."""
@@ -67,11 +79,23 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
     inherit: the job stays locked until both have ended. Yields None, and locks nothing, where files cannot be made or locked.
     """
     # Snakemake removes a job's log before it starts the job, so the log cannot be the locked file.
-    path = record.with_name(f"{record.name.removesuffix('.json')}.lock")
+    path, file, told = record.with_suffix(".lock"), None, False
     try:
-        file = _locked(path, waiting)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while (file := try_lock(path)) is None:
+            if not told:
+                holder = "not known"
+                with contextlib.suppress(FileNotFoundError):
+                    holder = path.read_text(encoding="utf-8").strip() or holder
+                end = f"waiting for its end. If it is gone, delete {path}"
+                waiting(f"an earlier run of this job still goes on ({holder}); {end}")
+            told = True
+            time.sleep(POLL)
+        with contextlib.suppress(OSError):  # unbuffered: the file's own close must not try again what a full disk refused
+            os.ftruncate(file.fileno(), 0)
+            os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
     except OSError:  # a full or read-only disk ends the job itself, with its name; some network file systems have no locks
-        file = None
+        pass
     try:
         yield file
     finally:
@@ -80,26 +104,6 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
             with contextlib.suppress(OSError):
                 path.unlink()
             file.close()
-
-
-def _locked(path: Path, waiting: Callable[[str], object]) -> IO[str]:
-    """Wait until the file at `path` is locked, and write into it who holds it. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = try_lock(path)
-    if file is None:
-        holder = ""
-        with contextlib.suppress(FileNotFoundError):
-            holder = path.read_text(encoding="utf-8").strip()
-        waiting(
-            f"an earlier run of this job still goes on ({holder or 'not known'}); waiting for its end. If it is gone, delete {path}"
-        )
-    while file is None:
-        time.sleep(POLL)
-        file = try_lock(path)
-    with contextlib.suppress(OSError):  # unbuffered: the file's own close must not try again what a full disk refused
-        os.ftruncate(file.fileno(), 0)
-        os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
-    return file
 
 
 def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str] | None, *, gpu_count: int, quiet: bool) -> int:
@@ -123,8 +127,12 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
         except (OSError, InputError) as error:
             print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
 
+    pool, lease = os.environ.get(POOL, ""), None
     try:
-        lease = _lease(gpu_count, record.scenario, results / FOLDER / GPU_NOTES if this else None)
+        if gpu_count and pool != GIVEN:
+            names = [name for name in pool.split(",") if name] or gpus.visible_devices()
+            share, notes = int(os.environ.get(SHARE, "1")), results / FOLDER / GPU_NOTES if this else None
+            lease = gpus.acquire(gpu_count, names, jobs_per_gpu=share, affinity=record.scenario, notes=notes, say=say)
     except (InputError, TimeoutError) as error:
         save(Attempt(started=_now(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT))
         raise
@@ -137,8 +145,7 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
         own = lease.environment() if lease else {} if gpu_count else {gpus.VISIBLE: ""}
         # The command holds lock and slots too: they are free when it has ended, even if this process dies first.
         locks = [*([lock] if lock else []), *(lease.files if lease else ())]
-        log = results / record.log
-        ended, fault = execute(command, log, begun, environment=os.environ | own, locks=locks, quiet=quiet)
+        ended, fault = execute(command, results / record.log, begun, os.environ | own, locks, quiet=quiet)
         save(ended)
         if lease and (fault is None or fault.device):
             try:
@@ -152,19 +159,170 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
     return ended.exit if ended.exit >= 0 else 1
 
 
-def _lease(count: int, scenario: str, notes: Path | None) -> gpus.Lease | None:
-    """GPUs of this machine; None where none is needed or a cluster has chosen them."""
-    pool = os.environ.get(POOL, "")
-    if not count or pool == GIVEN:
-        return None
-    names = [name for name in pool.split(",") if name] or gpus.visible_devices()
-    share = int(os.environ.get(SHARE, "1"))
-    return gpus.acquire(count, names, jobs_per_gpu=share, affinity=scenario, notes=notes, say=say)
-
-
 def _now() -> str:
     """UTC, with milliseconds: leases follow one another closely."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def execute(
+    command: Sequence[str], log: Path, begun: Attempt, environment: Mapping[str, str], locks: Sequence[IO[str]], *, quiet: bool
+) -> tuple[Attempt, faults.Fault | None]:
+    """Run a command, which inherits `locks`, to its end: (the finished attempt, why it failed if it did).
+
+    Its output goes to the log, signals are passed on to it, its use of the machine is sampled from outside. `quiet`: the output
+    goes to the log alone, unless the command fails.
+    """
+    write = _log(log)
+    write(f"# {begun.started} {shlex.join(command)}\n")
+    start = time.monotonic()
+    try:
+        process = warm.start(command, locks, environment) or subprocess.Popen(
+            command,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            bufsize=1,
+            pass_fds=[file.fileno() for file in locks],
+            preexec_fn=warm.die_with_parent,
+        )
+    except OSError as error:
+        status, refused = faults.not_started(error)
+        write(f"{error}\n")
+        say(f"{refused.cause}: {error}. {refused.remedy}".strip())
+        return replace(begun, outcome=refused.outcome, cause=refused.cause, message=str(error), exit=status), refused
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda received, frame: process.send_signal(received))
+    tail: collections.deque[str] = collections.deque(maxlen=TAIL)
+    assert process.stdout is not None
+    with Watch(process.pid, begun.devices) as watch:
+        for line in process.stdout:
+            tail.append(line)
+            write(line)
+            if not quiet:
+                _print(line)
+        status = process.wait()
+    ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
+    fault = faults.diagnose(status, list(tail))
+    if fault is None:
+        return ended, None
+    if quiet:
+        _print("".join(tail))
+    again = " (may be tried again)" if fault.outcome == "transient" else ""
+    say(f"{fault.cause}{again}. {fault.remedy}".strip())
+    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(tail))), fault
+
+
+def say(text: str) -> None:
+    """Tell whoever watches the workflow; the log is the command's."""
+    with contextlib.suppress(OSError):  # a terminal that is gone must not end the job
+        print(text, file=sys.stderr, flush=True)
+
+
+def _print(text: str) -> None:
+    """Print; a terminal that is gone, or a full disk behind our own output, must not end the job."""
+    try:
+        print(text, end="", flush=True)
+    except OSError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - for as long as this process lives
+
+
+def _log(path: Path) -> Callable[[str], None]:
+    """What appends to a log. A log that cannot be written is a warning: on a full disk the job's own error counts."""
+    file: IO[bytes] | None = None
+
+    def write(text: str) -> None:
+        nonlocal file
+        try:
+            if file:
+                file.write(text.encode())
+        except OSError as error:
+            say(f"warning: {path}: {error.strerror}")
+            file = None
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab", buffering=0)  # unbuffered: nothing is left to fail when it is closed
+    except OSError as error:
+        say(f"warning: {path}: {error.strerror}")
+    return write
+
+
+class Watch:
+    """Samples a process tree and GPUs in a thread, for the length of a `with` block."""
+
+    def __init__(self, pid: int, devices: Sequence[str]) -> None:
+        self._pid, self._devices = pid, tuple(devices)
+        self._rows: list[list[float | None]] = []
+        self._peak = 0.0
+        self._cpu: dict[int, float] = {}
+        self._names: list[str] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def facts(self) -> dict[str, Any]:
+        """The fields of an `Attempt` that describe the use of the machine. Call this after the block."""
+        # Samples miss short peaks; the kernel remembers the peak of the largest ended process.
+        largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 if sys.platform != "darwin" else MIB)
+        shares = [row[3] for row in self._rows if row[3] is not None]
+        return {
+            "peak_memory_mb": round(max(self._peak, largest), 1),
+            "cpu_seconds": round(sum(self._cpu.values()), 2),
+            "samples": self._rows,
+            "device_names": self._names,
+            "peak_gpu_memory_mb": max((row[4] for row in self._rows if row[4] is not None), default=None),
+            "gpu_utilization": round(sum(shares) / len(shares), 1) if shares else None,
+        }
+
+    def _sample(self) -> None:
+        start = last = time.monotonic()
+        interval, before, handles = INTERVAL, 0.0, []
+        with gpus.nvml() if self._devices else contextlib.nullcontext() as library:
+            for device in self._devices if library else ():
+                with contextlib.suppress(Exception):  # a MIG slice: NVML does not measure it by this name
+                    handles.append(gpus.handle_of(library, device))
+                    self._names.append(str(library.nvmlDeviceGetName(handles[-1])))
+            while True:
+                # A short first wait, so that jobs of a second are seen too.
+                ended = self._stop.wait(interval if self._rows else 0.1)
+                moment = time.monotonic()
+                memory, cpu = self._tree()
+                self._peak = max(self._peak, memory)
+                share = 100 * (cpu - before) / max(moment - last, 1e-3)
+                if not ended or not self._rows:
+                    gpu: list[float | None] = [None, None]
+                    with contextlib.suppress(Exception):  # a device may be lost while it is watched; the command will say so
+                        rates = [library.nvmlDeviceGetUtilizationRates(handle).gpu for handle in handles]
+                        used = [library.nvmlDeviceGetMemoryInfo(handle).used / MIB for handle in handles]
+                        gpu = [sum(rates) / len(rates), round(sum(used), 1)] if handles else gpu
+                    self._rows.append([round(moment - start, 2), round(max(share, 0.0), 1), round(memory, 1), *gpu])
+                last, before = moment, cpu
+                if ended:
+                    return
+                if len(self._rows) >= MOST:
+                    del self._rows[::2]
+                    interval *= 2
+
+    def _tree(self) -> tuple[float, float]:
+        """(resident MiB, CPU seconds) of the process and its children. The seconds include ended children."""
+        memory = 0.0
+        with contextlib.suppress(psutil.Error):
+            root = psutil.Process(self._pid)
+            for process in (root, *root.children(recursive=True)):
+                with contextlib.suppress(psutil.Error):
+                    times = process.cpu_times()
+                    self._cpu[process.pid] = times.user + times.system
+                    memory += process.memory_info().rss / MIB
+        return memory, sum(self._cpu.values())
 
 
 if __name__ == "__main__":
