@@ -26,7 +26,7 @@ from filelock import FileLock
 
 from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.data import hub as fetch_hub
+from neuspring.data import fetch as fetching
 from neuspring.data import phystwin
 from neuspring.data.fetch import LOCK, RECORD, fetch
 from neuspring.scores.released.run import check
@@ -196,7 +196,7 @@ def server(released: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_TELEMETRY", True)  # read at import, which another test may have caused
     for name, value in {"BLOCK": 4096, "GAP": 1024}.items():  # as small as the archives
-        monkeypatch.setattr(fetch_hub, name, value)
+        monkeypatch.setattr(fetching, name, value)
     retry(monkeypatch, 0)
     close_session()  # its client knows the environment of its first use
     with StandIn() as standin:
@@ -264,7 +264,7 @@ def test_one_scenario_costs_neither_the_other_nor_the_other_archives(server: Sta
     assert not [path for path in server.paths if "experiments" in path]
     toc = 140 * sum(1 for _ in zipfile.ZipFile(io.BytesIO(server.files["data.zip"])).infolist())
     wanted = sum(len(content) for content in fetched.values())
-    assert server.served < wanted * 1.05 + toc + 3 * fetch_hub.BLOCK
+    assert server.served < wanted * 1.05 + toc + 3 * fetching.BLOCK
 
 
 def test_parts_keep_to_themselves(server: StandIn, tmp_path: Path) -> None:
