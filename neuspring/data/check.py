@@ -1,7 +1,7 @@
 """Departures of a data set from its described layout, file by file, and of a capture from what a scene on a table looks like.
 Nothing here raises for bad content.
 
-What cannot work is an error, what is only unusual a warning with the next move; see `plausible_world`. `neuspring check-data` adds
+What cannot work is an error, what is only unusual a warning with the next move; see `plausible`. `neuspring check-data` adds
 the comparison with the released results: `neuspring.scores.released.run`.
 """
 
@@ -19,26 +19,9 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, note, refusal, unusual
-from neuspring.data import mocap, phystwin
+from neuspring.data import mocap, phystwin, plausible
 from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
-from neuspring.data.phystwin import CALIBRATION, metadata_findings, poses_findings
-from neuspring.data.plausible_masks import Shown, mask_findings
-from neuspring.data.plausible_world import (
-    Sample,
-    color_alone_findings,
-    depth_findings,
-    hand_findings,
-    horizon_findings,
-    lifted,
-    object_on_table,
-    place_findings,
-    reach_findings,
-    sampled,
-    size_findings,
-    table_findings,
-    view_findings,
-)
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
 from neuspring.data.unpickle import load_pickle
 
@@ -71,11 +54,6 @@ class Inspection:
         return None
 
 
-def is_capture(folder: Path) -> bool:
-    """Whether the folder holds a capture."""
-    return (folder / CAPTURE).exists()
-
-
 def check_capture(folder: Path) -> list[Finding]:
     """Description, calibration, every image, masks of frame 0, tracks, marked points."""
     case, path = Inspection(folder), folder / CAPTURE
@@ -83,13 +61,15 @@ def check_capture(folder: Path) -> list[Finding]:
     if description is None:
         return case.findings
     case.findings += description_findings(path, description)
-    case.findings += rate_findings(path, description.frame_rate)
+    if not SLOWEST <= description.frame_rate <= FASTEST:  # Speeds and forces of the twin scale with it.
+        rule = f"frames per second at which it was filmed are required, {SLOWEST:g} to {FASTEST:g}"
+        case.findings.append(broken(path, "frame_rate", rule, f"{description.frame_rate:g}"))
     capture = Capture(folder, description)
     calibrated = not any(d.level == "error" for d in case.findings)
     samples = {name: _check_camera(case, capture, name, calibrated) for name in capture.cameras}
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
-        case.findings += view_findings(path, capture.cameras, first, description.up)
+        case.findings += plausible.view_findings(path, capture.cameras, first, description.up)
     case.load(folder / TRACKS, lambda _: capture.tracks())
     for name in capture.cameras:
         case.load(folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
@@ -104,20 +84,12 @@ def _at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
     return [replace(one, where=str(file), name=f"{one.where}: {one.name}") for one in findings]
 
 
-def rate_findings(path: Path, rate: float) -> list[Finding]:
-    """A finding of a frame rate that no depth camera has. Speeds and forces of the twin scale with it."""
-    if SLOWEST <= rate <= FASTEST:
-        return []
-    rule = f"frames per second at which it was filmed are required, {SLOWEST:g} to {FASTEST:g}"
-    return [broken(path, "frame_rate", rule, f"{rate:g}")]
-
-
-def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: bool) -> dict[int, Sample]:
+def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: bool) -> dict[int, plausible.Sample]:
     """Check every image of a camera, and a few frames against the world; returns these."""
     view = capture.cameras[name]
-    depths, shown = [], Shown(capture.frame_count, (view.width, view.height))
-    samples: dict[int, Sample] = {}
-    wanted = sampled(capture.frame_count)
+    depths, shown = [], plausible.Shown(capture.frame_count, (view.width, view.height))
+    samples: dict[int, plausible.Sample] = {}
+    wanted = plausible.sampled(capture.frame_count)
     for frame in range(capture.frame_count):
         if not capture.has(name, frame):
             continue
@@ -131,21 +103,26 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
                 mask = capture.mask(name, frame)
                 shown.see(frame, mask)
             if frame in wanted:
-                samples[frame] = Sample(depth, mask)
+                samples[frame] = plausible.Sample(depth, mask)
         except InputError as error:
             case.findings.append(refusal(error))
-    wrong = median_depth_findings(capture, name, depths)
-    case.findings += wrong
+    path, measured = capture.folder / CAPTURE, [median for median in depths if np.isfinite(median)]
+    typical = float(np.median(measured)) if measured else 0.0
+    if depths and not measured:
+        case.findings.append(broken(path, f"cameras.{name}", "some depth is required", "0 in every pixel of every frame"))
+    elif measured and not NEAR < typical < FAR:
+        rule = f"the median depth of camera {name} must lie between {NEAR:g} and {FAR:g} m, with the unit of the images"
+        received = f"{capture.description.depth_unit:g} m per count, which makes it {typical:.4g} m"
+        case.findings.append(broken(path, "depth_unit", rule, received))
+    elif calibrated and capture.has_depth:
+        case.findings += _world_findings(capture, name, samples)
     if calibrated and not capture.has_depth:
         case.findings += _color_alone_findings(capture, name, samples)
-    elif calibrated and not wrong:
-        case.findings += _world_findings(capture, name, samples)
-    masks = capture.folder / "mask" / name
-    case.findings += _at(masks, mask_findings(name, shown))
+    case.findings += _at(capture.folder / "mask" / name, plausible.mask_findings(name, shown))
     return samples
 
 
-def _world_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
+def _world_findings(capture: Capture, name: str, samples: dict[int, plausible.Sample]) -> list[Finding]:
     """The table, and object and hands in the masks, of one camera."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
     is_counted = capture.description.depth_format == "png"
@@ -154,13 +131,13 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> 
     around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
     enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
     found = planes(cloud(around, camera.intrinsics)) if enough else []
-    findings = table_findings(path, name, found, camera.camera_to_world, up, unit)
-    bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
+    findings = plausible.table_findings(path, name, found, camera.camera_to_world, up, unit)
+    bodies = {frame: plausible.lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
     things = [
-        *depth_findings(camera, samples),
-        *place_findings(f"camera {name}, object", list(bodies.values()), up_sign(up)),
-        *hand_findings(camera, samples),
-        *reach_findings(camera, samples),
+        *plausible.depth_findings(camera, samples),
+        *plausible.place_findings(f"camera {name}, object", list(bodies.values()), up_sign(up)),
+        *plausible.hand_findings(camera, samples),
+        *plausible.reach_findings(camera, samples),
     ]
     findings += _at(path, things)
     if 0 in bodies:
@@ -168,17 +145,17 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> 
     return findings
 
 
-def _color_alone_findings(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
+def _color_alone_findings(capture: Capture, name: str, samples: dict[int, plausible.Sample]) -> list[Finding]:
     """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
-    findings = color_alone_findings(path, camera, up)
+    findings = plausible.color_alone_findings(path, camera, up)
     if any(d.level == "error" for d in findings) or 0 not in samples:
         return findings
     mask = samples[0].mask
-    findings += horizon_findings(path, camera, mask)
-    findings += _at(path, size_findings(camera, mask))
+    findings += plausible.horizon_findings(path, camera, mask)
+    findings += _at(path, plausible.size_findings(camera, mask))
     # Obstacles stand on the table: what lies beneath one is met above it.
-    on_table = object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
+    on_table = plausible.object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
     return findings + obstacle_findings(path, capture.description, on_table[np.isfinite(on_table[:, 0])])
 
 
@@ -189,23 +166,9 @@ def obstacle_findings(path: Path, description: Description, points: np.ndarray) 
         share = float((obstacle.depth(points) > INSIDE).mean()) if len(points) else 0.0
         if share > INSIDE_SHARE:
             rule = f"the object of frame 0 must be outside, but for {INSIDE_SHARE:.0%} of what is seen of it"
-            remedy = "Look at center, rotation and sizes; they are in meters, in the world of the cameras."
-            found.append(
-                broken(path, f"obstacles[{number}]", f"{rule}. {remedy}", f"{share:.0%} more than {1e3 * INSIDE:g} mm inside")
-            )
+            rule += ". Look at center, rotation and sizes; they are in meters, in the world of the cameras."
+            found.append(broken(path, f"obstacles[{number}]", rule, f"{share:.0%} more than {1e3 * INSIDE:g} mm inside"))
     return found
-
-
-def median_depth_findings(capture: Capture, name: str, medians: list[float]) -> list[Finding]:
-    """Departures of a camera whose median depths, m, are not those of a scene on a table."""
-    path, depths = capture.folder / CAPTURE, np.array([m for m in medians if np.isfinite(m)])
-    if medians and not len(depths):
-        return [broken(path, f"cameras.{name}", "some depth is required", "0 in every pixel of every frame")]
-    if len(depths) and not NEAR < np.median(depths) < FAR:
-        unit = capture.description.depth_unit
-        rule = f"the median depth of camera {name} must lie between {NEAR:g} and {FAR:g} m, with the unit of the images"
-        return [broken(path, "depth_unit", rule, f"{unit:g} m per count, which makes it {np.median(depths):.4g} m")]
-    return []
 
 
 CONTROLLERS = 30
@@ -250,16 +213,14 @@ def find_cases(folder: Path) -> list[Released]:
         if not paths:
             raise InputError(folder, "at least one case folder is required", "none")
         return [Released(root=folder, name=path.name) for path in paths]
-    paths = [folder] if is_case(folder) else [path for path in _subfolders(folder) if is_case(path)]
-    return [_located(path) for path in paths]
-
-
-def _located(path: Path) -> Released:
-    """The case in folder `path`, with its root if it lies in one."""
-    path = path.absolute()
-    if path.parts[-3:-1] == ("data", "different_types"):
-        return Released(root=path.parents[2], name=path.name)
-    return Released(root=path.parent, name=path.name, loose=path)
+    cases = []
+    for path in [folder] if is_case(folder) else filter(is_case, _subfolders(folder)):
+        path = path.absolute()
+        if path.parts[-3:-1] == ("data", "different_types"):
+            cases.append(Released(root=path.parents[2], name=path.name))
+        else:
+            cases.append(Released(root=path.parent, name=path.name, loose=path))
+    return cases
 
 
 def is_case(folder: Path) -> bool:
@@ -280,7 +241,7 @@ def render(findings: list[Finding]) -> str:
 
 
 def _captures(folder: Path) -> list[Path]:
-    return [path for path in (folder, *_subfolders(folder)) if is_capture(path)]
+    return [path for path in (folder, *_subfolders(folder)) if (path / CAPTURE).exists()]
 
 
 def _subfolders(folder: Path) -> list[Path]:
@@ -289,30 +250,44 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _check_case(case: Released) -> list[Finding]:
     inspection = Inspection(case.folder)
+    load, findings = inspection.load, inspection.findings
     data = _check_final_data(inspection)
     frames = None if data is None else len(data["object_points"])
     path = case.folder / phystwin.SPLIT
-    split = inspection.load(path, load_json)
+    split = load(path, load_json)
     if split is not None and frames is None:
-        message = "needs the number of frames of final_data.pkl: the check of the split is skipped"
-        inspection.findings.append(note(path, message))
+        findings.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
     elif split is not None and frames is not None:
-        inspection.findings += phystwin.split_findings(path, split, frames)
+        findings += phystwin.split_findings(path, split, frames)
     path = case.folder / phystwin.TRACKS
     tracks = inspection.load_optional(path, load_pickle, "annotated tracks and the track error are")
     if tracks is not None:
-        inspection.findings += phystwin.tracks_findings(path, tracks, frames)
-    path = case.folder / CALIBRATION
+        findings += phystwin.tracks_findings(path, tracks, frames)
+    path = case.folder / phystwin.CALIBRATION
     poses = inspection.load_optional(path, load_pickle, "the calibration check is")
     if poses is not None:
-        inspection.findings += poses_findings(path, poses, CAMERAS)
-    _check_metadata(inspection, frames)
-    if case.loose is None:
-        _check_results(inspection, case, data)
-    return inspection.findings
-
-
-# --- the processed case, file by file -------------------------------------------------------------------------------------
+        findings += phystwin.poses_findings(path, poses, CAMERAS)
+    path = case.folder / phystwin.METADATA
+    metadata = inspection.load_optional(path, load_json, "the check of intrinsics and frame rate is")
+    if metadata is not None:
+        findings += phystwin.frame_rate_findings(path, metadata)
+    if isinstance(metadata, dict):
+        if "fps" not in metadata:
+            findings.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
+        if frames is not None and metadata.get("frame_num", frames) != frames:
+            findings.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
+        findings += phystwin.metadata_findings(path, metadata, CAMERAS)
+    if case.loose is not None:
+        return findings
+    # Results: a file that is missing skips the checks that need it.
+    if case.parameters.exists() and (parameters := load(case.parameters, load_pickle)) is not None:
+        findings += parameter_findings(case.parameters, parameters)
+    if case.checkpoint.exists():
+        load(case.checkpoint, read_checkpoint)
+    if data is not None and case.prediction.exists() and (positions := load(case.prediction, load_pickle)) is not None:
+        nodes = data["object_points"].shape[1] + len(data["surface_points"]) + len(data["interior_points"])
+        findings += prediction_findings(case.prediction, positions, len(data["object_points"]), nodes)
+    return findings
 
 
 def _check_final_data(case: Inspection) -> dict[str, np.ndarray] | None:
@@ -324,96 +299,39 @@ def _check_final_data(case: Inspection) -> dict[str, np.ndarray] | None:
     case.findings += phystwin.final_data_findings(path, data)
     if any(d.level == "error" for d in phystwin.structure_findings(path, data)) or not data["object_visibilities"].size:
         return None
-    case.findings += _invisible_findings(path, data)
-    case.findings += _motion_findings(path, data)
-    case.findings += _rest_state_findings(path, data)
-    controllers = data["controller_points"].shape[1]
-    if controllers != CONTROLLERS:
-        case.findings.append(unusual(path, "controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
-    return dict(data)
-
-
-def _invisible_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
-    points, visible = data["object_points"], data["object_visibilities"]
-    findings = []
+    findings = case.findings
+    points, visible, valid = data["object_points"], data["object_visibilities"], data["object_motions_valid"]
     moved = np.argwhere(~visible & (points != 0).any(axis=2))
     if len(moved):
         findings.append(unusual(path, "object_points", "(0, 0, 0) is expected where a point is invisible", _place(moved)))
     below = np.argwhere(points[..., 2] > 0)
     if len(below):
-        depth = float(np.nanmax(points[..., 2]))
-        findings.append(
-            unusual(path, "object_points", "z <= 0 (on or above the table) is expected", f"z up to {depth:.4g} m, {_place(below)}")
-        )
-    empty = np.flatnonzero(~visible.any(axis=1))
-    if len(empty):
-        findings.append(
-            unusual(path, "object_visibilities", "a visible point in every frame is expected", f"none in frames {_list(empty)}")
-        )
-    return findings
-
-
-def _motion_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
-    visible, valid = data["object_visibilities"], data["object_motions_valid"]
-    key, findings = "object_motions_valid", []
+        received = f"z up to {float(np.nanmax(points[..., 2])):.4g} m, {_place(below)}"
+        findings.append(unusual(path, "object_points", "z <= 0 (on or above the table) is expected", received))
+    empty = np.flatnonzero(~visible.any(axis=1)).tolist()
+    if empty:
+        frames = ", ".join(map(str, empty[:8])) + (f", ... ({len(empty)} in all)" if len(empty) > 8 else "")
+        rule = "a visible point in every frame is expected"
+        findings.append(unusual(path, "object_visibilities", rule, f"none in frames {frames}"))
     if valid[-1].any():
         rule = "the last row has no next frame and must be all False"
-        findings.append(unusual(path, key, rule, f"{int(valid[-1].sum())} True"))
+        findings.append(unusual(path, "object_motions_valid", rule, f"{int(valid[-1].sum())} True"))
     unseen = np.argwhere(valid[:-1] & ~(visible[:-1] & visible[1:]))
     if len(unseen):
         rule = "a valid motion from t to t+1 requires the point to be visible in both frames"
-        findings.append(broken(path, key, rule, _place(unseen)))
-    return findings
-
-
-def _rest_state_findings(path: Path, data: dict[str, np.ndarray]) -> list[Finding]:
-    """Duplicates and order of the frame-0 points. Duplicates would make springs without length."""
-    rest = data["object_points"][0]
-    key, findings = "object_points", []
-    duplicates = len(rest) - len(np.unique(rest, axis=0))
+        findings.append(broken(path, "object_motions_valid", rule, _place(unseen)))
+    rest = points[0]
+    duplicates = len(rest) - len(np.unique(rest, axis=0))  # springs between them would have no length
     if duplicates:
-        findings.append(unusual(path, key, "the points of frame 0 are expected to differ", f"{duplicates} duplicates"))
-    order = np.lexsort(rest.T[::-1])
-    if not np.array_equal(rest[order], rest, equal_nan=True):
-        findings.append(
-            unusual(path, key, "columns are expected in lexicographic order of their frame-0 coordinates", "another order")
-        )
-    return findings
+        findings.append(unusual(path, "object_points", "the points of frame 0 are expected to differ", f"{duplicates} duplicates"))
+    if not np.array_equal(rest[np.lexsort(rest.T[::-1])], rest, equal_nan=True):
+        rule = "columns are expected in lexicographic order of their frame-0 coordinates"
+        findings.append(unusual(path, "object_points", rule, "another order"))
+    controllers = data["controller_points"].shape[1]
+    if controllers != CONTROLLERS:
+        findings.append(unusual(path, "controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
+    return dict(data)
 
 
 def _place(rows: np.ndarray) -> str:
     return f"frame {rows[0][0]}, point {rows[0][1]} ({len(rows)} in all)"
-
-
-def _list(values: np.ndarray, most: int = 8) -> str:
-    return ", ".join(str(int(v)) for v in values[:most]) + (f", ... ({len(values)} in all)" if len(values) > most else "")
-
-
-def _check_metadata(case: Inspection, frames: int | None) -> None:
-    path = case.folder / phystwin.METADATA
-    metadata = case.load_optional(path, load_json, "the check of intrinsics and frame rate is")
-    if metadata is None:
-        return
-    case.findings += phystwin.frame_rate_findings(path, metadata)
-    if not isinstance(metadata, dict):
-        return
-    if "fps" not in metadata:
-        case.findings.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
-    if frames is not None and metadata.get("frame_num", frames) != frames:
-        case.findings.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
-    case.findings += metadata_findings(path, metadata, CAMERAS)
-
-
-def _check_results(inspection: Inspection, case: Released, data: dict[str, np.ndarray] | None) -> None:
-    """Searched parameters, checkpoint and prediction, where they are there; a missing file skips the checks that need it."""
-    if case.parameters.exists() and (parameters := inspection.load(case.parameters, load_pickle)) is not None:
-        inspection.findings += parameter_findings(case.parameters, parameters)
-    if case.checkpoint.exists():
-        inspection.load(case.checkpoint, read_checkpoint)
-    if data is None or not case.prediction.exists():
-        return
-    positions = inspection.load(case.prediction, load_pickle)
-    if positions is not None:
-        frames, points = data["object_visibilities"].shape
-        nodes = points + len(data["surface_points"]) + len(data["interior_points"])
-        inspection.findings += prediction_findings(case.prediction, positions, frames, nodes)

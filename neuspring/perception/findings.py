@@ -16,8 +16,16 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.findings import Finding, Level, finding
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.plausible_masks import REMEDY, Shown, mask_findings
-from neuspring.data.plausible_world import Sample, depth_findings, hand_findings, place_findings, sampled
+from neuspring.data.plausible import (
+    REMEDY,
+    Sample,
+    Shown,
+    depth_findings,
+    hand_findings,
+    mask_findings,
+    place_findings,
+    sampled,
+)
 from neuspring.perception.frames import frames_of, gray, spread
 from neuspring.perception.results import LiftedTracks, ShapePrior
 

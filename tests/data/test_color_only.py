@@ -14,7 +14,7 @@ from neuspring.data.check import check_layout
 from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
-from neuspring.data.plausible_world import on_table
+from neuspring.data.plausible import on_table
 from neuspring.perception import segment_opencv
 from neuspring.perception.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.perception.annotate.tracks import TracksMode, tracks_of

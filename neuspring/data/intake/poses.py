@@ -30,7 +30,7 @@ from neuspring.data.intake.depth import (
 )
 from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, open_images
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from neuspring.data.plausible_world import color_alone_findings, table_findings
+from neuspring.data.plausible import color_alone_findings, table_findings
 
 FEWEST = 5
 """Frames of a capture."""
@@ -264,7 +264,7 @@ def stand(
     """Given poses against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
-    the table is elsewhere, with what explains it; see `plausible.table`.
+    the table is elsewhere, with what explains it; see `plausible`.
     """
     clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
     moved, motion, lines, tables = dict(poses), np.eye(4), list[str](), dict[str, Plane]()
@@ -301,7 +301,7 @@ def stand(
 def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamera], where: Path) -> Placed:
     """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
 
-    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible.table`.
+    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible`.
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"

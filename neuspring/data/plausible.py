@@ -6,13 +6,14 @@
 - Cameras against each other: a point that camera A measured is projected into camera B. Where B measured more depth there, B looked
   through it: one of the poses is wrong. Less depth is no contradiction: something may hide the point from B. Only what stands out
   of the table counts, because a table that is moved along itself looks the same.
+- The masks of one camera over the video: whether object and hands are there, whole, and change no faster than bodies do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import cv2
@@ -50,13 +51,8 @@ class Stand:
     off: float
     """Height of its points above z = 0 along up, m."""
 
-    @property
-    def good(self) -> bool:
-        """Whether it is z = 0."""
-        return self.tilt < TILT and abs(self.off) < OFF
-
     def near(self, height: float) -> bool:
-        """Whether it is so after a change; `height` is the camera's above the plane, m."""
+        """Whether it is z = 0 after a change that explains a finding; `height` is the camera's above the plane, m."""
         return self.tilt < EXPLAINED[0] and abs(self.off) < max(EXPLAINED[1], EXPLAINED[1] * height)
 
 
@@ -74,10 +70,13 @@ def table_findings(path: Path, name: str, planes: Sequence[Plane], pose: np.ndar
     candidates = [plane for plane in planes if plane.share >= SMALLEST]
     if not candidates:
         return [note(path, f"camera {name} sees no plane in depth: z = 0 and up are not checked against the table")]
-    table = min(candidates, key=lambda plane: _cost(stand(plane, pose, sign)))
-    standing = stand(table, pose, sign)
-    if standing.good:
-        found = [note(path, f"camera {name}: the table is {_text(standing)}; plane: {table.text()}")]
+    stands = [stand(plane, pose, sign) for plane in candidates]
+    standing = min(stands, key=lambda one: one.tilt / TILT + abs(one.off) / OFF)
+    table = candidates[stands.index(standing)]
+    side = "above" if standing.off > 0 else "below"
+    where_it_is = f"{1e3 * abs(standing.off):.0f} mm {side} z = 0 and tilted by {standing.tilt:.1f} degrees; plane: {table.text()}"
+    if standing.tilt < TILT and abs(standing.off) < OFF:
+        found = [note(path, f"camera {name}: the table is {where_it_is}")]
         if table.height > HIGHEST:
             rule = f"{where}: a camera should be at most {HIGHEST:g} m above the table"
             next_move = f"{table.height:.2f} m. Check depth_unit: ten times too large makes all of the scene so"
@@ -87,21 +86,11 @@ def table_findings(path: Path, name: str, planes: Sequence[Plane], pose: np.ndar
         explained = _explained(path, name, plane, pose, up, unit)
         if explained:
             return [explained]
-    moved = f"{_text(standing)}; plane: {table.text()}"
     if standing.tilt > TILTED or abs(standing.off) > FAR_OFF:
         remedy = "Calibrate again, or let `neuspring make-capture --level` put it there"
-        return [broken(path, where, "the table that the camera sees must be z = 0", f"{moved}. {remedy}")]
+        return [broken(path, where, "the table that the camera sees must be z = 0", f"{where_it_is}. {remedy}")]
     remedy = "`neuspring make-capture --level` puts the table at z = 0"
-    return [unusual(path, where, "the table that the camera sees should be z = 0", f"{moved}. {remedy}")]
-
-
-def _cost(standing: Stand) -> float:
-    return standing.tilt / TILT + abs(standing.off) / OFF
-
-
-def _text(standing: Stand) -> str:
-    side = "above" if standing.off > 0 else "below"
-    return f"{1e3 * abs(standing.off):.0f} mm {side} z = 0 and tilted by {standing.tilt:.1f} degrees"
+    return [unusual(path, where, "the table that the camera sees should be z = 0", f"{where_it_is}. {remedy}")]
 
 
 def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Finding | None:
@@ -116,13 +105,11 @@ def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, u
         return broken(path, "up", rule, f"{up}, by which camera {name} is {abs(height):.0f} mm below the table")
     for factor in FACTORS:
         if stand(plane, pose, sign, 1 / factor).near(pose[2, 3]):
-            what = "depth_unit" if unit is not None else f"depth of camera {name}"
-            now = (
-                f"{unit:g}, which makes it {factor:g} times as far. Plausible would be {unit / factor:g}"
-                if unit
-                else f"{factor:g} times"
-            )
-            return broken(path, what, f"the table must be as far from camera {name} as its pose says", now)
+            rule = f"the table must be as far from camera {name} as its pose says"
+            if unit is None:
+                return broken(path, f"depth of camera {name}", rule, f"{factor:g} times")
+            plausible = f"Plausible would be {unit / factor:g}"
+            return broken(path, "depth_unit", rule, f"{unit:g}, which makes it {factor:g} times as far. {plausible}")
     variants: Mapping[str, np.ndarray] = {
         "a world-to-camera matrix. Invert it": rigid_inverse(pose),
         "a matrix for OpenGL's axes (y up, z backward). Change the signs of its second and third column": pose @ OPENGL,
@@ -269,7 +256,6 @@ def reach_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Findin
     return [finding("hand far from the object", "warning", f"camera {camera.name}", value, rule, remedy)]
 
 
-NAME = "size of the object"
 POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."
 
 
@@ -327,7 +313,7 @@ def size_findings(camera: Camera, mask: np.ndarray) -> list[Finding]:
     text = " x ".join(f"{100 * side:.0f}" for side in sides)
     value = f"color alone: table z = 0 as given, object size on the table {text} cm"
     return [
-        finding(NAME, "note", where, value, "by its mask of frame 0", "Is that what was filmed?"),
+        finding("size of the object", "note", where, value, "by its mask of frame 0", "Is that what was filmed?"),
         *implausible(where, sides[0]),
     ]
 
@@ -379,8 +365,7 @@ def _compare(a: Camera, depth_a: np.ndarray, b: Camera, depth_b: np.ndarray, up:
     y, x = np.nonzero(depth_a[::STRIDE, ::STRIDE] > 0)
     pixels = STRIDE * np.stack([x, y], axis=-1)
     points = a.lift(pixels.astype(float), depth_a[pixels[:, 1], pixels[:, 0]])
-    height = sign * points[:, 2]
-    points = points[(height > RISEN) & (height < TALLEST)]
+    points = points[(sign * points[:, 2] > RISEN) & (sign * points[:, 2] < TALLEST)]
     seen, distance = b.project(points)
     visible = (distance > 0.05) & b.sees(seen)
     column, row = np.round(seen[visible]).astype(int).T
@@ -390,3 +375,128 @@ def _compare(a: Camera, depth_a: np.ndarray, b: Camera, depth_b: np.ndarray, up:
     # At the outline of a thing a pixel beside the point sees past it: B looked through the point if all pixels around it did.
     nearest = cv2.erode(np.where(depth_b > 0, depth_b, np.inf).astype(np.float32), np.ones((3, 3), np.uint8))[row, column]
     return int(valid.sum()), float((nearest - expected > FREE)[valid].mean())
+
+
+APART = 0.1
+"""Distance between two pieces of one label, as a fraction of the image, from which they count as two objects."""
+SECOND = 0.3
+"""A piece with at least this fraction of the largest piece's area counts as an object."""
+LEAVES = 0.1
+"""Fraction of its area in frame 0 below which an object has left the view."""
+SMALL_MASK = 200
+"""Pixels of the object in frame 0."""
+EDGE = 3
+"""Pixels of the object on the image border from which it may go on outside."""
+CUT = 0.1
+"""Share of the frames from which an object at the border counts as cut off; frame 0 alone does, where its shape is taken."""
+BORDERED = 0.1
+"""Part of the image's border that is object, median over frames, from which the mask shows the background or a person."""
+JUMP = 2.0
+"""Ratio of the object's areas in neighboring frames: no body grows that fast."""
+STEP, STEPS, FEWEST_STEPS = 1.5, 0.1, 3
+"""A smaller such ratio, and the part and number of frames with it from which a mask flickers: what is hidden once and comes back
+jumps twice."""
+FLOOR = 1e-4
+"""Part of the image by which areas are enlarged before they are divided: a few pixels of a hidden object are no jump."""
+REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose another perception.segment.backend."
+
+
+class Shown:
+    """What the masks of one camera show, counted frame by frame."""
+
+    def __init__(self, frames: int, size: tuple[int, int]) -> None:
+        """Nothing so far, of images of `size` (width, height)."""
+        self.size = size
+        self.objects = 0
+        """Objects in frame 0."""
+        self.areas = np.full((3, frames), np.nan)
+        """Pixels of each label [3, T]; NaN without a mask."""
+        self.rims = np.full(frames, np.nan)
+        """Pixels of the object on the image border [T]."""
+
+    def see(self, frame: int, labels: np.ndarray) -> None:
+        """Count the mask [H, W] of a frame."""
+        self.areas[:, frame] = np.bincount(labels.ravel(), minlength=3)[:3]
+        own = labels == OBJECT
+        self.rims[frame] = own[0].sum() + own[-1].sum() + own[1:-1, 0].sum() + own[1:-1, -1].sum()
+        if frame == 0:
+            # Pieces count as one object if they meet when they are grown by half of APART.
+            reach = max(int(0.5 * APART * max(labels.shape)), 1)
+            disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
+            count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
+            sizes = np.bincount(pieces[own], minlength=count)[1:]
+            self.objects = int((sizes >= SECOND * sizes.max()).sum()) if len(sizes) else 0
+
+    @property
+    def frames(self) -> np.ndarray:
+        """Frames with a mask."""
+        return np.flatnonzero(np.isfinite(self.rims))
+
+    @property
+    def bordered(self) -> float:
+        """Part of the image's border that is object, median over frames."""
+        return float(np.median(self.rims[self.frames])) / (2 * sum(self.size) - 4) if len(self.frames) else 0.0
+
+    def ratios(self) -> dict[int, float]:
+        """Ratio of the object's areas, 1 or more, in a frame and the one before it; of frames that follow each other."""
+        grown = self.areas[OBJECT] + FLOOR * self.size[0] * self.size[1]
+        return {b: float(max(grown[a] / grown[b], grown[b] / grown[a])) for a, b in pairwise(self.frames.tolist()) if b == a + 1}
+
+    @property
+    def steps(self) -> float:
+        """Part of the frames with a ratio above STEP; 0 where there are fewer than FEWEST_STEPS."""
+        ratios = self.ratios().values()
+        count = sum(ratio > STEP for ratio in ratios)
+        return count / len(ratios) if count >= FEWEST_STEPS else 0.0
+
+
+def mask_findings(camera: str, shown: Shown) -> list[Finding]:
+    """Findings about the masks of one camera. Without a mask of frame 0 nothing is said of it."""
+    area, hands, found = shown.areas[OBJECT], shown.areas[HANDS], list[Finding]()
+    if not len(shown.frames):
+        return found
+
+    def say(name: str, value: str, rule: str, remedy: str = REMEDY) -> None:
+        found.append(finding(name, "warning", f"camera {camera}", value, rule, remedy))
+
+    if area[0] == 0:
+        say("no object in frame 0", "no pixel with label 1 in frame 0", "shape and points begin there")
+    if hands[0] == 0:
+        rule = "controllers begin in frame 0, with what some camera shows of the hands there"
+        say("no hand in frame 0", "no pixel with label 2 in frame 0", rule, "Begin the capture when a hand is in view, or mark it.")
+    if shown.objects > 1:
+        value = f"the object's mask of frame 0 has {shown.objects} pieces far apart"
+        say("two objects", value, "one object is expected, whose pieces lie together; two become one twin")
+    if 0 < area[0] < SMALL_MASK:
+        say(
+            "small object",
+            f"{area[0]:.0f} pixels of object in frame 0",
+            f"at least {SMALL_MASK} are expected",
+            "Film from nearer by.",
+        )
+    gone = shown.frames[area[shown.frames] < np.fmax(LEAVES * np.nan_to_num(area[0]), 1)]
+    if len(gone) and area[0] != 0:
+        value = f"almost nothing of the object in {len(gone)} frames, first in frame {gone[0]}"
+        say("object missing", value, "each frame should show it; its points are invisible there")
+    cut = shown.frames[shown.rims[shown.frames] >= EDGE]
+    if shown.bordered > BORDERED:
+        value = f"{shown.bordered:.0%} of the image's border is object"
+        rule = f"at most {BORDERED:.0%} is expected; the mask holds the table, a sleeve or a person"
+        say("background in the mask", value, rule)
+    elif len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames)):
+        value = f"the object touches the image border in {len(cut)} frames, first in frame {cut[0]}"
+        back = "move the camera back, or keep other frames (make-capture --frames)"
+        say(
+            "object at the border",
+            value,
+            "what is outside is neither seen nor carved",
+            f"Is it the object? Then {back}. If not, mark what it is.",
+        )
+    if shown.steps > STEPS:
+        value = f"the object's area changes {STEP:g}-fold or more in {shown.steps:.0%} of the frames"
+        say("mask flickers", value, f"at most {STEPS:.0%} are expected")
+    elif wild := {frame: ratio for frame, ratio in shown.ratios().items() if ratio > JUMP}:
+        frame, ratio = next(iter(wild.items()))
+        value = f"the object's area changes {ratio:.1f}-fold from frame {frame - 1} to {frame} (so in {len(wild)} frames)"
+        say("mask jumps", value, f"less than {JUMP:g}-fold is expected")
+    return found
