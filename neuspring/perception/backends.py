@@ -74,7 +74,7 @@ BACKENDS = {
     "segment": {
         "given": Backend(module="neuspring.perception.segment_given", given=True),
         "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv", given=True),
-        "marks": Backend(module="neuspring.perception.segment_marks", section="marks", given=True),
+        "marks": Backend(module="neuspring.perception.marks.store", section="marks", given=True),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },
     "track": {

@@ -71,8 +71,12 @@ def grips(labels: np.ndarray, filled: np.ndarray, reach: float, apart: float, le
     found = [one for one in found if len(one) >= 0.1 * largest]
     if np.isinf(length):
         return found
-    along = along_arms(hands)
-    return [_near_tip(one, along[one[:, 1], one[:, 0]], length) for one in found]
+    held, distance = [], along_arms(hands)
+    for one in found:
+        along = distance[one[:, 1], one[:, 0]]
+        from_tip = np.linalg.norm(one - one[int(along.argmax())], axis=1)
+        held.append(one[from_tip <= length] if along.any() else one)
+    return held
 
 
 def along_arms(hands: np.ndarray) -> np.ndarray:
@@ -99,14 +103,6 @@ def along_arms(hands: np.ndarray) -> np.ndarray:
     return distance
 
 
-def _near_tip(piece: np.ndarray, along: np.ndarray, length: float) -> np.ndarray:
-    """Pixels of a grip [n, 2] within `length` of its tip, for their distances along the arm [n]."""
-    if not along.any():
-        return piece
-    tip = piece[int(along.argmax())]
-    return np.asarray(piece[np.linalg.norm(piece - tip, axis=1) <= length])
-
-
 def follow_hands(capture: Capture, camera: str, labels: np.ndarray, held: list[np.ndarray], radius: float) -> HandMotion:
     """Follow the grips `held` of frame 0 through all frames; labels [T, H, W]. Corners lie within `radius` px of the grip."""
     hands = [_follow(capture, camera, labels, grip.mean(axis=0), radius) for grip in held]
@@ -128,15 +124,16 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
     key, start = poses[0], _corners(before, labels[0], center, radius)
     points = start
     for frame in range(1, frames):
-        poses[frame] = _as_before(poses, frame)
+        # A hand that is not followed goes on as it went, half as fast.
+        step = poses[frame - 1] - poses[frame - 2] if frame > 1 else np.zeros(4)
+        poses[frame] = poses[frame - 1] + 0.5 * step * [1.0, 1.0, 0.0, 0.0]
         if not capture.has(camera, frame):
             continue
         now = _hand_image(capture, camera, labels, frame)
         if len(points):
             points, ok = _flow(before, now, points)
             start, points = start[ok], points[ok]
-        fit = _similarity(start, points)
-        pose = None if fit is None else _moved(key, *fit)
+        pose = _similarity(key, start, points)
         if pose is not None and 1 / LARGEST_STEP < pose[3] / poses[frame - 1, 3] < LARGEST_STEP:
             poses[frame] = pose
         else:
@@ -147,14 +144,6 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
             points = start
         before = now
     return poses, lost
-
-
-def _as_before(poses: np.ndarray, frame: int) -> np.ndarray:
-    """Where a hand is that was not followed: it goes on as it went, half as fast."""
-    step = poses[frame - 1] - poses[frame - 2] if frame > 1 else np.zeros(4)
-    guess = poses[frame - 1] + 0.5 * step
-    guess[2:] = poses[frame - 1, 2:]
-    return np.asarray(guess)
 
 
 def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -> np.ndarray:
@@ -185,17 +174,13 @@ def _flow(before: np.ndarray, now: np.ndarray, points: np.ndarray) -> tuple[np.n
     return np.asarray(moved), ok
 
 
-def _similarity(start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float, float] | None:
-    """(matrix [2, 3], angle, size) of the similarity from corners of the key frame to their present places; None: too few agree."""
+def _similarity(key: np.ndarray, start: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+    """What the similarity from corners of the key frame to their present places makes of its pose [4]; None: too few agree."""
     if len(start) < LEAST:
         return None
     # OpenCV's RANSAC begins with the same seed in every call.
     matrix, agree = cv2.estimateAffinePartial2D(start, points, method=cv2.RANSAC, ransacReprojThreshold=1.5)
     if matrix is None or agree.sum() < LEAST:
         return None
-    return matrix, float(np.arctan2(matrix[1, 0], matrix[0, 0])), float(np.hypot(matrix[0, 0], matrix[1, 0]))
-
-
-def _moved(key: np.ndarray, matrix: np.ndarray, angle: float, size: float) -> np.ndarray:
-    """The pose that a similarity makes of that of the key frame."""
+    angle, size = float(np.arctan2(matrix[1, 0], matrix[0, 0])), float(np.hypot(matrix[0, 0], matrix[1, 0]))
     return np.array([*(matrix[:, :2] @ key[:2] + matrix[:, 2]), key[2] + angle, key[3] * size])

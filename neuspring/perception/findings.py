@@ -146,8 +146,6 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
 
 def look_at_tracks(camera: str, labels: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> list[Finding]:
     """Findings about tracks: pixels [T, Q, 2] and visible [T, Q], with the masks' labels [T, H, W]."""
-    if not pixels.shape[1]:
-        return []
     x, y = np.round(pixels[0]).astype(int).T
     own = labels[0][y, x] == OBJECT
     if not own.any():
@@ -157,13 +155,19 @@ def look_at_tracks(camera: str, labels: np.ndarray, pixels: np.ndarray, visible:
         value, rule = f"{own.sum()} points are followed on the object", f"at least {TRACKS} are expected"
         remedy = "Film from nearer by, or raise points of perception.track."
         found.append(finding("few tracks", "warning", where, value, rule, remedy))
-    alive = visible[:, own].mean(axis=1)
-    if low := np.flatnonzero(alive < FOLLOWED).tolist():
-        value = f"{alive.min():.0%} of the object's points are followed in frame {int(alive.argmin())}; few in {len(low)} frames"
+    value, low = _few(visible[:, own], FOLLOWED, "followed")
+    if low:
         level: Level = "warning" if len(low) >= OFTEN * len(visible) else "note"
         remedy = f"Look at tracks.png; end the capture before frame {low[0]}, use more light or shorter exposures, or cotracker3."
         found.append(finding("tracks lost", level, where, value, f"at least {FOLLOWED:.0%} are expected in every frame", remedy))
     return found
+
+
+def _few(visible: np.ndarray, least: float, what: str) -> tuple[str, list[int]]:
+    """What to say of the frames in which fewer points [T, n] are visible than a share, and these frames."""
+    alive = visible.mean(axis=1)
+    low = np.flatnonzero(alive < least).tolist()
+    return f"{alive.min():.0%} of the object's points are {what} in frame {int(alive.argmin())}; few in {len(low)} frames", low
 
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
@@ -175,7 +179,7 @@ def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: Im
 def look_at_observations(observations: Observations) -> list[Finding]:
     """Findings about what every method reads. Errors are what no method can work with."""
     where, nodes, scenario = "observations", observations.nodes, observations.scenario
-    found = [*_hands(observations.controller_points, observations)]
+    found = _hands(observations.controller_points, observations)
     if len(nodes) < NODES[0]:
         value, rule = f"{len(nodes)} structure points", f"at least {NODES[0]} are needed to deform"
         remedy = "Lower perception.sample.voxel, or give the object more pixels."
@@ -228,9 +232,8 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
         value = f"in frame {frame} a hand comes back to another part of the object"
         rule = "springs of hands are made for their place in frame 0, so nothing moves the twin there"
         found.append(finding("grip elsewhere", "warning", "controllers", value, rule, f"End the capture before frame {frame}."))
-    alive = lifted.object_visibility.mean(axis=1)
-    if (low := np.flatnonzero(alive < SEEN)).size:
-        value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
+    value, low = _few(lifted.object_visibility, SEEN, "seen")
+    if low:
         rule = f"at least {SEEN:.0%} are expected in every frame"
         found.append(finding("points lost", "warning", where, value, rule, f"End the capture before frame {low[0]}. {remedy}"))
     return found
@@ -239,9 +242,8 @@ def _motion(lifted: LiftedTracks) -> list[Finding]:
 def _in_image(image: ImageObservations) -> list[Finding]:
     """Points of the object that are lost in the image, and hands that were not followed."""
     found = []
-    alive = image.visible[: len(image.inside)].mean(axis=1)
-    if (low := np.flatnonzero(alive < SEEN)).size:
-        value = f"{alive.min():.0%} of the object's points are seen in frame {int(alive.argmin())}; few in {low.size} frames"
+    value, low = _few(image.visible[: len(image.inside)], SEEN, "seen")
+    if low:
         rule = f"at least {SEEN:.0%} are expected in every training frame; silhouettes alone say where the object is in the others"
         found.append(finding("points lost", "warning", "tracks", value, rule, "Look at tracks.png."))
     if image.hand_sizes.max() > RESIZED or image.hand_sizes.min() < 1 / RESIZED:
@@ -255,7 +257,13 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
     """Controllers [T, C, 3] that hold nothing, never come near, stand still, or are faster than hands are."""
     where, found, rate = "controllers", [], observations.scenario.frame_rate
     remedy = "Masks may take something else for a hand: look at masks.png; perception.lift has grip and grip_reach."
-    apart = np.array([_nearest(observations, controllers, frame) for frame in range(len(controllers))])
+    # Distances [T, C] of controllers from the nearest point of the object that is seen; in frame 0 from all nodes.
+    apart = np.full(controllers.shape[:2], np.inf)
+    for frame, own in enumerate(controllers):
+        shown = observations.object_points[frame, observations.object_visibility[frame]]
+        points = observations.nodes if frame == 0 else shown
+        if len(points):
+            apart[frame] = cKDTree(points).query(own)[0]
     nearest = apart.min(axis=1)
     if nearest.min() > APART:
         value = f"the hand is never nearer to the object than {100 * nearest.min():.0f} cm"
@@ -290,12 +298,3 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
         remedy = f"frame_rate ({rate:g}/s) or depth_unit of capture.json may be wrong, or a hand's tracks jump."
         found.append(finding("controllers too fast", "warning", where, value, rule, remedy))
     return found
-
-
-def _nearest(observations: Observations, controllers: np.ndarray, frame: int) -> np.ndarray:
-    """Distance of each controller [C] from the nearest point of the object in a frame; from all nodes in frame 0."""
-    shown = observations.object_points[frame, observations.object_visibility[frame]]
-    points = observations.nodes if frame == 0 else shown
-    if not len(points):
-        return np.full(controllers.shape[1], np.inf)
-    return np.asarray(cKDTree(points).query(controllers[frame])[0])

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.perception.controllers import Body, Holding, choose_controllers, holding
+from neuspring.perception.controllers import ALWAYS, Body, choose_controllers, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
@@ -70,12 +70,16 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
-    holds = _holds(capture, cameras, labels, controllers, hands, objects, settings)
-    if len(holds.valid):
-        first = float(np.flatnonzero(~holds.valid.all(axis=1))[0])
-        facts |= {"controllers_let_go": float((~holds.valid).any(axis=0).sum()), "first_let_go": first}
-    if holds.elsewhere is not None:
-        facts["grip_elsewhere"] = float(holds.elsewhere)
+    holds, elsewhere = ALWAYS, None
+    if settings.release is not None:
+        body, in_view = _body(capture, cameras, labels, objects)
+        seen = (hands.points, hands.visible)
+        holds, elsewhere = holding(controllers, seen, body, in_view, settings.release)
+    if len(holds):
+        first = float(np.flatnonzero(~holds.all(axis=1))[0])
+        facts |= {"controllers_let_go": float((~holds).any(axis=0).sum()), "first_let_go": first}
+    if elsewhere is not None:
+        facts["grip_elsewhere"] = float(elsewhere)
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),
@@ -88,7 +92,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         object_motion_valid=valid,
         object_colors=objects.colors,
         controller_points=controllers,
-        controller_valid=holds.valid,
+        controller_valid=holds,
         cloud=cloud,
         cloud_colors=colors,
         backend="released" if settings.released else "vectorised",
@@ -96,19 +100,10 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     )
 
 
-def _holds(
-    capture: Capture,
-    cameras: Mapping[str, Camera],
-    labels: Mapping[str, np.ndarray],
-    controllers: np.ndarray,
-    hands: Seen,
-    objects: Seen,
-    settings: Lift,
-) -> Holding:
-    """When controllers hold. Depth is read again only if hands can let go."""
-    if settings.release is None:
-        none = Body([], [], objects.points, objects.visible)
-        return holding(controllers, (hands.points, hands.visible), none, np.zeros(0), settings)
+def _body(
+    capture: Capture, cameras: Mapping[str, Camera], labels: Mapping[str, np.ndarray], objects: Seen
+) -> tuple[Body, np.ndarray]:
+    """What says when hands hold, and whether any mask shows a hand [T]. Depth is read again."""
     clouds: dict[int, list[np.ndarray]] = {OBJECT: [], HANDS: []}
     for frame in range(capture.train_end):
         depths = {name: capture.depth(name, frame) for name in cameras if capture.has(name, frame)}
@@ -119,8 +114,7 @@ def _holds(
                 seen.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
             own.append(np.concatenate(seen))
     in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    body = Body(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible)
-    return holding(controllers, (hands.points, hands.visible), body, in_view, settings)
+    return Body(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible), in_view
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:

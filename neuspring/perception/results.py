@@ -69,11 +69,9 @@ class ShapePrior(_Result):
 
 def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:
     """Masks by camera, from records in the capture's order. Raises InputError for too few and for masks of another size."""
-    if len(records) != len(capture.cameras):
-        raise InputError("--masks", f"one record per camera is required: {list(capture.cameras)}", len(records))
     by_camera = {}
-    for (name, camera), path in zip(capture.cameras.items(), records, strict=True):
-        masks = Masks.load(StageRecord.load(path).file("masks", path))
+    for name, path in _record_of(capture, records, "--masks").items():
+        masks, camera = Masks.load(StageRecord.load(path).file("masks", path)), capture.cameras[name]
         shape = (capture.frame_count, camera.height, camera.width)
         if masks.labels.shape != shape:
             remedy = f"Delete {path} and run again."
@@ -84,9 +82,11 @@ def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Mas
 
 def tracks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, PixelTracks]:
     """Tracks by camera, from records in the capture's order. Raises InputError for too few."""
+    by_camera = _record_of(capture, records, "--tracks")
+    return {name: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for name, path in by_camera.items()}
+
+
+def _record_of(capture: Capture, records: Sequence[Path], option: str) -> dict[str, Path]:
     if len(records) != len(capture.cameras):
-        raise InputError("--tracks", f"one record per camera is required: {list(capture.cameras)}", len(records))
-    return {
-        name: PixelTracks.load(StageRecord.load(path).file("tracks", path))
-        for name, path in zip(capture.cameras, records, strict=True)
-    }
+        raise InputError(option, f"one record per camera is required: {list(capture.cameras)}", len(records))
+    return dict(zip(capture.cameras, records, strict=True))

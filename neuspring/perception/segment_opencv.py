@@ -22,7 +22,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.perception.frames import frames_of, gray, heights, spread
 from neuspring.perception.marks.colors import bins_of, count, lab_of
-from neuspring.perception.marks.start import solve
+from neuspring.perception.marks.solve import solve
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""

@@ -9,7 +9,7 @@ With a user's marks (`carry`) SAM 2 starts from the masks of the marked frames, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,10 +62,11 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
         remedy = "Set perception.segment.grounded_sam2.prompt to other words for the object."
         raise InputError(where, rule, f"no {missing} among {[detection.words for detection in detections]}", remedy)
     labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
-    for frame, masks in zip(frames, propagate(images, detections, models, device), strict=True):
+    boxes = {"obj_ids": list(range(len(detections))), "input_boxes": [[list(detection.box) for detection in detections]]}
+    for index, logits in propagate(images, {0: boxes}, models, device).items():
         # Hands come last: they are in front of what they hold.
-        labels[frame][masks[np.logical_not(is_hand)].any(axis=0)] = OBJECT
-        labels[frame][masks[is_hand].any(axis=0)] = HANDS
+        labels[frames[index]][(logits[np.logical_not(is_hand)] > 0).any(axis=0)] = OBJECT
+        labels[frames[index]][(logits[is_hand] > 0).any(axis=0)] = HANDS
     return labels
 
 
@@ -91,7 +92,9 @@ def carry(
         # Hands come last: they are in front of what they hold.
         for column, label in enumerate((OBJECT, HANDS)):
             masks = {index: start == label for index, start in starts.items() if (start == label).any()}
-            for index, logits in carry_masks(images, masks, networks, device).items():
+            prompts = {index: {"obj_ids": [0], "input_masks": [mask]} for index, mask in masks.items()}
+            carried = propagate(images, prompts, networks, device, back=True) if prompts else {}
+            for index, (logits,) in carried.items():
                 labels[index][logits > 0] = label
                 near = np.abs(logits) < np.quantile(np.abs(logits[logits > 0]), 0.2) if (logits > 0).any() else logits > 0
                 unsure[index, column] = float((1 / (1 + np.exp(np.abs(logits[near])))).mean()) if near.any() else 0.0
@@ -100,22 +103,25 @@ def carry(
     return over_capture(capture, camera, marks, work)
 
 
-def carry_masks(images: list[np.ndarray], masks: dict[int, np.ndarray], models: Models, device: str) -> dict[int, np.ndarray]:
-    """Logits [H, W] by frame of one thing, from its masks [H, W] bool by frame: carried forward from the first, and back."""
+def propagate(
+    images: list[np.ndarray], prompts: Mapping[int, Mapping[str, Any]], models: Models, device: str, *, back: bool = False
+) -> dict[int, np.ndarray]:
+    """Logits [n, H, W] of n things by frame, carried from the first prompted frame on, and `back` from it.
+
+    `prompts` by frame are SAM 2's: `obj_ids` (0 to n - 1), and `input_boxes` or `input_masks`.
+    """
     import torch
 
-    size, logits = list(images[0].shape[:2]), {}
-    if not masks:
-        return {}
+    processor, size, logits = models.video_processor, list(images[0].shape[:2]), {}
     with torch.inference_mode():
-        session = models.video_processor.init_video_session(video=images, inference_device=device)
-        for index, mask in sorted(masks.items()):
-            models.video_processor.add_inputs_to_inference_session(session, frame_idx=index, obj_ids=[1], input_masks=[mask])
-            models.video(inference_session=session, frame_idx=index)
-        for reverse in (False, True):
-            for output in models.video.propagate_in_video_iterator(session, start_frame_idx=min(masks), reverse=reverse):
-                scaled = models.video_processor.post_process_masks([output.pred_masks], original_sizes=[size], binarize=False)[0]
-                logits[output.frame_idx] = scaled[0, 0].float().cpu().numpy()
+        session = processor.init_video_session(video=images, inference_device=device)
+        for frame, prompt in sorted(prompts.items()):
+            processor.add_inputs_to_inference_session(session, frame_idx=frame, **prompt)
+            models.video(inference_session=session, frame_idx=frame)
+        for reverse in (False, True) if back else (False,):
+            for output in models.video.propagate_in_video_iterator(session, start_frame_idx=min(prompts), reverse=reverse):
+                scaled = processor.post_process_masks([output.pred_masks], original_sizes=[size], binarize=False)[0]
+                logits[output.frame_idx] = scaled[:, 0].float().cpu().numpy()
     return logits
 
 
@@ -159,22 +165,3 @@ def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Model
     rows = zip(result["boxes"].tolist(), result["text_labels"], result["scores"].tolist(), strict=True)
     detections = [Detection(tuple(box), str(text), float(score)) for box, text, score in rows]
     return sorted(detections, key=lambda detection: -detection.score)
-
-
-def propagate(images: list[np.ndarray], detections: list[Detection], models: Models, device: str) -> list[np.ndarray]:
-    """Masks [detections, H, W] bool of every image."""
-    import torch
-
-    size = images[0].shape[:2]
-    masks = [np.zeros((len(detections), *size), dtype=bool) for _ in images]
-    processor = models.video_processor
-    with torch.inference_mode():
-        session = processor.init_video_session(video=images, inference_device=device)
-        boxes = [[list(detection.box) for detection in detections]]
-        processor.add_inputs_to_inference_session(session, frame_idx=0, obj_ids=list(range(len(detections))), input_boxes=boxes)
-        models.video(inference_session=session, frame_idx=0)
-        for output in models.video.propagate_in_video_iterator(session):
-            scaled = processor.post_process_masks([output.pred_masks], original_sizes=[list(size)], binarize=True)[0]
-            for place, detection in enumerate(session.obj_ids):
-                masks[output.frame_idx][detection] = scaled[place, 0].cpu().numpy().astype(bool)
-    return masks

@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuspring.config.perception import Lift
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.perception.controllers import ALWAYS, Body, Holding, holding
+from neuspring.perception.controllers import ALWAYS, Body, holding
 from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
 FRAMES = 30
-SETTINGS = Lift(release=0.05)
+RELEASE = 0.05
 
 
 @pytest.fixture(autouse=True)
@@ -37,26 +36,25 @@ def scene(away: np.ndarray):
     return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
 
 
-def grips(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> Holding:
+def grips(away: np.ndarray, train_end: int = FRAMES, **changes: np.ndarray) -> tuple[np.ndarray, int | None]:
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
     body = Body(list(bodies[:train_end]), list(points[:train_end]), bodies, changes.get("shown", shown))
-    return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, settings)
+    return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, RELEASE)
 
 
-def held(away: np.ndarray, settings: Lift = SETTINGS, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
-    found = grips(away, settings, train_end, **changes)
-    assert found.elsewhere is None
-    return found.valid
+def held(away: np.ndarray, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
+    valid, elsewhere = grips(away, train_end, **changes)
+    assert elsewhere is None
+    return valid
 
 
 def leaving(at: int) -> np.ndarray:
     return 0.03 * np.maximum(np.arange(FRAMES) - at, 0)
 
 
-def test_a_hand_that_stays_or_no_setting_holds_always():
+def test_a_hand_that_stays_holds_always():
     assert held(np.zeros(FRAMES)) is ALWAYS
-    assert held(leaving(10), Lift()) is ALWAYS
 
 
 def test_a_hand_that_goes_away_lets_go_and_the_other_holds_on():
@@ -106,13 +104,13 @@ def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_sam
     bodies = scene(away)[2]
     turned = bodies.copy()
     turned[15:, :60, 2] *= -1
-    found = grips(away, bodies=turned)
-    assert found.elsewhere == 20
-    assert not found.valid[20:, :2].any()
+    valid, elsewhere = grips(away, bodies=turned)
+    assert elsewhere == 20
+    assert not valid[20:, :2].any()
     # Without any followed point nobody knows.
     shown = np.ones(bodies.shape[:2], bool)
     shown[20, :60] = shown[20, 60:] = False
-    assert grips(away, shown=shown).elsewhere == 20
+    assert grips(away, shown=shown)[1] == 20
 
 
 def test_no_hold_is_taken_after_the_training_frames():
@@ -132,7 +130,7 @@ def test_a_hand_is_near_if_what_is_seen_of_it_is():
     controllers = points[:, [0, 3, 4]].copy()
     controllers[12:, :2] += 0.4
     body = Body(list(bodies), list(points), bodies, shown)
-    assert holding(controllers, (points, seen), body, in_view, SETTINGS).valid is ALWAYS
+    assert holding(controllers, (points, seen), body, in_view, RELEASE)[0] is ALWAYS
 
 
 def test_a_hand_out_of_view_lets_go_after_some_frames():

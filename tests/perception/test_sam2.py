@@ -123,10 +123,10 @@ def test_sam2_carries_boxes_through_the_video(capture):
     torch.manual_seed(0)
     model, processor = video_models()
     images = [capture.color("0", frame) for frame in range(FRAMES) if capture.has("0", frame)]
-    detections = [Detection((30.0, 20.0, 90.0, 70.0), "toy", 0.9), Detection((60.0, 5.0, 100.0, 40.0), "hand", 0.8)]
-    masks = segment_sam2.propagate(images, detections, Models(None, None, model, processor), "cpu")
-    assert len(masks) == FRAMES - 1
-    assert all(mask.shape == (2, 90, 160) and mask.dtype == bool for mask in masks)
+    boxes = {0: {"obj_ids": [0, 1], "input_boxes": [[[30.0, 20.0, 90.0, 70.0], [60.0, 5.0, 100.0, 40.0]]]}}
+    logits = segment_sam2.propagate(images, boxes, Models(None, None, model, processor), "cpu")
+    assert sorted(logits) == list(range(FRAMES - 1))
+    assert all(one.shape == (2, 90, 160) for one in logits.values())
 
 
 def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
@@ -135,19 +135,19 @@ def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
     marks = [mark("object", "polygon", [(40, 30), (90, 30), (90, 70), (40, 70)], frame=1)]
     marks.append(mark("hand", "box", [(60, 5), (100, 40)], frame=3))
     heard = []
-    carry_masks = segment_sam2.carry_masks
+    propagate = segment_sam2.propagate
 
-    def hear(images, masks, *rest):
-        result = carry_masks(images, masks, *rest)
-        heard.append((sorted(masks), sorted(result)))
+    def hear(images, prompts, *rest, **options):
+        result = propagate(images, prompts, *rest, **options)
+        heard.append((sorted(prompts), sorted(result)))
         return result
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(segment_sam2, "carry_masks", hear)
+        patch.setattr(segment_sam2, "propagate", hear)
         carried = segment_sam2.carry(capture, "0", marks, GroundedSam2(), "cpu", Models(None, None, model, processor))
     # Frame 2 is missing: frames 3 to 5 are the third to the fifth that there are.
     assert heard[0] == ([1], [0, 1, 2, 3, 4])
-    assert heard[1][0] in ([2], [])
+    assert [prompts for prompts, _ in heard[1:]] in ([[2]], [])
     assert carried.labels.shape == (FRAMES, 90, 160)
     assert not carried.labels[2].any()
     assert set(np.unique(carried.labels)) <= {0, 1, 2}
@@ -173,10 +173,10 @@ def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path, monkeypatch)
 
 def test_hands_lie_over_the_object_and_missing_frames_stay_empty(capture, monkeypatch):
     detections = [Detection((0.0, 0.0, 9.0, 9.0), "hand", 0.9), Detection((0.0, 0.0, 9.0, 9.0), "toy", 0.8)]
-    both = np.zeros((2, 90, 160), bool)
-    both[0, 10:20, 10:20] = both[1, 15:30, 15:30] = True
+    both = np.full((2, 90, 160), -1.0)
+    both[0, 10:20, 10:20] = both[1, 15:30, 15:30] = 1.0
     monkeypatch.setattr(segment_sam2, "detect", lambda *_: detections)
-    monkeypatch.setattr(segment_sam2, "propagate", lambda images, *_: [both] * len(images))
+    monkeypatch.setattr(segment_sam2, "propagate", lambda images, *_: dict.fromkeys(range(len(images)), both))
     labels = segment_sam2.segment(capture, "0", GroundedSam2(), "cpu", Models(None, None, None, None))
     assert labels.shape == (FRAMES, 90, 160)
     assert (labels[0][10:20, 10:20] == 2).all()

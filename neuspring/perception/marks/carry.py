@@ -24,8 +24,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.frames import frames_of, heights, overlap, spread
 from neuspring.perception.marks.colors import Background, apart, lab_of, mixed
 from neuspring.perception.marks.marks import Mark, Seeds, require_marks
-from neuspring.perception.marks.start import LABELS, MarkedFrame, start
-from neuspring.perception.marks.step import CarriedFrame, Pass
+from neuspring.perception.marks.solve import LABELS, CarriedFrame, MarkedFrame, Pass, start
 
 AROUND = 4
 """Frames before and after with whose median an area is compared."""

@@ -1,4 +1,5 @@
-"""Masks of a capture: kept in its folder mask/ with what they were made from, shown on a contact sheet, and compared with others.
+"""Masks of a capture: made from its marks (the backend `marks`), kept in its folder mask/ with what they were made from, shown on a
+contact sheet, and compared with others.
 
 marks = Marks.load(folder / MARKS)
 capture = Capture.load(folder)
@@ -20,13 +21,14 @@ import numpy as np
 
 from neuspring.config import parse, plain
 from neuspring.config.parse import STRICT, Name
+from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest
 from neuspring.perception.frames import frames_of, overlap, spread, write_png
-from neuspring.perception.marks.carry import Carried
-from neuspring.perception.marks.marks import Mark, marks_digest
+from neuspring.perception.marks.carry import Carried, carry_camera
+from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
 
 MADE = "masks.json"
 """What the masks of a capture were made from, and how far each frame is doubted; in its folder."""
@@ -37,6 +39,29 @@ EVEN, DOUBTFUL = 8, 8
 """How many frames are shown evenly over the video, and in doubt."""
 WIDTH = 424
 """Of a tile, pixels, at most."""
+
+
+def require(capture: Capture) -> None:
+    """Raise InputError if marks.json is not there, is wrong, or lacks a camera."""
+    for camera in capture.cameras:
+        _marks_of(capture, camera)
+
+
+def segment(capture: Capture, camera: str, settings: MarksSegmentation) -> np.ndarray:
+    """Labels [T, H, W]. Raises InputError without marks.json, or where it has no marks of this camera."""
+    carried = carry_camera(capture, camera, _marks_of(capture, camera), settings)
+    doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
+    print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
+    return carried.labels
+
+
+def _marks_of(capture: Capture, camera: str) -> tuple[Mark, ...]:
+    path = capture.folder / MARKS
+    marks = Marks.load(path)
+    marks.require(capture, path)
+    if not marks.of(camera):
+        raise InputError(f"{path}, cameras", f"camera {camera} needs marks", sorted(marks.cameras))
+    return marks.of(camera)
 
 
 def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
