@@ -150,9 +150,9 @@ def holding(
     body is known in the training frames: later a hand lets go only by leaving the view, and takes no hold.
 
     A hand lets go after a frame in which it was within `release`, m, of the body: as soon as it is seen farther away, or when no
-    hand was in view for RELEASE_AFTER frames. If it is near again fewer than RELEASE_AFTER frames later it has not let go. Later it takes
-    hold again, if the part of the body that it is near lay within `release` of its controllers in frame 0, where springs are made;
-    else it holds nothing any more.
+    hand was in view for RELEASE_AFTER frames. If it is near again fewer than RELEASE_AFTER frames later it has not let go. Later it
+    takes hold again, if the part of the body that it is near lay within `release` of its controllers in frame 0, where springs are
+    made; else it holds nothing any more.
     """
     points, seen = hands
     label = np.zeros(points.shape[1], dtype=int)
