@@ -79,8 +79,8 @@ def study(
 ) -> None:
     """Run records -> one of the paper's tables, beside the paper's values."""
     from neuspring.report.study import write_collected, write_study
+    from neuspring.scores.paper import read_studies
     from neuspring.scores.runs import read_scores
-    from neuspring.scores.studies import read_studies
 
     studies = read_studies(table)
     if study not in studies:
@@ -128,7 +128,7 @@ def report(
 ) -> None:
     """Results folder -> one self-contained HTML file."""
     from neuspring.report import page
-    from neuspring.scores.studies import read_studies
+    from neuspring.scores.paper import read_studies
 
     options = page.Options(
         scenarios=scenarios,

@@ -18,8 +18,8 @@ from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, read_scenarios
 from neuspring.perception.backends import BACKENDS
-from neuspring.scores.lpips_weights import configured
-from neuspring.scores.studies import read_studies
+from neuspring.scores.lpips import configured_weights
+from neuspring.scores.paper import read_studies
 
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
@@ -285,7 +285,7 @@ class Benchmark:
     def _require_data(self) -> None:
         if self.config.images.enabled:
             # Named weights that are missing or wrong are an error before the first job.
-            configured(self.config.images.lpips)
+            configured_weights(self.config.images.lpips)
         for name, row in self.scenarios.items():
             path = self.data_path(name)
             if path is None:

@@ -28,7 +28,7 @@ from neuspring.data.synthetic import toy
 from neuspring.experiments import needs
 from neuspring.experiments.tracking import store
 from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
-from neuspring.scores import lpips_weights
+from neuspring.scores import lpips
 from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.view import View
 from neuspring.twin.rollout import roll_out
@@ -172,8 +172,8 @@ def _weights(settings: Config) -> Iterator[Finding]:
     hub = hub_folder()
     checked = {
         "LPIPS (AlexNet)": (
-            lambda: lpips_weights.configured(settings.images.lpips),
-            f"{DOWNLOAD} {hub / lpips_weights.BACKBONE} {lpips_weights.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
+            lambda: lpips.configured_weights(settings.images.lpips),
+            f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
         "VGG16 (Spring-Gaus' features)": (
             lambda: vgg.find_weights(settings.baselines.spring_gaus.vgg16),

@@ -25,7 +25,7 @@ from neuspring.core.provenance import code_digest
 from neuspring.data.sources import SOURCES
 from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
-from neuspring.scores.lpips_weights import configured
+from neuspring.scores.lpips import configured_weights
 from neuspring.stages import STAGES
 from neuspring.stages.stage import Stage
 
@@ -333,7 +333,7 @@ class Graph:
             if "capture" in stage.inputs or stage.name == "capture":
                 parts.append(self._image_stamps(wildcards.scenario))
             if stage.name == "render":
-                parts.append("absent" if isinstance(configured(self.config.images.lpips), str) else "found")
+                parts.append("absent" if isinstance(configured_weights(self.config.images.lpips), str) else "found")
             if stage.name == "train" and self.pictured(wildcards):
                 method = self.benchmark.methods[wildcards.method]
                 parts.append(BASELINES[method.model or ""].features(section_of(config, method)))

@@ -23,7 +23,8 @@ from neuspring.report.blocks import Block, Fold, Items, Text, markdown
 from neuspring.report.draw.benchmark import CLUSTERS, RATIOS, cluster_methods, clusters_figure, ratios_figure
 from neuspring.report.notes import differing_table, honest_notes
 from neuspring.report.study_cells import LEAST_SCENARIOS, ORACLE_LINE
-from neuspring.scores import failures, ratios
+from neuspring.scores import failures
+from neuspring.scores import statistics as ratios
 from neuspring.scores.metrics import (
     COLUMNS,
     DASH,

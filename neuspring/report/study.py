@@ -58,8 +58,8 @@ from neuspring.scores.failures import (
     unknown_lines,
 )
 from neuspring.scores.metrics import DASH, IN_PAPER, IN_STUDIES, SHORT, Metric, averages, present
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import Collected, collect, mixed_settings, pairs
-from neuspring.scores.studies import Study
 
 RELEASED_METHODS = ("phystwin", "baseline")
 """Our methods that stand for the released PhysTwin."""

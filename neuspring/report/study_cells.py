@@ -15,10 +15,9 @@ import pandas as pd
 
 from neuspring.scores import paper
 from neuspring.scores.metrics import IN_PAPER, IN_STUDIES, Metric, averages, present
-from neuspring.scores.paper import Printed
+from neuspring.scores.paper import Printed, Study
 from neuspring.scores.runs import Collected, comparable
 from neuspring.scores.statistics import interval, resampled_means
-from neuspring.scores.studies import Study
 
 NOT_RUN, NOT_COMPUTED, NOTHING_TO_COMPARE = "not run", "not computed", "nothing to compare"
 OTHER_DATA, NO_VALUE, NO_INTERVAL = "other data", "not in the paper", "no interval"

@@ -1,9 +1,9 @@
-"""Numbers: metrics and their averages, the bootstrap, the paper's values, conformance with the released results.
+"""Numbers: metrics and their averages, how sure they are, the paper's values, conformance with the released results.
 
-- `metrics`: `METRICS` declares every metric; Chamfer distance, track error, averages.
-- `pictures`, `lpips`, `lpips_weights`: scores of pictures.
-- `statistics`: 95 % intervals and paired differences.
+- `metrics`: `METRICS` declares every metric; Chamfer distance, track error, averages; `carried`: points that move with nodes.
+- `pictures`, `lpips`: scores of pictures.
+- `statistics`: 95 % intervals, paired differences, ratios over objects, aims.
 - `runs`: runs as tables; `failures`: averages without and with failed runs.
-- `paper`, `studies`: what the paper printed, and which methods stand in its tables.
+- `paper`: what the paper printed, and which methods stand in its tables.
 - `released`: checks against the released data, simulator and splats.
 """

@@ -2,20 +2,65 @@
 
 d(a, b) = sum over the five ReLUs l of the mean over pixels of w_l . (f_l(a) - f_l(b))^2, f_l of unit length over its channels.
 AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so that torchvision is not needed. Its
-weights and the heads are files (`lpips_weights`); nothing is downloaded.
+weights and the heads are files: in torch hub's cache, for the heads also inside an installed `lpips` or `torchmetrics`, or where
+the configuration says. They are recognized by their SHA-256. Nothing is downloaded; missing files are named.
+
+torch is imported where it is used, because the workflow asks for the weights before it plans any job.
 """
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-from torch.nn.functional import conv2d, max_pool2d, relu
-
+from neuspring.config.images import LpipsWeights
 from neuspring.core.errors import InputError
-from neuspring.core.weights import read_tensors
-from neuspring.scores.lpips_weights import BACKBONE_ADDRESS, find_weights
+from neuspring.core.weights import find_file, hub_folder, read_tensors
+
+if TYPE_CHECKING:
+    import torch
+
+BACKBONE = "alexnet-owt-7be5be79.pth"
+BACKBONE_DIGEST = "7be5be79"
+"""First digits of the SHA-256. By torch hub's convention they are part of the name."""
+BACKBONE_ADDRESS = f"https://download.pytorch.org/models/{BACKBONE}"
+HEADS = "lpips_alex_v0.1.pth"
+HEADS_DIGEST = "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"
+PACKAGED_HEADS = {"lpips": "weights/v0.1/alex.pth", "torchmetrics": "functional/image/lpips_models/alex.pth"}
+"""Path of the heads inside each package that has them."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Checked weight files."""
+
+    backbone: Path
+    heads: Path
+
+
+def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> Weights | str:
+    """The weight files, or one line that says which are missing. None: look in the usual caches.
+
+    Checks SHA-256 unless `trusted`. Raises InputError only if a path that was given is missing or has another content.
+    """
+    hub = hub_folder()
+    places = [hub / HEADS]
+    for package, inside in PACKAGED_HEADS.items():  # not imported
+        spec = importlib.util.find_spec(package)
+        places += [Path(folder) / inside for folder in (spec.submodule_search_locations or [] if spec else [])]
+    first = find_file("AlexNet weights", backbone, [hub / BACKBONE], BACKBONE_DIGEST, trusted)
+    second = find_file("LPIPS heads", heads, places, HEADS_DIGEST, trusted)
+    if isinstance(first, Path) and isinstance(second, Path):
+        return Weights(first, second)
+    return "; ".join(reason for reason in (first, second) if isinstance(reason, str))
+
+
+def configured_weights(settings: LpipsWeights) -> Weights | str:
+    """As `find_weights`, with the paths of the configuration."""
+    return find_weights(*(Path(path) if path else None for path in (settings.backbone, settings.heads)))
+
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
 """Of the picture and after each convolution."""
@@ -64,6 +109,8 @@ class Lpips:
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""
+        from torch.nn.functional import conv2d, max_pool2d, relu
+
         layers = []
         for k, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
             if k in POOLED:
@@ -78,6 +125,8 @@ class Lpips:
         LPIPS is made for [-1, 1], to which pictures are mapped; `released_range` leaves them in [0, 1] (PhysTwin's quirk).
         Raises InputError for bad shapes.
         """
+        import torch
+
         shapes = f"{tuple(a.shape)}, {tuple(b.shape)}"
         if a.ndim < 3 or a.shape != b.shape or a.shape[-3] != 3:
             raise InputError("LPIPS", "two pictures [..., 3, H, W] of the same shape are needed", shapes)

@@ -3,7 +3,7 @@
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
 Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
-its points move with the nodes around them (`bound`). Metrics of pictures are in `images` and `lpips`.
+its points move with the nodes around them (`carried`). Metrics of pictures are in `pictures` and `lpips`.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
 
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
-from neuspring.scores.bound import NEIGHBORS, bound_positions
+from neuspring.scores.carried import NEIGHBORS, bound_positions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -142,7 +142,7 @@ MARKED = (
         digits=1, tolerance=1e-6,
     ),
 )  # fmt: skip
-"""Of points that were marked in images, where there is color alone (image_points.py)."""
+"""Of points that were marked in images, where there is color alone (carried.py)."""
 METRICS = {metric.name: metric for metric in (*_ALL, *MARKED)}
 """By name, in the order of summaries."""
 IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
@@ -214,7 +214,7 @@ def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
 
 
 def bound_track_errors(positions: np.ndarray, tracks: np.ndarray, neighbors: int = NEIGHBORS) -> np.ndarray:
-    """As `track_errors`, of points that move with the nodes around them (`bound.bound_positions`): 0 for every rigid motion."""
+    """As `track_errors`, of points that move with the nodes around them (`carried.bound_positions`): 0 for every rigid motion."""
     tracks = tracks.astype(np.float64)
     return _mean_errors(positions, tracks, lambda points: bound_positions(positions, points, neighbors))
 
@@ -260,7 +260,7 @@ def marked_errors(positions: np.ndarray, observations: Observations) -> dict[str
     if image is None or not image.marked.shape[1]:
         return {}
     # OpenCV is imported for captures alone.
-    from neuspring.scores.image_points import points_in_image, points_on_table
+    from neuspring.scores.carried import points_in_image, points_on_table
 
     view = image.intrinsics, image.camera_to_world, positions, image.marked.astype(np.float64), observations.surface_count
     up = 1.0 if observations.scenario.up == "+z" else -1.0

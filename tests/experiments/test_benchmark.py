@@ -23,7 +23,7 @@ from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
 from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
-from neuspring.scores.studies import read_studies
+from neuspring.scores.paper import read_studies
 from neuspring.stages import STAGES
 from tests.support.captures import describe
 from tests.support.colored import paint

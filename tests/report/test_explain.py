@@ -18,7 +18,7 @@ from neuspring.report import explain as explain_text
 from neuspring.report import study as tables_paper
 from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.scores import paper
-from neuspring.scores.studies import read_studies
+from neuspring.scores.paper import read_studies
 from neuspring.stages.score import score
 from tests.support import small
 from tests.support.runs import STARTED, run_record

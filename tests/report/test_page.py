@@ -19,8 +19,8 @@ from neuspring.report.page.page import _answer
 from neuspring.report.page.pictures import ADDRESS
 from neuspring.report.page.setup import render
 from neuspring.scores import paper
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import collect
-from neuspring.scores.studies import Study
 from tests.support import report_tree
 from tests.support.browser import Browser, chromium
 from tests.support.report_tree import page_section as section

@@ -13,7 +13,7 @@ from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.page import Options, write
 from neuspring.report.page.material import Choice
-from neuspring.scores.studies import Study
+from neuspring.scores.paper import Study
 from tests.support import report_tree
 from tests.support.report_tree import page_section as section
 

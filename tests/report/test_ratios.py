@@ -16,8 +16,8 @@ from neuspring.report import study as tables_study
 from neuspring.report.benchmark import Judging
 from neuspring.report.notes import differing
 from neuspring.report.study_cells import ORACLE_LINE, cells, restricted
+from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import Collected, collect, read_scores
-from neuspring.scores.studies import Study, read_studies
 from tests.support.runs import run_record
 from tests.support.study_runs import collected, rows_of, write_run
 from tests.support.study_runs import summary as summary_of

@@ -19,9 +19,9 @@ from neuspring.report import study as tables_paper
 from neuspring.report import study_cells as tables_cells
 from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, averages
+from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores
 from neuspring.scores.statistics import paired_differences
-from neuspring.scores.studies import Study, read_studies
 from tests.support.study_runs import all_scores, write_benchmark, write_run
 
 STUDY_TABLE = Path(__file__).resolve().parents[2] / "config" / "studies.yaml"

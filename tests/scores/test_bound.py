@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neuspring.scores.bound import bound_positions, rotations
+from neuspring.scores.carried import bound_positions, rotations
 from neuspring.scores.metrics import bound_track_errors, errors_per_frame, floors, track_errors
 from tests.support.scenarios import observations
 

@@ -15,8 +15,8 @@ from neuspring.report.explain import explain
 from neuspring.report.explain import text as explained
 from neuspring.scores import failures
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, collect, comparable, read_scores
-from neuspring.scores.studies import Study
 from tests.support.study_runs import collected, write_run
 
 FUTURE = ("future", "track_error")

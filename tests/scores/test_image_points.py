@@ -13,7 +13,7 @@ from neuspring.core.artifacts import Trajectory
 from neuspring.data.capture import Camera
 from neuspring.report.benchmark import marked_blocks
 from neuspring.scores import metrics
-from neuspring.scores.image_points import BEHIND, carried_in_image, points_in_image, points_on_table
+from neuspring.scores.carried import BEHIND, carried_in_image, points_in_image, points_on_table
 from tests.support.colored import observed
 from tests.support.study_runs import rows_of
 

@@ -10,9 +10,8 @@ import torch
 from neuspring.core import weights as weight_files
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.scores import lpips_weights
-from neuspring.scores.lpips import Lpips
-from neuspring.scores.lpips_weights import Weights, find_weights
+from neuspring.scores import lpips as module
+from neuspring.scores.lpips import Lpips, Weights, find_weights
 from tests.support.devices import DEVICES
 
 CHANNELS = (64, 192, 384, 256, 256)
@@ -39,7 +38,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache of torch hub, and no package that carries heads."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(lpips_weights, "PACKAGED_HEADS", {})
+    monkeypatch.setattr(module, "PACKAGED_HEADS", {})
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
     return folder
@@ -163,9 +162,9 @@ def test_cached_weights_are_found(hub, files, monkeypatch):
     for path, expected in ((hub / "alexnet-owt-7be5be79.pth", "7be5be79"), (hub / "lpips_alex_v0.1.pth", "df73285e")):
         assert f"{path} has SHA-256 {digest_file(path)[:8]}..., not {expected}..." in reason
     assert find_weights(trusted=True) == Weights(hub / "alexnet-owt-7be5be79.pth", hub / "lpips_alex_v0.1.pth")
-    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0])[:8])
+    monkeypatch.setattr(module, "BACKBONE_DIGEST", digest_file(files[0])[:8])
     assert find_weights() == reason.partition("; ")[2]
-    monkeypatch.setattr(lpips_weights, "HEADS_DIGEST", digest_file(files[1]))
+    monkeypatch.setattr(module, "HEADS_DIGEST", digest_file(files[1]))
     assert isinstance(find_weights(), Weights)
     a, b = pair(40, 40)
     assert Lpips.load()(a, b) == Lpips.load(*files, trusted=True)(a, b)
@@ -177,19 +176,19 @@ def test_heads_are_found_in_a_package_without_importing_it(hub, files, tmp_path,
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
     shutil.copy(files[1], package / "weights/alex.pth")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(lpips_weights, "PACKAGED_HEADS", {"carries_heads": "weights/alex.pth", "absent_package": "alex.pth"})
+    monkeypatch.setattr(module, "PACKAGED_HEADS", {"carries_heads": "weights/alex.pth", "absent_package": "alex.pth"})
     found = find_weights(files[0], trusted=True)
     assert found == Weights(files[0], package / "weights/alex.pth")
     # A stale file in the cache does not hide the good one.
     (hub / "lpips_alex_v0.1.pth").write_bytes(b"stale")
-    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0]))
-    monkeypatch.setattr(lpips_weights, "HEADS_DIGEST", digest_file(files[1]))
+    monkeypatch.setattr(module, "BACKBONE_DIGEST", digest_file(files[0]))
+    monkeypatch.setattr(module, "HEADS_DIGEST", digest_file(files[1]))
     assert find_weights(files[0]) == found
 
 
 def test_a_truncated_cached_file_is_a_reason(hub, files, monkeypatch):
     whole = files[0].read_bytes()
-    monkeypatch.setattr(lpips_weights, "BACKBONE_DIGEST", digest_file(files[0])[:8])
+    monkeypatch.setattr(module, "BACKBONE_DIGEST", digest_file(files[0])[:8])
     (hub / "alexnet-owt-7be5be79.pth").write_bytes(whole[: len(whole) // 2])
     reason = find_weights()
     assert isinstance(reason, str) and "alexnet-owt-7be5be79.pth has SHA-256" in reason

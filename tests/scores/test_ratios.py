@@ -13,7 +13,7 @@ from neuspring.config import parse
 from neuspring.config.settings import Aim
 from neuspring.core.errors import InputError
 from neuspring.scores.metrics import COLUMNS
-from neuspring.scores.ratios import judged_aims, ratios, seed_spread, t_interval
+from neuspring.scores.statistics import judged_aims, ratios, seed_spread, t_interval
 
 
 def table(values: dict[tuple[str, str, int], float], category: str = "", task: str = "future") -> pd.DataFrame:

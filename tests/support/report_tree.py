@@ -236,7 +236,7 @@ def _relative(path: Path, folder: Path) -> str:
 def main() -> None:
     """Make the full benchmark and time its report."""
     from neuspring.report.page import Options, write
-    from neuspring.scores.studies import read_studies
+    from neuspring.scores.paper import read_studies
 
     results = Path(sys.argv[1])
     methods = list(config.read_yaml(Path("config/methods.yaml")))[:20]

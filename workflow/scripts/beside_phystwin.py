@@ -25,7 +25,7 @@ from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT
 from neuspring.report.draw.sheet import FUTURE, TRAINING
-from neuspring.scores.image_points import point_errors, points_on_table
+from neuspring.scores.carried import point_errors, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import COVERED
 from workflow.scripts.beside_data import PHYSTWIN, STILL, Case, Run, cases_of, iou_without_hands, runs_of

@@ -27,7 +27,7 @@ REACH = 2.5
 
 
 def ratios_figure(ratios: pd.DataFrame, path: Path, note: str) -> Path | None:
-    """Draw `scores.ratios.ratios`, a panel per task, methods in the order given; returns the file.
+    """Draw `scores.statistics.ratios`, a panel per task, methods in the order given; returns the file.
 
     Filled markers: the interval leaves out 1. None, and no file, if no ratio has an interval (too few objects, or nothing to
     compare). `note` is added below the title.

@@ -16,8 +16,8 @@ from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.scores.failures import LeftOut, applying
 from neuspring.scores.metrics import DASH
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, one_line
-from neuspring.scores.studies import Study
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """What a damaged record, table or picture raises."""

@@ -47,8 +47,8 @@ from neuspring.report.study import StudyNumbers, kind, study_blocks, verdict_chi
 from neuspring.report.study_cells import BETTER, WITHIN, WORSE
 from neuspring.scores import paper
 from neuspring.scores.failures import LeftOut
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import collect, collect_transfers
-from neuspring.scores.studies import Study
 
 MEGABYTE = 1_000_000
 MARKUP = 400

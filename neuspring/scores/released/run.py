@@ -22,10 +22,9 @@ from neuspring.data import phystwin
 from neuspring.data.check import check_layout, find_cases
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released
-from neuspring.scores.lpips import Lpips
-from neuspring.scores.lpips_weights import configured
+from neuspring.scores.lpips import Lpips, configured_weights
 from neuspring.scores.released import checks
-from neuspring.scores.released.findings import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
+from neuspring.scores.released.checks import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
 
 CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",
@@ -106,7 +105,7 @@ def _report(findings: Sequence[Comparison], names: Sequence[str], tools: Tools) 
 
 
 def _metric(settings: LpipsWeights, device: str) -> Lpips | str:
-    weights = configured(settings)
+    weights = configured_weights(settings)
     # Their checksums have just been taken.
     return weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
 

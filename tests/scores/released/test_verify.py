@@ -26,8 +26,7 @@ from neuspring.data.released import (
 )
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
-from neuspring.scores.released.checks import RELEASED, frame_scores
-from neuspring.scores.released.findings import MEAN, Comparison, Published, of_means
+from neuspring.scores.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.scores.released.run import CHECKS, Report, read_observations, verify_released
 from tests.support.phystwin_case import dump, edit, stored
 from tests.support.released_case import (
