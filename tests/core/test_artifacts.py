@@ -300,7 +300,7 @@ def test_foreign_files(tmp_path: Path) -> None:
         damaged(path, path.read_bytes())
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_flipped_byte_is_refused_or_harmless(data: st.DataObject, tmp_path: Path) -> None:
     path = tmp_path / "it.npz"

@@ -16,9 +16,10 @@ from neuspring.config import Mocap, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
 from neuspring.data.check import check_layout
+from tests.support.real import FOLDER
 
 ROW = ScenarioRow(scenario="cable", source="mocap", category="cable", path="x", self_collision=False, ground=False)
-REAL = Path(__file__).parents[2].parent / "shared" / "data" / "mocap_dlo"
+REAL = FOLDER / "mocap_dlo"
 EDGE = 1e-9
 """Rounding of float64 geometry of size 1."""
 SPLINE = 1e-3
@@ -186,16 +187,15 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
-def test_released_recordings() -> None:
-    settings = Mocap()
-    for cable in ("DLO1", "DLO2", "DLO4"):
-        file = next((REAL / cable / "train").glob("*.pkl"))
-        assert [d for d in check_layout(file) if d.level != "note"] == []
-        observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, settings)
-        assert observations.scenario.frame_count == 250
-        assert observations.object_points.shape[1] == (9 if cable == "DLO1" else 8)
-        assert 300 < len(observations.nodes) < 380
-        assert_no_twist(observations.surface_points, settings.ring)
+@pytest.mark.parametrize(("cable", "observed"), [("DLO1", 9), ("DLO2", 8), ("DLO3", 8), ("DLO4", 8)])
+def test_released_recordings(cable: str, observed: int) -> None:
+    file = min((REAL / cable / "train").glob("*.pkl"))
+    assert [d for d in check_layout(file) if d.level != "note"] == []
+    observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, Mocap())
+    assert observations.scenario.frame_count == 250
+    assert observations.object_points.shape[1] == observed
+    assert 300 < len(observations.nodes) < 380
+    assert_no_twist(observations.surface_points, Mocap().ring)
 
 
 def test_a_given_number_of_rings_spaces_them_equally_from_end_to_end() -> None:

@@ -13,7 +13,7 @@ from tests.support.real import PLUSH
 
 
 @pytest.mark.skipif(not PLUSH.is_dir(), reason="the recording is not part of the repository")
-@pytest.mark.parametrize("frames", ["250-335"])
+@pytest.mark.parametrize("frames", ["250-335", pytest.param("160-349", marks=pytest.mark.slow)])
 def test_the_table_of_a_real_recording(tmp_path, frames, capsys):
     words = ["--color", f"{PLUSH}/color", "--depth", f"{PLUSH}/depth", "--intrinsics", f"{PLUSH}/intrinsics.json", "--rate", "30"]
     output = tmp_path / "plush"
