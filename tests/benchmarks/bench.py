@@ -2,10 +2,9 @@
 
     python -m tests.benchmarks.bench [--quick] [--only SECTION] [--device DEVICE] [--peer CHECKOUT] [--save]
 
-On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table and the machine's
-limits, and how every row changed since the table of the same kind of machine that was committed last. Writes
-results/bench/<kind of machine>.json, or with --save results/published/bench/<kind of machine>.json, which is to be committed. Some
-five minutes on a CPU; the sections of a GPU are chosen to end within two.
+On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table, and how every row
+changed since the table of the same kind of machine that was committed last. Writes results/bench/<kind of machine>.json, or with
+--save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes on a CPU; on a GPU at most two.
 """
 
 from __future__ import annotations
@@ -13,14 +12,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
 
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
-from tests.benchmarks import limits, machine, table
+from tests.benchmarks import table
 from tests.benchmarks.ours import Ours
 from tests.benchmarks.phystwin import PhysTwin
 from tests.benchmarks.rows import Bench
@@ -32,26 +30,22 @@ def main(arguments: list[str] | None = None) -> None:
     options = parsed(arguments)
     torch.set_num_threads(1)
     start_warp()
-    facts = machine.facts()
-    kind = machine.kind(facts)
+    facts = table.facts()
+    kind = table.kind(facts)
     rows: list[table.Row] = []
     notes: list[str] = []
-    measured: dict[str, limits.Limits] = {}
     for device in devices(options.device):
         peer = PhysTwin(options.peer, device) if options.peer else None
-        measured[device] = limits.measure(device)
-        bench = Bench(device, measured[device], Ours(device), peer, options.quick, notes)
+        bench = Bench(device, Ours(device), peer, options.quick, notes)
         for section in options.only or (SECTIONS if device == "cpu" else ON_CUDA):
             begin = time.perf_counter()
             rows += SECTIONS[section](bench)
             print(f"{section}, {device}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
     committed = table.last_committed(kind)
     print(", ".join(f"{name} {value}" for name, value in facts.items() if value))
-    for device, its in measured.items():
-        print(*(f"{device} {line}" for line in its.lines()), sep="\n")
     print("", table.text(rows, committed), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
     print(f"compared with commit {committed['machine']['commit']}" if committed else f"no table of {kind} is committed")
-    record = table.as_record(facts, {device: asdict(its) for device, its in measured.items()}, rows, notes)
+    record = table.as_record(facts, rows, notes)
     print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
 
 

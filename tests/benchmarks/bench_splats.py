@@ -19,7 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.splats.rasterize import Backend, choose_backend, rasterize
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
-from tests.benchmarks.memory import peak_mib, reset_peak
+from tests.benchmarks.memory import growth
 from tests.benchmarks.simulators import take_turns
 
 SIZES = ((212, 120), (424, 240), (848, 480))
@@ -67,15 +67,7 @@ def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend:
     if device == "cpu":
         # What was freed must not hide what is needed again (glibc).
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-        reset_peak()
-        before = peak_mib()
-        both()
-        grown = peak_mib() - before
-    else:
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated() / 2**20
-        both()
-        grown = torch.cuda.max_memory_allocated() / 2**20 - before
+    grown = growth(both, device)
     times = take_turns({"forward": forward, "both": both}, device, rounds=repeats, least=repeats)
     first, second = times["forward"].median, times["both"].median
     row = f"{backend:>8}{size[0]:>6} x {size[1]:<4}{count:>8}{1e3 * first:>12.1f}{1e3 * second:>16.1f}{grown:>14.0f}"

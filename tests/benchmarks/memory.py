@@ -8,28 +8,19 @@ from pathlib import Path
 import torch
 
 
-def peak_mib() -> float:
-    """Largest resident memory since `reset_peak`, MiB."""
-    return _status("VmHWM")
-
-
 def resident_mib() -> float:
     """Resident memory now, MiB."""
     return _status("VmRSS")
 
 
-def reset_peak() -> None:
-    """Count the peak from now on."""
-    Path("/proc/self/clear_refs").write_text("5")
-
-
 def growth(run: Callable[[], object], device: str = "cpu") -> float:
     """How far memory rises while `run` runs, MiB."""
     if device == "cpu":
-        reset_peak()
-        before = _status("VmRSS")
+        # Count the peak from now on.
+        Path("/proc/self/clear_refs").write_text("5")
+        before = resident_mib()
         run()
-        return peak_mib() - before
+        return _status("VmHWM") - before
     torch.cuda.reset_peak_memory_stats(device)
     held = torch.cuda.memory_allocated(device)
     run()

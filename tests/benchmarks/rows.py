@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks import work
-from tests.benchmarks.limits import Limits
 from tests.benchmarks.ours import Ours
 from tests.benchmarks.simulators import Frame, Simulator, Times, distances, gradient_difference, take_turns
 from tests.benchmarks.table import Row
@@ -23,7 +21,6 @@ class Bench:
     """What a section measures with."""
 
     device: str
-    limits: Limits
     ours: Ours
     peer: Simulator | None = None
     quick: bool = False
@@ -54,11 +51,6 @@ class Entry:
     """Mean number of twins that differ in it; 0: that of `twin`."""
 
     @property
-    def work(self) -> work.Work:
-        """Least work of a spring and substep."""
-        return work.FORWARD_BACKWARD if self.frame.gradient else work.FORWARD
-
-    @property
     def counts(self) -> tuple[int, int, int, int]:
         """Nodes, springs, substeps, twins."""
         topology = self.twin.topology
@@ -81,10 +73,6 @@ def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
             section=section, name=entry.name, device=bench.device, median=1e3 * mine.median, least=1e3 * mine.least,
             nodes=nodes, springs=springs, substeps=substeps, batch=batch,
         )  # fmt: skip
-        if not entry.twin.simulation.self_collision:
-            # What contacts cost is not in this count.
-            bandwidth, arithmetic = entry.work.shares(mine.median, *entry.counts, bench.limits)
-            row = replace(row, bandwidth=bandwidth, arithmetic=arithmetic)
         if entry.reference:
             other = named[entry.reference]
             ratio, scale = mine.over(times[other.name]), np.prod(other.counts[1:]) / np.prod(entry.counts[1:])

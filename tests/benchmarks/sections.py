@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -14,7 +19,6 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks import bench_start
 from tests.benchmarks.crowds import by_batch, by_topologies, of_search, together
 from tests.benchmarks.memory import growth
 from tests.benchmarks.ours import Ours, reference_frame
@@ -25,6 +29,12 @@ from tests.benchmarks.table import Row
 
 TOGETHER = 16
 """Twins of one call in the first section: the lanes of a vector."""
+TALKING = """import sys
+from neuspring.cli.main import main
+from neuspring.core import device
+device.quiet = lambda: None
+sys.exit(main())"""
+"""The program whose Warp says which modules it compiled and which it found."""
 
 
 def frames(bench: Bench) -> list[Row]:
@@ -144,19 +154,58 @@ def rises(device: str, count: int) -> tuple[float, float]:
 
 
 def start(bench: Bench) -> list[Row]:
-    """A job from start to end, and a crowd of them without compiled kernels. On the CPU alone."""
+    """A rollout of a tiny scene from start to end, whose own work is negligible: alone, and 16 at once with an empty kernel cache.
+
+    On the CPU alone.
+    """
     if bench.device != "cpu":
         return []
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        command = bench_start.tiny(folder)
-        times = Times(tuple(bench_start.alone(folder, command, 1 if bench.quick else 3)))
-        found = {"a job alone": times}
+        command = _tiny_rollout(folder)
+        times = []
+        for _ in range(1 if bench.quick else 3):
+            begin = time.perf_counter()
+            run = [sys.executable, "-m", "neuspring", *command, str(folder / "alone.json")]
+            subprocess.run(run, check=True, capture_output=True)
+            times.append(time.perf_counter() - begin)
+        found = {"a job alone": Times(tuple(times))}
         if not bench.quick:
-            found["16 jobs at once, no kernels yet"] = Times((bench_start.crowd(folder, command)[0],))
+            seconds, text = _crowd(folder, command, 16)
+            found["16 jobs at once, no kernels yet"] = Times((seconds,))
+            counts = f"{text.count('(compiled)')} kernels compiled, {text.count('(cached)')} found in the cache"
+            bench.notes.append(f"16 jobs at once: {counts}")
     return [
         Row(section="start", name=name, device="cpu", median=its.median, least=its.least, unit="s") for name, its in found.items()
     ]
+
+
+def _tiny_rollout(folder: Path) -> list[str]:
+    """The command line of a rollout of a tiny scene, which is made here, but for its output."""
+    (folder / "settings.yaml").write_text(json.dumps({"toy": {"frames": 5}, "search": {"rollouts": 2}}))
+    options = ["--settings", str(folder / "settings.yaml")]
+    observations, search = folder / "observations.npz", folder / "search.json"
+    observe = ["observe", "--scenario", "toy_rope_lift_smooth", *options, "--output", str(observations)]
+    find = ["search", "--observations", str(observations), *options, "--device", "cpu", "--output", str(search)]
+    for command in (observe, find):
+        subprocess.run([sys.executable, "-m", "neuspring", *command], check=True, capture_output=True)
+    return ["rollout", "--observations", str(observations), "--learned", str(search), "--device", "cpu", "--output"]
+
+
+def _crowd(folder: Path, command: list[str], jobs: int) -> tuple[float, str]:
+    """Seconds until all jobs that start at once with an empty kernel cache have ended, and what they printed."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(folder / "cache")}
+    begin = time.perf_counter()
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", TALKING, *command, str(folder / f"{index}.json")],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )
+        for index in range(jobs)
+    ]  # fmt: skip
+    outputs = [process.communicate()[0] for process in processes]
+    assert all(process.returncode == 0 for process in processes), outputs[0]
+    return time.perf_counter() - begin, "".join(outputs)
 
 
 SECTIONS: dict[str, Callable[[Bench], list[Row]]] = {

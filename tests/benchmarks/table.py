@@ -1,16 +1,24 @@
-"""The rows of the table, its text, its file, and its change against the table that was committed last."""
+"""The rows of the table, its text, its file, its change against the table that was committed last, and what a machine is."""
 
 from __future__ import annotations
 
 import json
+import os
+import platform
+import re
 import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+import warp as wp
+
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.provenance import commit
 from neuspring.core.table import Table
 
 ROOT = Path(__file__).parents[2]
@@ -18,11 +26,39 @@ COMMITTED = "results/published/bench"
 """Tables that are part of the repository, a file per kind of machine."""
 SCRATCH = "results/bench"
 """Where a table goes that nobody asked to keep."""
-HEADER = ["section", "row", "device", "nodes", "springs", "substeps", "batch", "median", "least", "ns", "ratio", "to"]
-HEADER += ["bandwidth", "arithmetic", "change"]
+HEADER = ["section", "row", "device", "nodes", "springs", "substeps", "batch", "median", "least", "ns", "ratio", "to", "change"]
 LEGEND = """ns: median per spring, substep and twin. ratio: of ns to the row named after it, median of the rounds.
-bandwidth, arithmetic: the least time by this machine's limits, as a share of the median.
 change: of the median since the committed table of this kind of machine."""
+
+
+def facts() -> dict[str, str | int]:
+    """Processor, GPU, versions and the commit. Nothing that names the machine."""
+    processor = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    return {
+        "cpu": entry(processor, "model name") or platform.machine(),
+        "cpu_model": entry(processor, "model"),
+        "cpu_flags": len(entry(processor, "flags").split()),
+        "cores": os.cpu_count() or 1,
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "",
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "torch": torch.__version__,
+        "warp": wp.__version__,
+        "commit": commit(),
+    }
+
+
+def entry(text: str, name: str) -> str:
+    """The first value of a name in a text of lines `name : value`; empty where there is none."""
+    found = re.search(rf"^{re.escape(name)}\s*:\s*(.*)$", text, re.MULTILINE)
+    return found.group(1).strip() if found else ""
+
+
+def kind(machine: dict[str, str | int]) -> str:
+    """A file name for machines that should take the same time: processor, cores and GPU."""
+    cpu = str(machine["cpu"]).replace("(R)", "").replace("(TM)", "")
+    words = f"{cpu} {machine['cpu_model']} {machine['cores']} cores {machine['gpu']}"
+    return re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +80,6 @@ class Row:
     """To the row `reference` of the same section and device, in time per spring, substep and twin (or in the unit)."""
     least_ratio: float | None = None
     reference: str = ""
-    bandwidth: float | None = None
-    """Share of the machine's bandwidth: the least time for the bytes over the median."""
-    arithmetic: float | None = None
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -59,10 +92,10 @@ class Row:
         return 1e6 * self.median / (self.springs * self.substeps * self.batch) if self.unit == "ms" and self.springs else None
 
 
-def as_record(machine: dict[str, Any], limits: dict[str, Any], rows: Sequence[Row], notes: Sequence[str]) -> dict[str, Any]:
+def as_record(machine: dict[str, Any], rows: Sequence[Row], notes: Sequence[str]) -> dict[str, Any]:
     """What a file holds."""
     table = [asdict(row) | {"nanoseconds": row.nanoseconds} for row in rows]
-    return {"machine": machine, "limits": limits, "rows": table, "notes": list(notes)}
+    return {"machine": machine, "rows": table, "notes": list(notes)}
 
 
 def save(record: dict[str, Any], kind: str, *, committed: bool) -> Path:
@@ -104,7 +137,7 @@ def change(row: Row, before: dict[tuple[str, str, str], tuple[float, str]]) -> f
 def text(rows: Sequence[Row], committed: dict[str, Any] | None) -> str:
     """The table as it is printed."""
     before = medians(committed) if committed else {}
-    cells = [[*_facts(row), *_shares(row), _signed(change(row, before))] for row in rows]
+    cells = [[*_facts(row), _signed(change(row, before))] for row in rows]
     return "\n".join(Table.of_texts(HEADER, cells).markdown())
 
 
@@ -114,11 +147,6 @@ def _facts(row: Row) -> list[str]:
     ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
     times = [f"{row.median:.4g} {row.unit}", f"{row.least:.4g}", "" if row.nanoseconds is None else f"{row.nanoseconds:.2f}"]
     return [row.section, row.name, row.device, *counts, batch, *times, ratio, row.reference]
-
-
-def _shares(row: Row) -> list[str]:
-    shares = (row.bandwidth, row.arithmetic)
-    return ["" if share is None else f"{100 * share:.{1 if share < 0.1 else 0}f} %" for share in shares]
 
 
 def _signed(relative: float | None) -> str:

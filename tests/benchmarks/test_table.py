@@ -9,13 +9,12 @@ from itertools import count
 import pytest
 
 from neuspring.core.errors import InputError
-from tests.benchmarks import bench, machine, table, work
-from tests.benchmarks.limits import Limits
-from tests.benchmarks.simulators import Times, take_turns
+from tests.benchmarks import bench, table
+from tests.benchmarks.simulators import take_turns
 from tests.benchmarks.table import Row
 
 ROW = Row(section="frame", name="a: forward", device="cpu", median=4.0, least=3.0, nodes=400, springs=5000, substeps=80)
-SLOWER = replace(ROW, name="a: forward, peer", median=6.0, ratio=1.5, reference=ROW.name, bandwidth=0.025, arithmetic=0.16)
+SLOWER = replace(ROW, name="a: forward, peer", median=6.0, ratio=1.5, reference=ROW.name)
 START = Row(section="start", name="a job alone", device="cpu", median=2.5, least=2.25, unit="s")
 
 
@@ -24,18 +23,14 @@ def cells(line: str) -> list[str]:
 
 
 def test_the_text_has_a_line_per_row_with_its_cost_and_its_change():
-    before = table.as_record({}, {}, [replace(ROW, median=5.0), replace(START, unit="ms")], [])
+    before = table.as_record({}, [replace(ROW, median=5.0), replace(START, unit="ms")], [])
     header, _, *lines = table.text([ROW, SLOWER, START], before).splitlines()
     shown = [dict(zip(cells(header), cells(line), strict=True)) for line in lines]
     # 4 ms / (5000 springs x 80 substeps) = 10 ns.
     assert shown[0] | {"median": "4 ms", "ns": "10.00", "batch": "1", "change": "-20 %", "ratio": ""} == shown[0]
-    assert shown[1] | {"ratio": "1.50", "to": "a: forward", "bandwidth": "2.5 %", "arithmetic": "16 %", "change": ""} == shown[1]
+    assert shown[1] | {"ratio": "1.50", "to": "a: forward", "change": ""} == shown[1]
     # Another unit is no change.
     assert shown[2] | {"median": "2.5 s", "ns": "", "nodes": "", "batch": "", "change": ""} == shown[2]
-
-
-def test_twins_together_share_the_time():
-    assert replace(ROW, batch=16, median=64.0).nanoseconds == pytest.approx(ROW.nanoseconds)
 
 
 def test_a_table_is_compared_with_the_one_in_the_last_commit(tmp_path):
@@ -46,7 +41,7 @@ def test_a_table_is_compared_with_the_one_in_the_last_commit(tmp_path):
     assert table.last_committed("here", tmp_path) is None
     file = tmp_path / table.COMMITTED / "here.json"
     file.parent.mkdir(parents=True)
-    file.write_text(json.dumps(table.as_record({"commit": "c0"}, {}, [ROW], [])))
+    file.write_text(json.dumps(table.as_record({"commit": "c0"}, [ROW], [])))
     git("add", ".")
     git("commit", "-m", "table")
     file.write_text("{}")
@@ -64,7 +59,7 @@ def test_a_table_is_compared_with_the_one_in_the_last_commit(tmp_path):
 @pytest.mark.parametrize(("committed", "folder"), [(True, table.COMMITTED), (False, table.SCRATCH)])
 def test_only_save_writes_into_the_committed_folder(tmp_path, monkeypatch, committed, folder):
     monkeypatch.setattr(table, "ROOT", tmp_path)
-    record = table.as_record({"cpu": "x"}, {"cpu": {}}, [ROW, SLOWER], ["a note"])
+    record = table.as_record({"cpu": "x"}, [ROW, SLOWER], ["a note"])
     path = table.save(record, "here", committed=committed)
     assert path == tmp_path / folder / "here.json"
     assert json.loads(path.read_text()) == record
@@ -80,12 +75,12 @@ def test_a_part_of_the_table_is_not_saved(rest, capsys):
 
 def test_the_kind_of_machine_is_a_file_name_of_processor_cores_and_gpu():
     facts = {"cpu": "Intel(R) Xeon(R) Gold 6530", "cpu_model": "207", "cores": 16, "gpu": "NVIDIA H200", "warp": "1.19.0"}
-    assert machine.kind(facts) == "intel-xeon-gold-6530-207-16-cores-nvidia-h200"
-    assert machine.kind(facts | {"gpu": "", "warp": "2"}) == "intel-xeon-gold-6530-207-16-cores"
-    here = machine.facts()
-    assert here["cpu"] and here["cores"] >= 1 and machine.kind(here) == machine.kind(here).strip("-")
+    assert table.kind(facts) == "intel-xeon-gold-6530-207-16-cores-nvidia-h200"
+    assert table.kind(facts | {"gpu": "", "warp": "2"}) == "intel-xeon-gold-6530-207-16-cores"
+    here = table.facts()
+    assert here["cpu"] and here["cores"] >= 1 and table.kind(here) == table.kind(here).strip("-")
     text = "model\t\t: 167\nmodel name\t: Some CPU @ 2 GHz\nflags\t\t: a b\n\nmodel name\t: Other\n"
-    assert [machine.entry(text, name) for name in ("model", "model name", "stepping")] == ["167", "Some CPU @ 2 GHz", ""]
+    assert [table.entry(text, name) for name in ("model", "model name", "stepping")] == ["167", "Some CPU @ 2 GHz", ""]
 
 
 def test_simulators_take_turns_and_none_is_always_first():
@@ -102,20 +97,3 @@ def test_rounds_end_when_their_time_is_up_but_not_before_the_least_number():
     times = take_turns({"slow": lambda: (next(calls), time.sleep(0.02))}, rounds=50, least=4, seconds=0.0)
     assert len(times["slow"].seconds) == 4 and next(calls) == 5
     assert times["slow"].least >= 0.02
-
-
-def test_a_ratio_is_the_median_of_rounds_so_that_one_busy_round_does_not_count():
-    found = Times((2.0, 4.0, 30.0)).over(Times((1.0, 2.0, 3.0)))
-    assert (found.median, found.least, found.most) == (2.0, 2.0, 10.0)
-
-
-def test_shares_are_the_least_time_over_the_time():
-    limits = Limits({10_000: 100e9, 1_000_000: 10e9}, fused=28e9, roots=1e9)
-    small = work.FORWARD.shares(1.0, nodes=100, springs=100, substeps=10**6, batch=1, limits=limits)
-    # 4 + 12 + 84 bytes a spring from the cache that holds 10 kB; 28 operations take 1 ns, and a root beside them as well.
-    assert small == pytest.approx((1e8 * 100 / 100e9, 1e8 * 1e-9))
-    # 16 twins share the end of a spring, and need the larger memory; where roots are slow, they are what counts.
-    slow = replace(limits, roots=0.5e9)
-    many = work.FORWARD.shares(1.0, nodes=100, springs=100, substeps=10**6, batch=16, limits=slow)
-    assert many == pytest.approx((16e8 * 96.25 / 10e9, 16e8 * 2e-9))
-    assert limits.bandwidth_of(10**9) == 10e9

@@ -1,15 +1,10 @@
-"""A results folder as the workflow leaves it, with invented numbers: for tests of the report, and to time it.
-
-`python -m tests.support.report_tree FOLDER` makes the full benchmark (22 scenarios, 20 methods, 3 seeds) and times its report.
-"""
+"""A results folder as the workflow leaves it, with invented numbers: for tests of the report."""
 
 from __future__ import annotations
 
 import html
 import os
 import re
-import sys
-import time
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -26,7 +21,6 @@ from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.report.video import Video
-from neuspring.scores import paper
 from neuspring.scores.metrics import COLUMNS, UNITS
 from tests.support.runs import run_record
 
@@ -231,26 +225,3 @@ def page_section(page: str, key: str) -> str:
 
 def _relative(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path, folder)).as_posix()
-
-
-def main() -> None:
-    """Make the full benchmark and time its report."""
-    from neuspring.report.page import Options, write
-    from neuspring.scores.paper import read_studies
-
-    results = Path(sys.argv[1])
-    methods = list(config.read_yaml(Path("config/methods.yaml")))[:20]
-    scenarios, seeds = sorted(paper.scenarios()), (0, 1, 2)
-    if not results.exists():
-        make(results, scenarios, methods, seeds, source="phystwin", nodes=2000)
-        write_jobs(results, scenarios, methods, seeds, gpus=8)
-    wall, cpu = time.perf_counter(), time.process_time()
-    page = write(results, results / "report.html", Options(studies=read_studies(Path("config/studies.yaml"))))
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    print(
-        f"{len(scenarios)} x {len(methods)} x {len(seeds)}: {wall:.1f} s ({cpu:.1f} s of CPU), {page.stat().st_size / 1e6:.1f} MB"
-    )
-
-
-if __name__ == "__main__":
-    main()

@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 
 from neuspring.data.synthetic import toy
-from tests.support import scripts, small
-
-study = scripts.load("identifiability")
+from tests.support import small
+from workflow.scripts import identifiability as study
 
 
 @functools.cache
