@@ -48,10 +48,6 @@ def said(findings: list[Finding]) -> set[str]:
     return {f"{one.level}: {one.name}" for one in findings}
 
 
-def test_good_masks_have_no_findings(capture):
-    assert looked_at(capture, scene()) == []
-
-
 def moved_to_the_border(labels):
     labels[2:, 30:60, :] = np.roll(labels[2:, 30:60, :], -40, axis=2)
 
@@ -81,6 +77,15 @@ def tiny(labels):
     labels[:, 40:50, 40:50] = OBJECT
 
 
+def test_good_masks_have_no_findings_and_holes_of_depth_are_said(capture):
+    assert looked_at(capture, scene()) == []
+    for frame in range(FRAMES):
+        depth = np.full(SIZE, 800, np.uint16)
+        depth[30:45, 40:70] = 0
+        cv2.imwrite(str(capture.path("depth", "0", frame)), depth)
+    assert "warning: depth holes" in said(looked_at(capture, scene()))
+
+
 @pytest.mark.parametrize(
     ("spoil", "name"),
     [
@@ -104,14 +109,6 @@ def test_a_finding_says_where_value_limit_and_next_move(capture):
     tiny(labels)
     text = "warning: camera 0: small object: 100 pixels of object in frame 0; at least 200 are expected. Film from nearer by."
     assert text in map(str, looked_at(capture, labels))
-
-
-def test_an_object_without_depth_is_said(capture):
-    for frame in range(FRAMES):
-        depth = np.full(SIZE, 800, np.uint16)
-        depth[30:45, 40:70] = 0
-        cv2.imwrite(str(capture.path("depth", "0", frame)), depth)
-    assert "warning: depth holes" in said(looked_at(capture, scene()))
 
 
 def test_lost_and_few_tracks_are_said():

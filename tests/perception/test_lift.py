@@ -95,13 +95,18 @@ def test_no_object_and_no_hand_are_named(scene):
             lifting.lift(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)
 
 
-def test_a_missing_frame_leaves_points_invisible(tmp_path):
-    writer = Writer(tmp_path, describe(cameras=(entry(missing=(2,)),)))
+def still(folder, camera) -> tuple[Capture, np.ndarray]:
+    """A capture in which object and hand stand still at 0.8 m, and its labels [H, W]."""
+    writer = Writer(folder, describe(cameras=(camera,)))
     labels = np.zeros((24, 32), np.uint8)
     labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
-    for frame in set(range(FRAMES)) - {2}:
+    for frame in set(range(FRAMES)) - set(camera.missing):
         writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
-    capture = writer.finish()
+    return writer.finish(), labels
+
+
+def test_a_missing_frame_leaves_points_invisible(tmp_path):
+    capture, labels = still(tmp_path, entry(missing=(2,)))
     masks = Masks(labels=np.stack([labels * capture.has("0", f) for f in range(FRAMES)]), backend="x")
     y, x = np.nonzero(labels)
     pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), FRAMES, axis=0)
@@ -218,38 +223,25 @@ def test_patches_average_the_noise_of_the_tracks():
     assert facts["patch_misfit_mm"] == pytest.approx(2.0 * np.sqrt(3 * 7 / 8), rel=0.05)
 
 
-def test_a_hand_that_has_yet_to_come_grips_with_what_is_foremost():
+def test_a_hand_that_has_yet_to_come_grips_with_what_is_foremost_and_a_small_patch_is_named():
     points, cloud, _, _ = grasp()
     seen = np.ones(points.shape[:2], bool)
     controllers, _ = choose_controllers(points, seen, seen, cloud - np.array([0.5, 0, 0]), PATCH, "here")
     assert (controllers[0, :, 0] < -0.1).any()
     assert (controllers[0, :, 0] > 0.05).any()
-
-
-def test_a_patch_that_is_too_small_is_named():
-    points, cloud, _, _ = grasp()
-    seen = np.ones(points.shape[:2], bool)
     with pytest.raises(InputError, match=r"near the object in frame 0.*grip_reach"):
         choose_controllers(points, seen, seen, cloud, replace(PATCH, grip_reach=1e-6), "here")
 
 
-def test_hands_apart_move_apart():
+@pytest.mark.parametrize(("second", "hands"), [(8, [8, 8]), (2, [10])])
+def test_hands_apart_move_apart_and_two_points_apart_follow_the_nearest_hand(second, hands):
     rng = np.random.default_rng(0)
-    start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), rng.uniform(0, 0.03, (8, 3)) + np.array([0.3, 0, 0])])
-    assert [len(hand) for hand in hands_of(start)] == [8, 8]
-    moved = start + np.repeat([[0, 0, 0.1], [0, 0, -0.05]], 8, axis=0)
-    points, trusted = np.stack([start, moved]), np.ones((2, 16), bool)
+    start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), rng.uniform(0, 0.03, (second, 3)) + np.array([0.3, 0, 0])])
+    assert [len(hand) for hand in hands_of(start)] == hands
+    down = -0.05 if second == 8 else 0.1
+    points = np.stack([start, start + np.repeat([[0, 0, 0.1], [0, 0, down]], [8, second], axis=0)])
+    trusted = np.ones((2, 8 + second), bool)
     trusted[1, [0, 9]] = False
-    np.testing.assert_allclose(fill_rigidly(np.where(trusted[..., None], points, 0.0), trusted), points, atol=1e-9)
-
-
-def test_two_points_apart_follow_the_nearest_hand():
-    rng = np.random.default_rng(0)
-    start = np.concatenate([rng.uniform(0, 0.03, (8, 3)), [[0.17, 0, 0], [0.18, 0, 0]]])
-    points = start + np.linspace(0, 0.2, 6)[:, None, None] * [0, 0, 1.0]
-    trusted = np.ones((6, 10), bool)
-    trusted[3:, 8:] = False
-    assert [len(hand) for hand in hands_of(start)] == [10]
     np.testing.assert_allclose(fill_rigidly(np.where(trusted[..., None], points, 0.0), trusted), points, atol=1e-9)
 
 
@@ -305,13 +297,7 @@ def test_whole_pixels_as_released_lift_the_pixel_that_a_track_is_in(scene):
 
 def test_a_mirrored_principal_point_as_before_july_2025_shifts_the_object(tmp_path):
     camera = entry()
-    off_center = replace(camera, intrinsics=((40.0, 0.0, 13.0), *camera.intrinsics[1:]))
-    writer = Writer(tmp_path, describe(cameras=(off_center,)))
-    labels = np.zeros((24, 32), np.uint8)
-    labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
-    for frame in range(FRAMES):
-        writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
-    capture = writer.finish()
+    capture, _ = still(tmp_path, replace(camera, intrinsics=((40.0, 0.0, 13.0), *camera.intrinsics[1:])))
     right, mirrored = (
         lifting.clean_masks(capture, lifting.lifting_cameras(capture, settings), masks_of(capture), settings)[1]
         for settings in (SETTINGS, replace(SETTINGS, mirrored_principal_point=True))

@@ -53,8 +53,15 @@ def leaving(at: int) -> np.ndarray:
     return 0.03 * np.maximum(np.arange(FRAMES) - at, 0)
 
 
-def test_a_hand_that_stays_holds_always():
-    assert held(np.zeros(FRAMES)) is ALWAYS
+def back_at(frame: int) -> np.ndarray:
+    away = leaving(10)
+    away[frame:] = 0.0
+    return away
+
+
+@pytest.mark.parametrize("away", [np.zeros(FRAMES), np.full(FRAMES, 0.3), back_at(15)], ids=["stays", "never near", "back soon"])
+def test_a_hand_that_stays_was_never_near_or_comes_back_soon_has_not_let_go(away):
+    assert held(away) is ALWAYS
 
 
 def test_a_hand_that_goes_away_lets_go_and_the_other_holds_on():
@@ -73,16 +80,8 @@ def test_the_body_is_not_read_after_the_training_frames():
     np.testing.assert_array_equal(held(leaving(10), train_end=18, bodies=spoiled), held(leaving(10), train_end=18))
 
 
-def test_a_hand_that_comes_back_soon_has_not_let_go():
-    away = leaving(10)
-    away[15:] = 0.0
-    assert held(away) is ALWAYS
-
-
 def test_a_hand_that_comes_back_to_the_same_place_takes_hold_again():
-    away = leaving(10)
-    away[20:] = 0.0
-    valid = held(away)
+    valid = held(back_at(20))
     first = np.flatnonzero(~valid[:, 0])[0]
     assert first in (11, 12)
     assert valid[:first].all() and valid[20:].all()
@@ -99,8 +98,7 @@ def test_a_hand_may_let_go_and_take_hold_twice():
 
 def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_same():
     """The body is turned over while the hand is away, so that another side of it is where the hand comes back."""
-    away = leaving(10)
-    away[20:] = 0.0
+    away = back_at(20)
     bodies = scene(away)[2]
     turned = bodies.copy()
     turned[15:, :60, 2] *= -1
@@ -114,14 +112,8 @@ def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_sam
 
 
 def test_no_hold_is_taken_after_the_training_frames():
-    away = leaving(10)
-    away[24:] = 0.0
-    assert held(away)[24:].all()
-    assert not held(away, train_end=22)[13:, :2].any()
-
-
-def test_a_hand_that_was_never_near_has_not_let_go():
-    assert held(np.full(FRAMES, 0.3)) is ALWAYS
+    assert held(back_at(24))[24:].all()
+    assert not held(back_at(24), train_end=22)[13:, :2].any()
 
 
 def test_a_hand_is_near_if_what_is_seen_of_it_is():

@@ -81,11 +81,6 @@ def test_hostile_writes_are_refused_and_change_nothing(client, headers, status):
     assert not (client.server.capture.folder / "marks.json").exists()
 
 
-def test_all_under_api_needs_the_token(client):
-    for path in ("/api/state", "/api/color/0/0", "/api/masks", "/api/nothing"):
-        assert client.raw("GET", path, X_NeuSpring_Token=None)[0] == 401
-
-
 def test_requests_of_the_page_itself_are_taken(client):
     origin = f"http://127.0.0.1:{client.port}"
     status, headers, _ = client.raw("GET", "/api/state", Origin=origin, Sec_Fetch_Site="same-origin")
@@ -130,9 +125,11 @@ def test_bodies_that_are_no_object_are_refused(client, body):
     assert client.raw("POST", "/api/marks", body)[0] == 400
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "PATCH"])
-def test_other_methods_are_not_there(client, method):
-    assert client.raw(method, "/api/marks")[0] == 405
+def test_all_under_api_needs_the_token_and_other_methods_are_not_there(client):
+    for path in ("/api/state", "/api/color/0/0", "/api/masks", "/api/nothing"):
+        assert client.raw("GET", path, X_NeuSpring_Token=None)[0] == 401
+    for method in ("PUT", "DELETE", "OPTIONS", "PATCH"):
+        assert client.raw(method, "/api/marks")[0] == 405
 
 
 def test_the_page_comes_from_the_package_alone(client):
@@ -145,26 +142,19 @@ def test_the_page_comes_from_the_package_alone(client):
         assert b"://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
 
 
-@pytest.mark.parametrize(
-    ("where", "message"),
-    [
+def test_addresses_that_cannot_be_had_say_the_next_move(client):
+    for where, message in (
         ({"port": 70000}, "--port: must be 0 to 65535"),
+        ({"port": client.port}, "--port: must be a free port"),
         ({"host": "192.0.2.1"}, "--host: must be an address of this machine"),
         ({"host": "no.such.name.invalid"}, "--host: must be an address of this machine"),
-    ],
-)
-def test_addresses_that_cannot_be_had_say_the_next_move(tmp_path, where, message):
-    with pytest.raises(InputError, match=message):
-        Server(moving(tmp_path), **where)
+    ):
+        with pytest.raises(InputError, match=message):
+            Server(client.server.capture, **where)
 
 
-def test_a_port_in_use_says_the_next_move(client, tmp_path):
-    with pytest.raises(InputError, match="--port: must be a free port"):
-        Server(moving(tmp_path), port=client.port)
-
-
-def test_the_address_has_the_token_where_no_server_logs_it(tmp_path):
-    server = Server(moving(tmp_path))
+def test_the_address_has_the_token_where_no_server_logs_it(client):
+    server = Server(client.server.capture)
     try:
         assert server.url == f"http://127.0.0.1:{server.port}/#{server.token}"
         assert len(server.token) >= 20

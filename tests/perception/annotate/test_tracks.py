@@ -30,22 +30,16 @@ def one(*clicks, name="ear", camera="0"):
     return {"format": 1, "points": [{"name": name, "clicks": {camera: list(clicks)}}]}
 
 
-def test_what_is_written_is_read_and_says_no_more_than_needed(tmp_path):
+def test_what_is_written_is_read_in_the_order_of_frames_and_says_no_more_than_needed(tmp_path):
     capture = moving(tmp_path)
+    assert Annotations.load(capture).points == ()
     clicks = (Click(frame=0, x=5.0, y=6.5), Click(frame=3, hidden=True))
     annotations = Annotations(points=(ClickedPoint(name="left ear", clicks={"0": clicks}), ClickedPoint(name="tail")))
     annotations.save(tmp_path)
     assert Annotations.load(capture) == annotations
     stored = json.loads((tmp_path / ANNOTATIONS).read_text())
     assert stored["points"][0]["clicks"]["0"] == [{"frame": 0, "x": 5.0, "y": 6.5}, {"frame": 3, "hidden": True}]
-
-
-def test_a_capture_without_the_file_has_no_points(tmp_path):
-    assert Annotations.load(moving(tmp_path)).points == ()
-
-
-def test_clicks_are_sorted_by_frame(tmp_path):
-    read = Annotations.read(one(click(frame=9), click(frame=1)), moving(tmp_path), "here")
+    read = Annotations.read(one(click(frame=9), click(frame=1)), capture, "here")
     assert [click.frame for click in read.points[0].clicks["0"]] == [1, 9]
 
 
@@ -99,15 +93,18 @@ def test_between_two_clicks_both_directions_count_by_their_distance(tmp_path):
     np.testing.assert_allclose(trail.apart[1:10], 2, atol=PIXELS)
 
 
-def test_hidden_frames_have_no_place(tmp_path):
-    clicks = [at(2), Click(frame=4, hidden=True), at(9)]
-    known = np.isfinite(follow(GrayImages(moving(tmp_path)), "0", clicks).places).all(axis=1)
-    assert known.tolist() == [True] * 4 + [False] * 5 + [True] * 3
-
-
-def test_a_point_that_is_hidden_from_the_start_appears_with_its_click(tmp_path):
-    trail = follow(GrayImages(moving(tmp_path)), "0", [Click(frame=0, hidden=True), at(6)])
-    assert np.isfinite(trail.places).all(axis=1).tolist() == [False] * 6 + [True] * 6
+@pytest.mark.parametrize(
+    ("clicks", "missing", "known"),
+    [
+        ([at(2), Click(frame=4, hidden=True), at(9)], (), [0, 1, 2, 3, 9, 10, 11]),
+        ([Click(frame=0, hidden=True), at(6)], (), [6, 7, 8, 9, 10, 11]),
+        ([at(0)], (4, 5), [0, 1, 2, 3, 6, 7, 8, 9, 10, 11]),
+    ],
+)
+def test_hidden_and_missing_frames_have_no_place(tmp_path, clicks, missing, known):
+    trail = follow(GrayImages(moving(tmp_path, missing=missing)), "0", clicks)
+    assert np.flatnonzero(np.isfinite(trail.places).all(axis=1)).tolist() == known
+    assert np.nanmax(error(trail)) < PIXELS
 
 
 def test_a_covered_point_is_lost_and_found_again(tmp_path):
@@ -115,13 +112,6 @@ def test_a_covered_point_is_lost_and_found_again(tmp_path):
     seen = np.isfinite(trail.places).all(axis=1)
     assert not seen[list(COVERED)].any()
     assert seen[[1, 2, 3, 4, 7, 8, 9, 10]].all()
-    assert np.nanmax(error(trail)) < PIXELS
-
-
-def test_missing_frames_are_skipped(tmp_path):
-    trail = follow(GrayImages(moving(tmp_path, missing=(4, 5))), "0", [at(0)])
-    seen = np.isfinite(trail.places).all(axis=1)
-    assert np.flatnonzero(~seen).tolist() == [4, 5]
     assert np.nanmax(error(trail)) < PIXELS
 
 
@@ -144,7 +134,8 @@ def body(tmp_path_factory):
     return capture, points
 
 
-def test_a_clicked_body_is_followed_to_a_pixel_in_every_camera(body):
+def test_a_clicked_body_is_followed_to_a_pixel_and_lifted_to_millimeters(body):
+    """A pixel of these small images is 4.4 mm wide where the body is."""
     capture, points = body
     images, errors = GrayImages(capture), []
     for number, point in points.items():
@@ -154,11 +145,6 @@ def test_a_clicked_body_is_followed_to_a_pixel_in_every_camera(body):
     assert np.isfinite(errors).all()
     assert np.median(errors) < 0.4
     assert np.max(errors) < 1.5
-
-
-def test_a_clicked_body_is_lifted_to_millimeters(body):
-    """A pixel of these small images is 4.4 mm wide where the body is."""
-    capture, points = body
     tracks, _ = tracks_of(capture, Annotations(points=tuple(points.values())))
     distance = np.linalg.norm(tracks - capture.tracks()[:, list(points)], axis=2)
     assert np.isfinite(distance).all()
@@ -253,11 +239,6 @@ def test_what_is_doubtful_is_noted_with_its_worst_frame(capture, what, frames, v
     spoiled = {"trail.apart": trail.apart, "trail.alike": trail.alike, "track.places": track[0], "track.apart": track[1]}
     spoiled[what][frames] = value
     assert note_texts(capture, trail, track) == [note]
-
-
-def test_tracks_need_a_point(capture):
-    with pytest.raises(InputError, match="a point or more must be clicked"):
-        tracks_of(capture, Annotations())
 
 
 def test_the_script_of_the_page_makes_tracks(tmp_path):
