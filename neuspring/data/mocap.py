@@ -32,6 +32,8 @@ from neuspring.core.findings import Finding, broken, refusal, refuse, unusual
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
 
+X, Y, Z = np.eye(3)
+
 
 def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, nearest: float, where: str) -> np.ndarray:
     """Points [T, 4 * count, 3], m, of rings around held markers [T, 4, 3] (two at either end, in the order along the cable).
@@ -49,13 +51,14 @@ def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, nea
         directions = along / length
         transported = transport(directions, normal)
         across = np.cross(directions, transported)
-        parts += [end[:, [k]] + circle(transported, across, radius, count) for k in (0, 1)]
+        parts += [end[:, [k]] + circle(transported, across, radius, count, 0.5) for k in (0, 1)]
     return np.concatenate(parts, axis=1)
 
 
-def circle(normal: np.ndarray, across: np.ndarray, radius: float, count: int) -> np.ndarray:
-    """Offsets [..., count, 3], m, of a clamp's points from its marker, with unit vectors [..., 3] normal to the cable."""
-    angle = (2 * np.pi * (np.arange(count) + 0.5) / count)[:, None]
+def circle(normal: np.ndarray, across: np.ndarray, radius: float, count: int, turn: float = 0.0) -> np.ndarray:
+    """Offsets [..., count, 3], m, from the center of a circle, with unit vectors [..., 3] normal to the cable. The first lies along
+    `normal`, or `turn` steps of the angle from it."""
+    angle = (2 * np.pi * (np.arange(count) + turn) / count)[:, None]
     offsets: np.ndarray = radius * (np.cos(angle) * normal[..., None, :] + np.sin(angle) * across[..., None, :])
     return offsets
 
@@ -117,7 +120,11 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
     body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
-    _require_distance(file, markers[0], body)
+    points = np.concatenate([markers[0], body])
+    nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
+    if nearest < MIN_DISTANCE:
+        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart (mocap.spacing, mocap.radius)"
+        raise InputError(file, rule, f"{nearest:.2g} m", "Choose a larger radius or spacing.")
     rest_shape = NO_REST_SHAPE
     if settings.rest_shape == "straight":
         line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
@@ -130,10 +137,12 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         turning = clamps(recorded, normals, settings.radius, settings.ring, MIN_DISTANCE, str(file))
         controllers = np.concatenate([controllers, turning[:: settings.stride]], axis=1)
         if len(rest_shape):
-            around = circle(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), settings.radius, settings.ring)
+            around = circle(Y, Z, settings.radius, settings.ring, 0.5)
             rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
-    motion_valid = np.ones(observed.shape[:2], dtype=bool)
+    visible = np.ones(observed.shape[:2], dtype=bool)
+    motion_valid = visible.copy()
     motion_valid[-1] = False
+    options = ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
     return Observations(
         scenario=Scenario(
             name=row.scenario,
@@ -145,10 +154,10 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
             up="+z",
             self_collision=row.self_collision,
             ground=row.ground,
-            provenance={file.name: f"sha256:{digest_file(file)}", "options": _options(settings)},
+            provenance={file.name: f"sha256:{digest_file(file)}", "options": options},
         ),
         object_points=observed,
-        object_visibility=np.ones(observed.shape[:2], dtype=bool),
+        object_visibility=visible,
         object_motion_valid=motion_valid,
         controller_points=controllers,
         surface_points=body,
@@ -156,19 +165,6 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         tracks=observed,
         rest_shape=rest_shape,
     )
-
-
-def _options(settings: Mocap) -> str:
-    return ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
-
-
-def _require_distance(file: Path, markers: np.ndarray, body: np.ndarray) -> None:
-    """Raise InputError where ring nodes lie on a marker or on each other."""
-    points = np.concatenate([markers, body])
-    distance = cKDTree(points).query(points, k=2)[0][:, 1]
-    if distance.min() < MIN_DISTANCE:
-        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart (mocap.spacing, mocap.radius)"
-        raise InputError(file, rule, f"{distance.min():.2g} m", "Choose a larger radius or spacing.")
 
 
 def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number: int | None = None) -> np.ndarray:
@@ -180,11 +176,7 @@ def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number
     """
     centers, tangents = centerline(markers, spacing, number)
     normals = _transported_normals(tangents)
-    binormals = np.cross(tangents, normals)
-    angle = 2 * np.pi * np.arange(count) / count
-    offsets = np.cos(angle)[:, None] * normals[:, None] + np.sin(angle)[:, None] * binormals[:, None]
-    nodes: np.ndarray = (centers[:, None] + radius * offsets).reshape(-1, 3)
-    return nodes
+    return np.asarray((centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)).reshape(-1, 3))
 
 
 def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -195,10 +187,8 @@ def straightened(markers: np.ndarray, number: int, radius: float, count: int) ->
     _, knots, dense, arc = _arc(markers)
     line = np.zeros((len(markers), 3))
     line[:, 0] = np.interp(knots, dense, arc)
-    angle = 2 * np.pi * np.arange(count) / count
-    circle = radius * np.stack([np.zeros(count), np.cos(angle), np.sin(angle)], axis=1)
-    centers = np.linspace(0.0, arc[-1], number)[:, None, None] * np.array([1.0, 0.0, 0.0])
-    return line, (centers + circle).reshape(-1, 3)
+    centers = np.linspace(0.0, arc[-1], number)[:, None, None] * X
+    return line, (centers + circle(Y, Z, radius, count)).reshape(-1, 3)
 
 
 def centerline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -252,11 +242,8 @@ def recording_findings(file: Path, raw: Any) -> list[Finding]:
         frame, axis, marker = (int(i) for i in bad[0])
         place = f"{data[frame, axis, marker]} at frame {frame}, marker {marker} ({len(bad)} in all)"
         findings.append(broken(file, "", "every coordinate must be finite", place))
-    return findings or _marker_findings(file, data)
-
-
-def _marker_findings(file: Path, data: np.ndarray) -> list[Finding]:
-    findings = []
+    if findings:
+        return findings
     if data.dtype != np.float64:
         findings.append(unusual(file, "", "the released dtype is float64", data.dtype))
     if len(data) != RELEASED_SAMPLES:
@@ -264,11 +251,8 @@ def _marker_findings(file: Path, data: np.ndarray) -> list[Finding]:
     length = np.linalg.norm(np.diff(data, axis=2), axis=1)
     short = np.argwhere(length[0] < MIN_DISTANCE)
     if len(short):
-        i = int(short[0, 0])
-        findings.append(
-            broken(file, "", f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0", f"markers {i} and {i + 1}")
-        )
-        return findings
+        i, rule = int(short[0, 0]), f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0"
+        return [*findings, broken(file, "", rule, f"markers {i} and {i + 1}")]
     stretch = np.abs(length / np.median(length, axis=0) - 1)
     frame, segment = np.unravel_index(int(stretch.argmax()), stretch.shape)
     if stretch[frame, segment] > MAX_STRETCH:

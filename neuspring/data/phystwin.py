@@ -1,7 +1,7 @@
 """PhysTwin's folders `data/different_types/{case}/`: processed -> Observations, raw -> a capture folder; the table of its 22 cases.
 
-Layout: the released PhysTwin data. Each `*_departures` function lists everything in one file that the reader refuses (errors) or
-that departs from the released layout without harm (warnings); `read` and `convert` raise the first error, `neuspring check-data`
+Layout: the released PhysTwin data. Each `*_findings` function lists everything in one file that the reader refuses (errors) or
+that is not as released and harmless (warnings); `read` and `convert` raise the first error, `neuspring check-data`
 prints them all. Of raw cases images are linked where the file system allows it, else copied; masks are put together from one image
 per detection.
 """
@@ -112,10 +112,8 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     refuse(split_findings(split_path, split, frames))
     used = [data_path, split_path]
 
-    tracks = np.zeros((frames, 0, 3))
-    if (folder / TRACKS).exists():
-        tracks = load_pickle(folder / TRACKS)
-        refuse(tracks_findings(folder / TRACKS, tracks, frames))
+    tracks = annotated(folder, frames)
+    if tracks is not None:
         used.append(folder / TRACKS)
     frame_rate = RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
@@ -143,7 +141,7 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
         controller_points=data["controller_points"],
         surface_points=data["surface_points"],
         interior_points=data["interior_points"],
-        tracks=tracks,
+        tracks=np.zeros((frames, 0, 3)) if tracks is None else tracks,
     )
 
 
@@ -154,67 +152,16 @@ def final_data_findings(path: Path, data: Any) -> list[Finding]:
         return findings
     for rule in ARRAYS:
         value = data.get(rule.key)
-        if isinstance(value, np.ndarray) and value.dtype.kind == "f" == rule.kind and value.ndim == len(rule.shape):
-            findings += _number_findings(path, rule, value)
-    if not any(d.level == "error" for d in findings):
-        findings += _content_findings(path, data)
-    return findings
-
-
-def structure_findings(path: Path, data: Any) -> list[Finding]:
-    """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
-    if not isinstance(data, dict):
-        return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
-    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
-    findings = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
-    sizes: dict[str, int] = {}
-    for rule in ARRAYS:
-        if rule.key in data:
-            findings += _array_findings(path, rule, data[rule.key], sizes)
-        else:
-            findings.append((broken if rule.required else unusual)(path, rule.key, "this key is missing"))
-    return findings
-
-
-def _array_findings(path: Path, rule: ArrayRule, value: Any, sizes: dict[str, int]) -> list[Finding]:
-    """Type, shape and dtype of one array. `sizes` collects the symbolic dimensions of the file."""
-    shape = f"[{', '.join(rule.shape)}]"
-    severity = broken if rule.required else unusual
-    if not isinstance(value, np.ndarray):
-        return [severity(path, rule.key, f"an array {shape} is required", type(value).__name__)]
-    if value.ndim != len(rule.shape):
-        return [severity(path, rule.key, f"the shape must be {shape}", value.shape)]
-    findings = []
-    for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
-        wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
-        if size != wanted:
-            message = f"the shape must be {shape} with {wanted} entries along axis {axis}"
-            findings.append(severity(path, rule.key, message, value.shape))
-    if value.dtype.kind != rule.kind:
-        findings.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
-    return findings
-
-
-def _number_findings(path: Path, rule: ArrayRule, value: np.ndarray) -> list[Finding]:
-    findings = []
-    if value.dtype != np.float64:
-        findings.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
-    bad = np.argwhere(~np.isfinite(value))
-    if len(bad):
-        severity = broken if rule.required else unusual
-        findings.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
-    return findings
-
-
-def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
-    """'nan at frame 3, point 17 (5 in all)' for rows `bad` of np.argwhere on a [T, K, 3] or [K, 3] array."""
-    first = tuple(int(i) for i in bad[0])
-    place = f"frame {first[0]}, point {first[1]}" if value.ndim == 3 else f"point {first[0]}"
-    return f"{value[first]} at {place} ({len(bad)} in all)"
-
-
-def _content_findings(path: Path, data: dict[str, Any]) -> list[Finding]:
-    findings = []
+        if rule.kind != "f" or not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.ndim != len(rule.shape):
+            continue
+        if value.dtype != np.float64:
+            findings.append(unusual(path, rule.key, "the released dtype is float64", value.dtype))
+        bad = np.argwhere(~np.isfinite(value))
+        if len(bad):
+            severity = broken if rule.required else unusual
+            findings.append(severity(path, rule.key, "every coordinate must be finite", describe_bad(value, bad)))
+    if any(d.level == "error" for d in findings):
+        return findings
     frames, points = data["object_visibilities"].shape
     if points == 0:
         findings.append(broken(path, "object_points", "at least one tracked object point is required", "none"))
@@ -227,6 +174,41 @@ def _content_findings(path: Path, data: dict[str, Any]) -> list[Finding]:
         rule = "every tracked point must be visible in frame 0, which is the rest state"
         findings.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
     return findings
+
+
+def structure_findings(path: Path, data: Any) -> list[Finding]:
+    """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
+    if not isinstance(data, dict):
+        return [broken(path, "", "a dict of arrays is required", type(data).__name__)]
+    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
+    findings = [unusual(path, str(key), "unknown key, not read") for key in data if key not in keys]
+    sizes: dict[str, int] = {}
+    """The symbolic dimensions of the file."""
+    for rule in ARRAYS:
+        severity = broken if rule.required else unusual
+        shape, value = f"[{', '.join(rule.shape)}]", data.get(rule.key)
+        if rule.key not in data:
+            findings.append(severity(path, rule.key, "this key is missing"))
+        elif not isinstance(value, np.ndarray):
+            findings.append(severity(path, rule.key, f"an array {shape} is required", type(value).__name__))
+        elif value.ndim != len(rule.shape):
+            findings.append(severity(path, rule.key, f"the shape must be {shape}", value.shape))
+        else:
+            for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
+                wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
+                if size != wanted:
+                    message = f"the shape must be {shape} with {wanted} entries along axis {axis}"
+                    findings.append(severity(path, rule.key, message, value.shape))
+            if value.dtype.kind != rule.kind:
+                findings.append(severity(path, rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
+    return findings
+
+
+def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
+    """'nan at frame 3, point 17 (5 in all)' for rows `bad` of np.argwhere on a [T, K, 3] or [K, 3] array."""
+    first = tuple(int(i) for i in bad[0])
+    place = f"frame {first[0]}, point {first[1]}" if value.ndim == 3 else f"point {first[0]}"
+    return f"{value[first]} at {place} ({len(bad)} in all)"
 
 
 def split_findings(path: Path, split: Any, frames: int) -> list[Finding]:
@@ -243,14 +225,9 @@ def split_findings(path: Path, split: Any, frames: int) -> list[Finding]:
             findings.append(broken(path, key, f"the range must lie within the {frames} frames of {FINAL_DATA}", value))
         elif key == "train" and value[1] < 2:
             findings.append(broken(path, key, "at least one frame after frame 0 must be for training", value))
-    if not findings:
-        findings += _split_warnings(path, split, frames)
-    return findings
-
-
-def _split_warnings(path: Path, split: dict[str, Any], frames: int) -> list[Finding]:
+    if findings:
+        return findings
     end = int(0.7 * frames)
-    findings = []
     for key, wanted in (("train", [0, end]), ("test", [end, frames])):
         if split[key] != wanted:
             meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
@@ -296,10 +273,6 @@ def frame_rate_findings(path: Path, metadata: Any) -> list[Finding]:
     return []
 
 
-HAND_PHRASE = "hand"
-"""The detected phrase of hands. The one detection of a camera with another phrase is the object."""
-
-
 def has_images(case: Path) -> bool:
     """Whether a case's folder holds what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (METADATA, CALIBRATION))
@@ -320,7 +293,6 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         frame_count=frames,
         frame_rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
         cameras=tuple(camera.entry() for camera in cameras_of(metadata, poses)),
-        depth_unit=0.001,
         depth_format="npy",
         up="-z",
         train_end=train_end_of(case, frames),
@@ -328,12 +300,18 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
     )
     writer = Writer(folder, description)
-    capture = writer.capture
-    for name, camera in capture.cameras.items():
+    for name, camera in writer.capture.cameras.items():
         ids = detections(case, name) if has_masks else {}
         for frame in range(frames):
-            _link(case / "color" / name / f"{frame}.png", capture.path("color", name, frame))
-            _link(case / "depth" / name / f"{frame}.npy", capture.path("depth", name, frame))
+            for kind, ending in (("color", "png"), ("depth", "npy")):
+                source, target = case / kind / name / f"{frame}.{ending}", folder / kind / name / f"{frame:05d}.{ending}"
+                if not source.is_file():
+                    raise InputError(source, "this image must exist", "no such file")
+                make_way(target)
+                try:
+                    os.link(source, target)
+                except OSError:
+                    shutil.copyfile(source, target)
             if has_masks:
                 writer.mask(name, frame, labels_of(case, camera, frame, ids))
     return writer.finish(annotated(case, frames))
@@ -417,9 +395,9 @@ def detections(case: Path, camera: str) -> dict[int, list[str]]:
     info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
         raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
-    objects = [key for key, phrase in info.items() if phrase != HAND_PHRASE]
+    objects = [key for key, phrase in info.items() if phrase != "hand"]
     if len(objects) != 1:
-        rule = f"exactly one detection must not be {HAND_PHRASE!r}: the object"
+        rule = "exactly one detection must not be 'hand': the object"
         raise InputError(path, rule, info, "Remove the others from this file, or give them the phrase 'hand'.")
     return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
 
@@ -452,13 +430,3 @@ def train_end_of(case: Path, frames: int) -> int | None:
     split = load_json(path)
     refuse(split_findings(path, split, frames))
     return int(split["train"][1])
-
-
-def _link(source: Path, target: Path) -> None:
-    if not source.is_file():
-        raise InputError(source, "this image must exist", "no such file")
-    make_way(target)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)

@@ -32,18 +32,9 @@ HUMAN = "0"
 LARGEST = 1e30
 """Larger values are refused, like infinity and NaN."""
 OPTIMAL_KEYS = (
-    "global_spring_Y",
-    "object_radius",
-    "object_max_neighbours",
-    "controller_radius",
-    "controller_max_neighbours",
-    "collide_elas",
-    "collide_fric",
-    "collide_object_elas",
-    "collide_object_fric",
-    "collision_dist",
-    "drag_damping",
-    "dashpot_damping",
+    *("global_spring_Y", "object_radius", "object_max_neighbours", "controller_radius", "controller_max_neighbours"),
+    *("collide_elas", "collide_fric", "collide_object_elas", "collide_object_fric", "collision_dist"),
+    *("drag_damping", "dashpot_damping"),
 )
 CONTACT_KEYS = {
     "ground_elasticity": "collide_elas",
