@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuspring.core.artifacts import Topology, Trajectory, Twin
+from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.twin import rollout
@@ -264,16 +264,3 @@ def test_an_unstable_rollout_is_refused() -> None:
     twin = twin_of(replace(body, simulation=replace(body.simulation, frame_time=1.0, substeps=1)), x, hands[0])
     with pytest.raises(InputError, match="substep must stay below"):
         rollout.roll_out(twin, hands)
-
-
-def test_a_topology_without_springs_rolls_out() -> None:
-    body = scene(2, gravity=9.8, on_ground=True, substeps=10, frame_time=0.1)
-    topology = Topology(
-        nodes=np.array([[0, 0, 1.0], [0, 0, 2.0]]),
-        controllers=np.zeros((1, 3)),
-        springs=np.zeros((0, 2), np.int32),
-        rest_lengths=np.zeros(0),
-        labels=np.zeros(2, np.int32),
-    )
-    twin = Twin(topology=topology, material=twin_of(body, np.zeros((2, 3)), np.zeros((1, 3))).material, simulation=body.simulation)
-    assert len(rollout.roll_out(twin, np.zeros((3, 1, 3))).positions) == 3

@@ -35,21 +35,12 @@ def true_problem(**settings) -> FitProblem:
     return small.fit_problem(twin=start, fit=config.Fit(**({"epochs": 12, "learning_rate": 3e-2} | settings)))
 
 
-@pytest.mark.parametrize("horizon", [1, 3])
-def test_training_lowers_the_loss_on_exact_data(horizon):
-    result = fit(true_problem(horizon=horizon))
-    losses = result.history["loss"]
-    assert losses.iloc[-1] < 0.7 * losses.iloc[0]
-    assert result.rollbacks == []
-
-
 def field_fit(**settings) -> config.Fit:
     """Settings of a fit of a small field."""
     return config.Fit(**({"epochs": 5, "learning_rate": 1e-2, "checkpoint_every": 1, "field": FIELD} | settings))
 
 
-@pytest.mark.parametrize("horizon", [1, 0])
-@pytest.mark.parametrize("field", [{}, {"triplane": False}], ids=str)
+@pytest.mark.parametrize(("field", "horizon"), [({}, 1), ({"triplane": False}, 0)], ids=str)
 def test_a_field_lowers_the_loss(field, horizon):
     settings = field_fit(
         epochs=8 if horizon else 12,
@@ -83,6 +74,7 @@ GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0, checkpoint
 EVERYTHING = {
     "kind": "field",
     "fit": field_fit(
+        epochs=4,
         global_stiffness=True,
         controller_factors=True,
         damping="homogeneous",
@@ -101,7 +93,7 @@ LIMITED = {
 
 @pytest.mark.parametrize(
     ("changes", "killed_in"),
-    [(GROWING, 10), (EVERYTHING, 4), (LIMITED, 3)],
+    [(GROWING, 10), (EVERYTHING, 3), (LIMITED, 3)],
     ids=["growing", "everything", "limited"],
 )
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
@@ -138,12 +130,6 @@ def assert_same_twin(twin: Twin, expected: Twin) -> None:
     for name in SCALARS:
         # The physics is computed in single precision, so a fit rounds scalars to it.
         assert np.float32(getattr(twin.material, name)) == np.float32(getattr(expected.material, name)), name
-
-
-def test_the_seed_decides_the_first_weights_of_a_field():
-    runs = [fit(small.fit_problem(kind="field", fit=field_fit(epochs=2), seed=seed)) for seed in (0, 0, 1)]
-    assert_same_twin(runs[0].twin, runs[1].twin)
-    assert not np.array_equal(runs[0].twin.material.stiffness, runs[2].twin.material.stiffness)
 
 
 def test_a_non_finite_gradient_rolls_back_and_is_reported(monkeypatch):
@@ -256,8 +242,8 @@ def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epoch
     assert eligible == [0, 20, 29]
 
 
-@pytest.mark.parametrize("changes", [{}, EVERYTHING, {"simulation": config.Simulation(initial_velocity="observed")}])
-def test_the_future_is_never_read(changes):
+def test_the_future_is_never_read():
+    changes = EVERYTHING | {"simulation": config.Simulation(initial_velocity="observed")}
     first, second = (fit(small.fit_problem(seen, **changes)) for seen in (small.observations(), small.spoiled_future()))
     assert_same_twin(first.twin, second.twin)
     pd.testing.assert_frame_equal(first.history, second.history, check_exact=True)

@@ -47,9 +47,8 @@ def test_a_fit_simulates_what_a_rollout_does():
     assert np.abs(outcome(problem.twin, seen) - roll_out(problem.twin, seen.controller_points).positions).max() > 1e-4
 
 
-@pytest.mark.parametrize("horizon", [1, 0])
-def test_a_fit_lowers_its_loss_and_does_not_read_the_future(horizon):
-    settings = config.Fit(epochs=3, learning_rate=5e-2, horizon=horizon)
+def test_a_fit_lowers_its_loss_and_does_not_read_the_future():
+    settings = config.Fit(epochs=3, learning_rate=5e-2, horizon=0)
     first, second = (
         fit(small.fit_problem(regripped(seen), fit=settings)) for seen in (small.observations(), small.spoiled_future())
     )

@@ -3,11 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Observations
-from neuspring.core.errors import InputError
 from neuspring.core.geometry import Obstacle
 from neuspring.twin.fit import fit
 from neuspring.twin.rollout import roll_out
@@ -38,12 +36,3 @@ def test_search_fit_rollout_and_transfer_carry_the_obstacles_of_a_scenario(tmp_p
     free = replace(trained, simulation=replace(trained.simulation, obstacles=()))
     assert np.abs(positions - roll_out(free, seen.controller_points).positions).max() > 1e-3
     assert move(free, seen)[0].simulation.obstacles == (SHELF,)
-
-
-def test_files_without_obstacles_do_not_name_them_and_bad_ones_are_named(tmp_path):
-    seen = small.observations()
-    seen.save(tmp_path / "plain.npz")
-    with np.load(tmp_path / "plain.npz") as file:
-        assert "obstacles" not in str(file["meta"])
-    with pytest.raises(InputError, match=r"scenario small.obstacles\[0\].half_sizes: three positive half sizes"):
-        replace(seen.scenario, obstacles=(replace(SHELF, half_sizes=(1.0, 0.0, 1.0)),))

@@ -65,17 +65,6 @@ def test_an_oracle_reads_what_comes_after_the_split():
     assert not np.array_equal(*map(parameters, results))
 
 
-def test_an_oracle_comes_closer_to_the_future():
-    seen = small.observations()
-    end, points = seen.scenario.train_end, seen.object_points.shape[1]
-    errors = []
-    for oracle in (False, True):
-        twin = fit(small.fit_problem(oracle=oracle, fit=config.Fit(epochs=12, learning_rate=5e-2, horizon=0))).twin
-        gap = roll_out(twin, seen.controller_points).positions[end:, :points] - seen.object_points[end:]
-        errors.append(np.square(gap).sum(axis=2).mean())
-    assert errors[1] < errors[0]
-
-
 def test_only_an_oracles_loss_holds_the_future():
     seen = small.observations()
     scenario = seen.scenario
@@ -87,12 +76,6 @@ def test_only_an_oracles_loss_holds_the_future():
 def test_an_oracle_holds_no_tail_back():
     with pytest.raises(InputError, match=r"fit\.selection: an oracle is fitted on all frames"):
         small.fit_problem(oracle=True, fit=config.Fit(selection="tail"))
-
-
-def test_settings_cannot_make_an_oracle():
-    """Only a row of the method table can: no key of any section does."""
-    with pytest.raises(InputError, match="oracle"):
-        config.parse(config.Fit, {"oracle": True}, "fit")
 
 
 @pytest.fixture(scope="module")

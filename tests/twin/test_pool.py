@@ -32,6 +32,12 @@ PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
 
 
+@pytest.fixture(autouse=True)
+def any_share(monkeypatch):
+    """The polish may take nearly the whole budget, which is small here."""
+    monkeypatch.setattr("neuspring.config.search.POLISH_SHARE", 0.9)
+
+
 def seen(path: str) -> Observations:
     """The same rope, moved in one of two ways."""
     return small.scene(path).observations
@@ -40,7 +46,7 @@ def seen(path: str) -> Observations:
 def polished(own: Observations, **changes) -> SearchProblem:
     """A search of one generation with a polish of one round."""
     start = {"object_radius": 0.045, "stiffness": 6e3}
-    polish = {"rounds": 1, "share": 0.9}
+    polish = {"rounds": 1}
     return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=polish, **POLISHED), **changes)
 
 
@@ -74,21 +80,7 @@ def spoiled(observations: Observations) -> Observations:
 # Search ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_candidate_costs_the_mean_of_its_costs_on_each_recording():
-    both = searched(LIFTED, SHAKEN)
-    first = both["generation"] == 0
-    # Later generations propose other candidates.
-    alone, moved = searched(LIFTED)[first], searched(LIFTED, SHAKEN, leave_out=True)[first]
-    np.testing.assert_allclose(both[first]["cost"], (alone["cost"] + moved["cost"]) / 2, rtol=MEAN)
-    assert (np.abs(alone["cost"] / moved["cost"] - 1) > 0.1).any(), "two recordings say something else"
-
-
 def test_a_recording_beside_itself_changes_nothing():
-    pd.testing.assert_frame_equal(searched(LIFTED, LIFTED), searched(LIFTED))
-    pd.testing.assert_frame_equal(searched(LIFTED, LIFTED, leave_out=True), searched(LIFTED))
-
-
-def test_a_recording_beside_itself_changes_nothing_of_a_polish():
     alone = polished(seen(LIFTED))
     expected = traced(alone)
     assert expected["stage"].tolist()[11:] == [SLOPES] * 4 + [POLISH] * 4
@@ -98,7 +90,7 @@ def test_a_recording_beside_itself_changes_nothing_of_a_polish():
 
 
 def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
-    """The same candidates, judged on both recordings, on one, and on the other."""
+    """The same candidates, judged on both recordings, on one, and on the other: as CMA-ES does, and for slopes."""
     both = on_pool(polished(seen(LIFTED)), SHAKEN)
     alone, moved = replace(both, pool=()), replace(both, leave_out=True)
     loss = FrameLoss.of(both.observations, both.losses, "cpu")
@@ -106,24 +98,14 @@ def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
     columns = [both.variables.index(name) for name in settings.polished]
     polish = Polish(settings, columns, both.encode(), 1.0)
     population, steps = polish.ask(), polish.steps()
+    costs = [[row["cost"] for row in evaluate(each, population, loss, 0, 0, map)] for each in (both, alone, moved)]
+    np.testing.assert_allclose(costs[0], np.mean(costs[1:], axis=0), rtol=1e-12)
     tables = [pd.DataFrame(module.slope_rows(each, population, steps, loss, 0, 0, map)) for each in (both, alone, moved)]
     judged = ["cost", *(name for name in tables[0] if name.startswith("product."))]
     assert len(judged) == 5
     mean, one, other = (table[judged].to_numpy() for table in tables)
     np.testing.assert_allclose(mean, (one + other) / 2, rtol=1e-12, atol=0)
     assert (np.abs(one[1:] / other[1:] - 1) > 0.1).any(), "two recordings say something else"
-
-
-def test_steps_of_a_polish_cost_the_mean_over_the_recordings():
-    problem = on_pool(polished(seen(LIFTED)), SHAKEN)
-    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    trace = traced(problem)
-    rows = trace[trace["stage"] == POLISH]
-    assert len(rows) == 4
-    population = rows[[f"normalized.{name}" for name in problem.variables]].to_numpy()
-    apart = [evaluate(each, population, loss, 0, 0, map) for each in (replace(problem, pool=()), replace(problem, leave_out=True))]
-    means = [np.mean([row["cost"] for row in pair]) for pair in zip(*apart, strict=True)]
-    np.testing.assert_allclose(rows["cost"], means, rtol=1e-12)
 
 
 def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
@@ -219,7 +201,7 @@ def test_a_pool_of_itself_alone_is_the_plain_fit(name):
 
 
 def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
-    problem, other, late = problem_of(LIFTED, oracle=True), seen(SHAKEN), small.spoiled_future()
+    problem, other, late = problem_of(LIFTED, oracle=True, epochs=1), seen(SHAKEN), small.spoiled_future()
     found = pooled(problem, other, leave_out=True)
     require_equal(found, pooled(replace(problem, observations=late), other, leave_out=True))
     own = fit(replace(problem, observations=other))
@@ -227,7 +209,7 @@ def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
     assert not np.array_equal(
         pooled(problem, late).twin.material.stiffness, pooled(problem, problem.observations).twin.material.stiffness
     )
-    plain = problem_of(LIFTED)
+    plain = problem_of(LIFTED, epochs=1)
     require_equal(pooled(plain, late), pooled(plain, plain.observations))
 
 
@@ -257,11 +239,8 @@ def test_left_out_recordings_lend_their_nodes_alone():
     assert not np.array_equal(found.twin.material.stiffness, fit(problem).twin.material.stiffness)
 
 
-@pytest.mark.parametrize(
-    "simulation", [config.Simulation(), config.Simulation(initial_velocity="observed")], ids=["plain", "observed"]
-)
-def test_search_and_polish_read_nothing_of_what_is_left_out(simulation):
-    here = seen(LIFTED)
+def test_search_and_polish_read_nothing_of_what_is_left_out():
+    here, simulation = seen(LIFTED), config.Simulation(initial_velocity="observed")
     alone = on_pool(polished(here, simulation=simulation), SHAKEN, leave_out=True)
     first, second = (traced(replace(alone, observations=o)) for o in (here, spoiled(here)))
     assert first["stage"].iloc[-1] == POLISH
@@ -284,7 +263,7 @@ def test_one_material_comes_nearer_to_two_recordings():
 
 
 def test_a_killed_fit_continues_exactly(tmp_path):
-    problem = problem_of(LIFTED, rest_shape=SHAPE)
+    problem = problem_of(LIFTED, rest_shape=SHAPE, epochs=3)
     whole = pooled(problem, seen(SHAKEN))
 
     class Killed(Exception):

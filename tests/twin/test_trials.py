@@ -79,9 +79,9 @@ def by_torch(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> float:
 
 
 @pytest.mark.parametrize("crowded", [False, True], ids=["free", "self-collision"])
-@pytest.mark.parametrize("count", [2, 6, 11])
+@pytest.mark.parametrize("count", [2, 11])
 def test_candidates_fare_together_as_alone(count, crowded):
-    """In 4, 8 and 16 lanes, with lanes to spare."""
+    """In 4 and 16 lanes, with lanes to spare."""
     problem = colliding(small.observations()) if crowded else small.search_problem()
     twins, loss = candidates(problem, count), loss_of(problem)
     assert len({t.topology.springs.tobytes() for t in twins}) == len({t.simulation.substeps for t in twins}) == min(count, 6)
