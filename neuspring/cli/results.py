@@ -34,26 +34,28 @@ def tables(
 ) -> None:
     """Run records -> tables."""
     from neuspring.config.settings import Aim
-    from neuspring.report import benchmark, gallery
+    from neuspring.report.benchmark import Benchmark, write
+    from neuspring.report.sections.pictures import write_gallery
     from neuspring.scores.runs import collect, collect_transfers, read_scores
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
-    judging = benchmark.Judging(objects=objects, aims=wanted)
     without = _read_left_out(left_out)
     if scores:
         found = read_scores(scores)
         against = baseline or str(found.runs["method"].iloc[0])
-        print(benchmark.write(replace(found, left_out=without), against, output, judging=judging))
+        found = replace(found, left_out=without)
+        print(write(Benchmark(everything=found, baseline=against, objects=objects, aims=wanted), output))
         return
     if not (scenarios and methods and seeds):
         raise InputError("tables", WHAT)
     collected = collect(results, scenarios, methods, seeds, without)
     moved = collect_transfers(results, transfers, methods, seeds)
-    print(benchmark.write(collected, baseline or methods[0], output, moved, judging))
+    against = baseline or methods[0]
+    print(write(Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved), output))
     print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in seeds if seed in finished), seeds[0])
-    print(f"Pictures and videos: {gallery.write(results, scenarios, methods, seed, collected, output)}")
+    print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, collected, output)}")
 
 
 def perception_table(

@@ -1,8 +1,8 @@
 """What people look at.
 
-- `table`: a table as one value; `blocks`: what pages are made of; both become Markdown and HTML.
+- `blocks`: what pages are made of, as HTML and as Markdown.
 - `benchmark`, `study_cells`, `study`, `notes`, `perception`: the tables, built once for files and for the page.
-- `page`: report.html; `gallery`: pictures.html.
-- `figures`, `paper`, `video`: PNG figures of runs, pictures for papers, H.264 videos.
+- `page` with its `sections`: report.html and pictures.html.
+- `draw`, `video`: pictures of runs and for papers, H.264 videos.
 - `explain`: from a cell of a table to its runs.
 """

@@ -7,7 +7,7 @@ Numbers are computed once (`Benchmark`), and become tables and sentences once (`
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +15,14 @@ from typing import Any, cast
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from neuspring.config.settings import Aim
 from neuspring.core.files import write_atomically, write_text
 from neuspring.core.table import Cell, Chip, Table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
-from neuspring.report.draw.benchmark import CLUSTERS, RATIOS, cluster_methods, clusters_figure, ratios_figure
+from neuspring.report.draw.benchmark import cluster_methods, clusters_figure, ratios_figure
+from neuspring.report.draw.sheet import save
 from neuspring.report.notes import differing_table, honest_notes
 from neuspring.report.study_cells import LEAST_SCENARIOS, ORACLE_LINE
 from neuspring.scores import failures
@@ -61,20 +63,15 @@ EMPTY = Cell(text=DASH, value="")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judging:
-    """How methods are compared: what an object is, and what was aimed at."""
-
-    objects: ratios.Objects = "scenario"
-    aims: tuple[Aim, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
 class Benchmark:
     """The numbers of a benchmark; each is computed when it is first asked for, the bootstrap takes seconds."""
 
     everything: Collected
     baseline: str
-    judging: Judging = Judging()
+    objects: ratios.Objects = "scenario"
+    """What intervals of ratios are over."""
+    aims: tuple[Aim, ...] = ()
+    """Ratios that are aimed at."""
     transfers: Collected | None = None
     """Twins on other recordings of the same object, as runs."""
 
@@ -109,17 +106,17 @@ class Benchmark:
     @cached_property
     def ratios(self) -> pd.DataFrame:
         """Ratios of errors to the baseline's, over objects."""
-        return ratios.ratios(self.finished, self.baseline, self.judging.objects)
+        return ratios.ratios(self.finished, self.baseline, self.objects)
 
     @cached_property
     def moved_ratios(self) -> pd.DataFrame:
         """The same of transferred twins."""
-        return ratios.ratios(self.moved, self.baseline, self.judging.objects)
+        return ratios.ratios(self.moved, self.baseline, self.objects)
 
     @cached_property
-    def aims(self) -> pd.DataFrame:
+    def judged(self) -> pd.DataFrame:
         """Aims and whether they are reached."""
-        return ratios.judged_aims(self.finished, self.moved, self.judging.aims, self.judging.objects)
+        return ratios.judged_aims(self.finished, self.moved, self.aims, self.objects)
 
     @cached_property
     def seeds(self) -> pd.DataFrame:
@@ -156,7 +153,7 @@ def score_blocks(benchmark: Benchmark) -> list[Block]:
         blocks.append(by_method("Spread over seeds", benchmark.seeds, cells, lambda r: Cell(text=f"{100 * r.spread:.1f} %"), about))
     if len(benchmark.ratios):
         blocks.append(ratio_table(f"Ratio of the error to that of {benchmark.baseline}", benchmark, benchmark.ratios, HEADINGS))
-    blocks += aim_table(benchmark.aims)
+    blocks += aim_table(benchmark.judged)
     if len(benchmark.differences):
         blocks.append(_differences(f"Paired difference to {benchmark.baseline}, mm", benchmark.differences, headings))
     blocks += failure_blocks(benchmark.means)
@@ -252,7 +249,7 @@ def ratio_table(caption: str, benchmark: Benchmark, table: pd.DataFrame, heading
         small = [*interval, f"(n = {row.n})"]
         return Cell(text=f"{row.ratio:.3f}", small=small, chips=[RATIO_CHIPS[row.verdict]], value=float(row.ratio))
 
-    what = {"scenario": "scenarios", "category": "categories"}[benchmark.judging.objects]
+    what = {"scenario": "scenarios", "category": "categories"}[benchmark.objects]
     note = (
         f"Geometric mean over objects of the paired log ratio to {benchmark.baseline}, seeds averaged within an object; 95 % "
         f"t-interval over objects ({what}), none below {ratios.LEAST_OBJECTS}; n objects. Every row takes all pairs of scenario "
@@ -538,35 +535,34 @@ def timing_table(runs: pd.DataFrame) -> Table:
     return Table(caption="Time and memory (medians)", header=["Method", *stages], rows=rows)
 
 
-def draw_clusters(collected: Collected, folder: Path) -> bool:
-    """Draw clusters.png if at least two methods clusters_<K> have scores.
+def pictures(benchmark: Benchmark) -> Iterator[tuple[str, str, Figure]]:
+    """File, caption and figure of the pictures that can be drawn: ratios with their intervals, and the number of regions.
 
-    Only pairs of scenario and seed count that every such method finished. A method that finished no run is left out.
+    For the latter only pairs of scenario and seed count that every method clusters_<K> finished. A method that finished no run is
+    left out.
     """
+    figure = ratios_figure(benchmark.ratios, benchmark.size if len(benchmark.usable) else "")
+    if figure:
+        yield "ratios.png", f"Ratio of every method's errors to those of {benchmark.baseline}", figure
+    collected = benchmark.everything
     runs = collected.runs[collected.runs["method"].isin(list(cluster_methods(collected.runs["method"])))]
     finished = list(cluster_methods(runs.loc[runs["status"] == "ok", "method"]))
     scores = collected.scores[collected.scores["method"].isin(finished)]
     usable = comparable(Collected(scores, runs[runs["method"].isin(finished)]))
     kept, asked = pairs(usable), pairs(runs)
     note = f"; {kept} of {asked} pairs of scenario\nand seed, those that every K finished" if kept < asked else ""
-    return clusters_figure(usable, folder / CLUSTERS, note) is not None
+    if figure := clusters_figure(usable, note):
+        yield "clusters.png", "Chamfer distance against the number of regions K", figure
 
 
-def draw_ratios(benchmark: Benchmark, folder: Path) -> bool:
-    """Draw ratios.png if there is an interval to draw."""
-    return ratios_figure(benchmark.ratios, folder / RATIOS, benchmark.size if len(benchmark.usable) else "") is not None
-
-
-def write(
-    collected: Collected, baseline: str, folder: Path, transfers: Collected | None = None, judging: Judging | None = None
-) -> str:
+def write(benchmark: Benchmark, folder: Path) -> str:
     """Write the tables of a benchmark, and return the scores in Markdown.
 
     Files: scores.csv, scores.parquet, runs.csv, averages.csv, differences.csv, held.csv (failures in the averages), floors.csv
     (errors in frame 0), ratios.csv, aims.csv, seeds.csv (spread over seeds), transfers.csv, summary.md. Where a method can be
     compared on several scenarios, also ratios.png, and with methods clusters_<K>, clusters.png; summary.md shows them.
     """
-    benchmark = Benchmark(everything=collected, baseline=baseline, judging=judging or Judging(), transfers=transfers)
+    collected, transfers = benchmark.everything, benchmark.transfers
     both = [table for table in (benchmark.ratios, benchmark.moved_ratios) if len(table)]
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
     tables = {
@@ -577,7 +573,7 @@ def write(
         "held": benchmark.means,
         "floors": floors_of(collected.runs),
         "ratios": pd.concat(both or [benchmark.ratios]),
-        "aims": benchmark.aims,
+        "aims": benchmark.judged,
         "seeds": benchmark.seeds,
         "transfers": transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS)),
     }
@@ -585,13 +581,11 @@ def write(
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     write_atomically(folder / "scores.parquet", lambda temporary: collected.scores.to_parquet(temporary, index=False))
     summary = summary_text(benchmark)
-    parts = ["# Scores\n", summary]
-    if draw_ratios(benchmark, folder):
-        parts.append(f"![Ratio of every method's errors to the baseline's]({RATIOS})\n")
-    parts.append(markdown(transfer_blocks(benchmark)))
-    if draw_clusters(collected, folder):
-        parts.append(f"## Number of regions\n\n![Chamfer distance against the number of regions K]({CLUSTERS})\n")
-    parts += [markdown(breakdown_blocks(benchmark)), markdown([timing_table(collected.runs)])]
+    for name in ("ratios.png", "clusters.png"):
+        (folder / name).unlink(missing_ok=True)
+    shown = [f"![{caption}]({save(figure, folder / name).name})\n" for name, caption, figure in pictures(benchmark)]
+    parts = ["# Scores\n", summary, *shown]
+    parts += [markdown([*transfer_blocks(benchmark), *breakdown_blocks(benchmark), timing_table(collected.runs)])]
     write_text(folder / "summary.md", "\n".join(part for part in parts if part))
     return summary
 

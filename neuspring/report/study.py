@@ -31,6 +31,7 @@ from neuspring.report import study_cells
 from neuspring.report.benchmark import failure_table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
 from neuspring.report.draw.benchmark import cluster_methods, clusters_figure
+from neuspring.report.draw.sheet import save
 from neuspring.report.notes import differing_table
 from neuspring.report.study_cells import (
     BETTER,
@@ -574,10 +575,12 @@ def _pictures(own: Collected) -> str:
 
 def _curve(numbers: StudyNumbers, path: Path) -> str:
     """The section with the picture of the number of regions, in a study of that number."""
-    scores = numbers.counted
-    if len(cluster_methods(numbers.study.rows.values())) < 2 or not len(scores) or clusters_figure(scores, path) is None:
-        path.unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+    enough = len(cluster_methods(numbers.study.rows.values())) > 1 and len(numbers.counted)
+    figure = clusters_figure(numbers.counted) if enough else None
+    if figure is None:
         return ""
+    save(figure, path)
     return f"![Chamfer distance against the number of regions K]({path.name})\n"
 
 

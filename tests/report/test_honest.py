@@ -7,8 +7,8 @@ import pytest
 
 from neuspring.core.findings import finding, told
 from neuspring.core.records import Recorder
+from neuspring.report import page as report
 from neuspring.report.notes import honest_notes
-from neuspring.report.page import page as report
 from neuspring.scores.runs import Collected
 from tests.support.report_tree import make
 from tests.support.runs import run_record

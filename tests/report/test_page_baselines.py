@@ -12,7 +12,6 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.page import Options, write
-from neuspring.report.page.material import Choice
 from neuspring.scores.paper import Study
 from tests.support import report_tree
 from tests.support.report_tree import page_section as section
@@ -101,12 +100,6 @@ def test_training_curves_stand_beside_those_of_fits(page):
     )
 
 
-def test_times_name_the_rules_and_whose_splats(page):
-    text = section(page, "work")
-    assert "train spring_gaus 1" in text and "predict static 1" in text and "rollout baseline 1" in text
-    assert "appearance spring_gaus 1" in text and "appearance shared 1" in text
-
-
 def test_jobs_of_baselines_belong_to_their_methods(results, tmp_path):
     names = ("train/rope/spring_gaus/0", "predict/rope/static/0", "appearance/rope/appearance/0")
     for name in (*names, "appearance/rope/appearance-spring_gaus/0"):
@@ -135,7 +128,7 @@ def test_what_does_not_apply_is_no_run(results):
     assert "Left out: spring_gaus on cable: it needs images." in section(page, "scores")
     assert "empty: does not apply" in section(page, "failures")
     assert "runs finished 2 of 4 2 missing" in section(report(results, **studied), "verdict")
-    choice = Choice(scenarios=("a", "b"), methods=("x", "y"), seeds=(0, 1), baseline="x", left_out={"x": ["b", "c"], "z": ["a"]})
+    choice = Options(scenarios=("a", "b"), methods=("x", "y"), seeds=(0, 1), baseline="x", left_out={"x": ["b", "c"], "z": ["a"]})
     assert choice.size == 6
 
 

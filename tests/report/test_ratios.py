@@ -13,7 +13,6 @@ from neuspring.config.settings import Aim, Config
 from neuspring.core.run_record import RunRecord
 from neuspring.report import benchmark as summary
 from neuspring.report import study as tables_study
-from neuspring.report.benchmark import Judging
 from neuspring.report.notes import differing
 from neuspring.report.study_cells import ORACLE_LINE, cells, restricted
 from neuspring.scores.paper import Study, read_studies
@@ -156,8 +155,8 @@ def test_aims_reach_the_summary_and_its_file(tmp_path):
     values = {(s, m, 0): v * (1 + 0.02 * i * (m == "y")) for i, s in enumerate("abcd") for m, v in (("x", 0.01), ("y", 0.007))}
     config = parse(Config, {"aims": [{"method": "y", "baseline": "x", "ratio": r} for r in (0.85, 0.5)]}, "here")
     assert json.loads(json.dumps(plain(config)["aims"]))[0]["below"] == 1.0
-    judging = Judging(aims=tuple(parse(Aim, row, "here") for row in plain(config)["aims"]))
-    text = summary.write(collected(values), "x", tmp_path, judging=judging)
+    aims = tuple(parse(Aim, row, "here") for row in plain(config)["aims"])
+    text = summary.write(summary.Benchmark(everything=collected(values), baseline="x", aims=aims), tmp_path)
     assert pd.read_csv(tmp_path / "aims.csv")["aim_verdict"].tolist() == ["reached", "missed"]
     assert [row[-1].plain for row in summary.aim_table(pd.read_csv(tmp_path / "aims.csv"))[0].rows] == ["reached", "missed"]
     assert "## Aims" in text

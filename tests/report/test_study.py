@@ -362,7 +362,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     for number, (method, factor) in itertools.product(range(7), methods.items()):
         write_run(tmp_path, f"cable_{number}", method, 0, {CD: 0.01 * factor * (1 + number)}, source="mocap")
     names = [f"cable_{number}" for number in range(7)]
-    tables.write(collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    tables.write(tables.Benchmark(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
     tables_paper.write_study("table2", STUDIES["table2"], tmp_path, names, [0], methods, tmp_path / "records")
     command = ["study", "--study", "table2", "--table", str(STUDY_TABLE), "--output", str(tmp_path / "scores")]
     assert main([*command, "--scores", str(tmp_path / "tables" / "scores.csv")]) == 0
@@ -374,7 +374,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     write_run(
         tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
     )
-    tables.write(collect(tmp_path, names, methods, [0]), "baseline", tmp_path / "tables")
+    tables.write(tables.Benchmark(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
     scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
     other = scores[scores["task"] == "future"].assign(task="reconstruction")
     pd.concat([scores, other]).to_csv(tmp_path / "tables" / "scores.csv", index=False)

@@ -151,7 +151,7 @@ def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_liste
 def test_missing_runs_are_listed(tmp_path):
     found = collect(tmp_path, ["a"], ["x", "y"], [0, 1])
     assert (found.runs["status"] == "missing").all()
-    text = tables.write(found, "x", tmp_path / "tables")
+    text = tables.write(tables.Benchmark(everything=found, baseline="x"), tmp_path / "tables")
     assert text.count("missing: no run.json") == 4
     assert (tmp_path / "tables" / "summary.md").is_file()
 

@@ -106,7 +106,7 @@ def test_a_method_that_failed_everywhere_has_the_mean_of_held_predictions():
 
 def test_summary_and_csv_have_both_averages(tmp_path):
     found = with_frozen(collected(VALUES, failed=LOST), {("b", "y", 0): 0.100})
-    text = tables.write(found, "x", tmp_path)
+    text = tables.write(tables.Benchmark(everything=found, baseline="x"), tmp_path)
     assert text.count("## Failures") == 1 and "published numbers of Spring-Gaus cover successful cases only" in text
     assert "## Failures" in (tmp_path / "summary.md").read_text()
     section = text.partition("## Failures")[2]
@@ -114,7 +114,7 @@ def test_summary_and_csv_have_both_averages(tmp_path):
     assert "| x      | 2/2       | all " in section
     table = pd.read_csv(tmp_path / "held.csv").set_index("method")
     assert table.loc["y", "all"] == pytest.approx(0.052)
-    assert "Failures" not in tables.write(collected(VALUES), "x", tmp_path)
+    assert "Failures" not in tables.write(tables.Benchmark(everything=collected(VALUES), baseline="x"), tmp_path)
     assert not len(pd.read_csv(tmp_path / "held.csv")), "nothing is left over from the earlier run"
 
 
@@ -245,7 +245,7 @@ def test_every_command_of_tables_takes_what_is_left_out(results, tmp_path, capsy
 
 
 def test_old_scores_say_nothing_of_held_predictions(results, tmp_path):
-    tables.write(of(results), "ours", tmp_path)
+    tables.write(tables.Benchmark(everything=of(results), baseline="ours"), tmp_path)
     again = read_scores(tmp_path / "scores.csv")
     assert not len(again.frozen) and not again.left_out
     with pytest.raises(InputError):

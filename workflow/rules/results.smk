@@ -36,7 +36,7 @@ rule tables:
         runtime=NEEDS.minutes("tables"),
     params:
         arguments=GRAPH.tables(),
-        code=code_digest("neuspring.report.benchmark", "neuspring.report.gallery"),
+        code=code_digest("neuspring.report.benchmark", "neuspring.report.sections.pictures"),
     shell:
         common_job("tables {params.arguments:q}")
 

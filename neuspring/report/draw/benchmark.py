@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from neuspring.report.draw.sheet import save
 from neuspring.scores.metrics import DISTANCES, averages
 
-RATIOS, CLUSTERS = "ratios.png", "clusters.png"
 METRIC_STYLES = (("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:purple", "D"))
 """Color and marker of each distance."""
 SHIFT = 0.24
@@ -26,13 +24,12 @@ REACH = 2.5
 """The axis ends here and at its inverse; what lies beyond stands at the edge with its number, so that it hides no other."""
 
 
-def ratios_figure(ratios: pd.DataFrame, path: Path, note: str) -> Path | None:
-    """Draw `scores.statistics.ratios`, a panel per task, methods in the order given; returns the file.
+def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
+    """Draw `scores.statistics.ratios`, a panel per task, methods in the order given.
 
-    Filled markers: the interval leaves out 1. None, and no file, if no ratio has an interval (too few objects, or nothing to
+    Filled markers: the interval leaves out 1. None if no ratio has an interval (too few objects, or nothing to
     compare). `note` is added below the title.
     """
-    path.unlink(missing_ok=True)
     rows = ratios[np.isfinite(ratios["ratio_low"])] if len(ratios) else ratios
     tasks = [task for task in TITLES if len(rows) and (rows["task"] == task).any()]
     if not tasks:
@@ -59,7 +56,7 @@ def ratios_figure(ratios: pd.DataFrame, path: Path, note: str) -> Path | None:
     objects = {"category": "categories"}.get(str(rows["objects"].iloc[0]), "scenarios") if "objects" in rows else "scenarios"
     about = f"geometric mean and 95 % interval over {objects}; filled: the interval leaves out 1"
     figure.suptitle(f"Ratio to {baseline}, {about}\n{note}", fontsize=9)
-    return save(figure, path)
+    return figure
 
 
 def _intervals(axis: Axes, part: pd.DataFrame, place: np.ndarray, color: str, marker: str, title: str) -> None:
@@ -125,12 +122,11 @@ def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     return table.sort_values(["scenario", "task", "clusters"], ignore_index=True)
 
 
-def clusters_figure(scores: pd.DataFrame, path: Path, note: str = "") -> Path | None:
-    """Draw Chamfer distance against K for scores of methods clusters_<K>; returns the file.
+def clusters_figure(scores: pd.DataFrame, note: str = "") -> Figure | None:
+    """Draw Chamfer distance against K for scores of methods clusters_<K>.
 
-    None, and no file, if fewer than two such methods have a score. `note` is added below the title.
+    None if fewer than two such methods have a score. `note` is added below the title.
     """
-    path.unlink(missing_ok=True)
     chamfer = scores[scores["metric"] == "chamfer"]
     if len(cluster_methods(chamfer["method"])) < 2:
         return None
@@ -151,7 +147,7 @@ def clusters_figure(scores: pd.DataFrame, path: Path, note: str = "") -> Path | 
     seeds = int(chamfer["seed"].nunique())
     spread = f"bars: standard deviation over {seeds} seeds" if seeds > 1 else "one seed"
     figure.suptitle(f"Chamfer distance against the number of regions\n{spread}{note}", fontsize=9)
-    return save(figure, path)
+    return figure
 
 
 def _draw(axis: Axes, curves: pd.DataFrame, *, faint: bool = False) -> None:

@@ -63,7 +63,7 @@ def test_cluster_methods_are_sorted_by_number():
 def test_the_cluster_picture_is_made_for_two_counts_or_more(tmp_path, methods, made):
     found = chamfer({key: value for key, value in STUDY.items() if key[1] in methods})
     (tmp_path / "clusters.png").write_text("of an earlier run")
-    tables.write(found, "search_only", tmp_path)
+    tables.write(tables.Benchmark(everything=found, baseline="search_only"), tmp_path)
     assert (tmp_path / "clusters.png").exists() == made
     assert ("(clusters.png)" in (tmp_path / "summary.md").read_text()) == made
     if made:
@@ -71,12 +71,9 @@ def test_the_cluster_picture_is_made_for_two_counts_or_more(tmp_path, methods, m
 
 
 @pytest.mark.parametrize("scenarios", [1, 4, 5])
-def test_few_scenarios_have_a_panel_each_and_many_share_one(tmp_path, scenarios, monkeypatch):
+def test_few_scenarios_have_a_panel_each_and_many_share_one(scenarios):
     values = {(f"s{i}", f"clusters_{k}", 0): 0.01 * (i + k) for i in range(scenarios) for k in (1, 2, 5)}
-    kept = []
-    monkeypatch.setattr(figures, "save", lambda figure, path: kept.append(figure) or path)
-    tables.write(chamfer(values), "clusters_1", tmp_path)
-    figure = kept[-1]
+    figure = figures.clusters_figure(chamfer(values).scores)
     alone = scenarios <= 4
     assert len(figure.axes) == (scenarios if alone else 1)
     lines = figure.axes[0].lines
@@ -88,12 +85,12 @@ def test_few_scenarios_have_a_panel_each_and_many_share_one(tmp_path, scenarios,
     plt.close("all")
 
 
-def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monkeypatch):
+def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(monkeypatch):
     values = {key: value for key, value in STUDY.items() if key != ("a", "clusters_10", 1)}
     failed = [("a", "clusters_10", 1), *((scenario, "clusters_4", seed) for scenario in "ab" for seed in (0, 1))]
     kept = []
-    monkeypatch.setattr(tables, "clusters_figure", lambda scores, path, note: kept.append((scores, note)))
-    assert not tables.draw_clusters(chamfer(values, failed=tuple(failed)), tmp_path)
+    monkeypatch.setattr(tables, "clusters_figure", lambda scores, note: kept.append((scores, note)))
+    assert not list(tables.pictures(tables.Benchmark(everything=chamfer(values, failed=tuple(failed)), baseline="search_only")))
     ((scores, note),) = kept
     assert set(zip(scores["scenario"], scores["seed"], strict=True)) == {("a", 0), ("b", 0), ("b", 1)}
     # clusters_4 finished no run: it is not drawn and holds nobody back.
@@ -101,9 +98,7 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(tmp_path, monk
     assert "3 of 4 pairs" in note
 
 
-def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
-    kept = []
-    monkeypatch.setattr(figures, "save", lambda figure, path: kept.append(figure) or path)
+def test_ratios_are_drawn_with_their_intervals():
     rows = [
         {
             "method": m,
@@ -117,8 +112,7 @@ def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
         for task in ("future", "reconstruction")
         for m, r in (("far", 1.1), ("near", 0.8))
     ]
-    assert figures.ratios_figure(pd.DataFrame(rows), tmp_path / "ratios.png", "") is not None
-    (figure,) = kept
+    figure = figures.ratios_figure(pd.DataFrame(rows), "")
     assert [axis.get_title() for axis in figure.axes] == ["training frames", "future"]
     for axis in figure.axes:
         ((_, _, (bars,)),) = axis.containers
@@ -133,7 +127,7 @@ def test_ratios_are_drawn_with_their_intervals(tmp_path, monkeypatch):
 def test_a_picture_of_ratios_needs_three_scenarios_and_is_not_left_over(tmp_path):
     def written(scenarios: str) -> str:
         values = {(s, m, 0): v for s in scenarios for m, v in (("x", 0.01), ("y", 0.008))}
-        tables.write(collected(values), "x", tmp_path)
+        tables.write(tables.Benchmark(everything=collected(values), baseline="x"), tmp_path)
         return (tmp_path / "summary.md").read_text()
 
     assert "](ratios.png)" in written("abc")

@@ -16,12 +16,11 @@ from markupsafe import Markup, escape
 
 from neuspring import config
 from neuspring.config import Config
-from neuspring.core.run_record import flat
+from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Picture, Prose, Section, Text
-from neuspring.report.page.material import UNREADABLE, FinishedRun, ReportData, listed, several
-from neuspring.report.page.pictures import embedded_png, link
-from neuspring.report.page.work import machines
+from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Prose, Section, Text
+from neuspring.report.sections.data import UNREADABLE, ReportData, listed, several
+from neuspring.report.sections.pictures import embedded, link
 from neuspring.scores.runs import mixed_settings
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
@@ -58,11 +57,10 @@ def file(material: ReportData, path: Path) -> tuple[Prose | None, set[Path]]:
 
     def picture(source: str) -> str:
         place = path.parent / source
-        png = embedded_png(place) if "://" not in source and place.suffix == ".png" else None
-        if png is None:
+        if "://" in source or place.suffix != ".png" or not place.is_file():
             return ""
         shown.add(place.resolve())
-        return png.uri
+        return embedded(place.read_bytes(), "", "").data
 
     if not path.is_file():
         return None, shown
@@ -80,20 +78,18 @@ def tuning_section(material: ReportData) -> Section | None:
         text, shown = file(material, path)
         if text is None:
             continue
-        drawings = [drawing for drawing in sorted(path.parent.glob("*.png")) if drawing.resolve() not in shown]
-        pictures = [_picture(drawing, png.uri, png.size) for drawing in drawings if (png := embedded_png(drawing))]
+        pictures = []
+        for drawing in sorted(path.parent.glob("*.png")):
+            if drawing.resolve() not in shown:
+                name = drawing.stem.replace("_", " ")
+                pictures.append(embedded(drawing.read_bytes(), name, f"{name}, study {path.parent.name}"))
         folds.append(Fold(summary=path.parent.name, blocks=[text, Grid(blocks=pictures, least=26)], open=not folds))
     return Section(key="tuning", title="Tuning", blocks=folds) if folds else None
 
 
-def _picture(path: Path, uri: str, size: tuple[int, int]) -> Block:
-    name = path.stem.replace("_", " ")
-    return Picture(caption=name, alt=f"{name}, study {path.parent.name}", data=uri, size=size, paper=True)
-
-
 def files(material: ReportData) -> list[tuple[str, str]]:
     """Files of the tables' folder beside the report: text and link."""
-    folder, here = material.results / material.tables, material.output.resolve()
+    folder, here = material.results / material.choice.tables, material.output.resolve()
     paths = (path for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.resolve() != here)
     paths = (path for path in paths if path.is_file() and SO_FAR not in path.relative_to(folder).parts)
     return [(material.relative(path), link(path, here.parent)) for path in paths]
@@ -101,7 +97,7 @@ def files(material: ReportData) -> list[tuple[str, str]]:
 
 def perception_section(material: ReportData) -> Section | None:
     """Perception against the truth of synthetic captures; None where it was not judged."""
-    text, _ = file(material, material.results / material.tables / "perception.md")
+    text, _ = file(material, material.results / material.choice.tables / "perception.md")
     return Section(key="perception", title="Perception", blocks=[text]) if text else None
 
 
@@ -132,7 +128,10 @@ def setup_section(material: ReportData) -> Section:
     variants = _variants(material.runs)
     if variants is not None:
         blocks.append(variants)
-    blocks += [_versions(), *_machines(material.runs)]
+    blocks.append(_versions())
+    if machines := Counter(f"{run.machine}; {run.device}" for run in material.runs):
+        rows = [[Cell(text=name), Cell(text=str(count))] for name, count in sorted(machines.items())]
+        blocks.append(Table(caption="Machines of the runs", header=["Machine; device", "Runs"], rows=rows))
     beside = files(material)
     if beside:
         links = Items(items=[Link(text=text, target=target) for text, target in beside])
@@ -140,9 +139,9 @@ def setup_section(material: ReportData) -> Section:
     return Section(key="setup", title="Configuration and versions", blocks=blocks)
 
 
-def _commits(runs: Iterable[FinishedRun]) -> Text:
+def _commits(runs: Iterable[RunRecord]) -> Text:
     """The code that made the runs, with a warning if it was not the same for all."""
-    own = Counter(run.record.commit or "unknown" for run in runs)
+    own = Counter(run.commit or "unknown" for run in runs)
     names = [f"{_short(name)} ({several(count, 'run')})" for name, count in sorted(own.items())]
     if len(own) > 1:
         text = f"Runs were made by {len(own)} states of the code: {listed(names)}. Compare with care."
@@ -161,8 +160,8 @@ def _short(name: str) -> str:
 
 def _settings(material: ReportData) -> list[Block]:
     defaults = flat(config.plain(Config()))
-    if material.settings is not None:
-        settings = config.plain(material.settings)
+    if material.choice.settings is not None:
+        settings = config.plain(material.choice.settings)
         changed = {key: {"": value} for key, value in flat(settings).items() if defaults.get(key) != value and key not in WHAT}
         text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
         return [
@@ -177,16 +176,16 @@ def _settings(material: ReportData) -> list[Block]:
     return [Text(text=text, tone="mute"), _changes("Settings that differ from the defaults", changed, defaults)]
 
 
-def _used(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
+def _used(runs: Iterable[RunRecord]) -> dict[str, dict[str, Any]]:
     """Setting to method to value, from the records of search, fit and baselines' training."""
     used: dict[str, dict[str, Any]] = defaultdict(dict)
     for run in runs:
-        for stage in (run.record.settings.get(name, {}) for name in ("search", "fit")):
+        for stage in (run.settings.get(name, {}) for name in ("search", "fit")):
             sections = {name: stage[name] for name in SECTIONS if isinstance(stage.get(name), Mapping)}
             for key, value in flat(sections).items():
                 used[key].setdefault(run.method, value)
-        own = {name: value for name, value in run.record.settings.get("train", {}).items() if name not in ("model", "seed")}
-        for key, value in flat(own, f"baselines.{run.record.model}.").items():
+        own = {name: value for name, value in run.settings.get("train", {}).items() if name not in ("model", "seed")}
+        for key, value in flat(own, f"baselines.{run.model}.").items():
             used[key].setdefault(run.method, value)
     return dict(used)
 
@@ -214,11 +213,11 @@ def _by_method(values: Mapping[str, Any]) -> str:
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in groups.items())
 
 
-def _variants(runs: Iterable[FinishedRun]) -> Table | None:
+def _variants(runs: Iterable[RunRecord]) -> Table | None:
     """The switches of each method, as its runs record them."""
     variants: dict[str, Mapping[str, Any]] = {}
     for run in runs:
-        variants.setdefault(run.method, run.record.variant)
+        variants.setdefault(run.method, run.variant)
     if not variants:
         return None
     common = {name: text for name, text in COMMON.items() if name != "model" or any("model" in own for own in variants.values())}
@@ -243,9 +242,3 @@ def _versions() -> Table:
         except metadata.PackageNotFoundError:
             continue
     return Table(caption="Versions where this page was written", header=["Package", "Version"], rows=rows)
-
-
-def _machines(runs: Iterable[FinishedRun]) -> list[Block]:
-    counts = machines(runs)
-    rows = [[Cell(text=name), Cell(text=str(count))] for name, count in counts.items()]
-    return [] if not rows else [Table(caption="Machines of the runs", header=["Machine; device", "Runs"], rows=rows)]

@@ -1,0 +1,165 @@
+"""What a report page is about: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neuspring.config import Config
+from neuspring.core.errors import InputError
+from neuspring.core.job_records import JobRecord, read_jobs
+from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.scores.failures import LeftOut, applying
+from neuspring.scores.metrics import DASH
+from neuspring.scores.paper import Study
+from neuspring.scores.runs import DAMAGED, Collected, one_line
+
+UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What a damaged record, table or picture raises."""
+METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
+METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
+"""Rules whose jobs are named <rule>/<scenario>/<method>/<seed>."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What the report is about. What is left empty is taken from the settings, else from what lies in the results folder."""
+
+    scenarios: Sequence[str] = ()
+    methods: Sequence[str] = ()
+    seeds: Sequence[int] = ()
+    baseline: str | None = None
+    """The method that others are compared with; None: the settings', else the first."""
+    transfers: Sequence[str] = ()
+    """Scenarios whose twins were rolled out on other recordings."""
+    left_out: LeftOut = field(default_factory=dict)
+    """Method to the scenarios to which it does not apply, so that it has no runs there."""
+    shown: Sequence[str] = ()
+    """Methods whose curves and pictures are shown; empty: the baseline and the first rows of the studies, six in all."""
+    settings: Config | None = None
+    studies: Mapping[str, Study] = field(default_factory=dict)
+    tables: str = "tables"
+    """Folder of tables in the results folder."""
+    megabytes: float = 25.0
+    """Largest size of the page. Pictures and videos that do not fit are linked."""
+    video_megabytes: float = 8.0
+    """Largest part of that for videos."""
+
+    @property
+    def size(self) -> int:
+        """Runs that there should be."""
+        absent = applying(self.left_out, tuple(self.scenarios), tuple(self.methods))
+        return (len(self.scenarios) * len(self.methods) - sum(map(len, absent.values()))) * len(self.seeds)
+
+
+@dataclass(kw_only=True)
+class ReportData:
+    """Everything that the sections read."""
+
+    results: Path
+    output: Path
+    choice: Options
+    """With nothing left empty."""
+    collected: Collected
+    transfers: Collected
+    jobs: list[JobRecord]
+    damaged: dict[str, str]
+    """Files that cannot be read, relative to the results folder, and why."""
+
+    @property
+    def runs(self) -> list[RunRecord]:
+        """The runs whose records could be read."""
+        return list(self.collected.records.values())
+
+    def folder(self, run: RunRecord) -> Path:
+        """Where a run lies."""
+        return self.results / run.name
+
+    def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
+        """One of the files that a run's record names; None if there is none, or it is not there."""
+        paths = (self.folder(run) / name for name in run.artifacts.get(kind, []))
+        return next((path for path in paths if path.stem == stem and path.is_file()), None)
+
+    def relative(self, path: Path) -> str:
+        """A path for people: relative to the results folder."""
+        place, results = path.resolve(), self.results.resolve()
+        return place.relative_to(results).as_posix() if place.is_relative_to(results) else str(path)
+
+    def lost(self, path: Path, reason: Exception | str) -> None:
+        """Remember a damaged file, once."""
+        self.damaged.setdefault(self.relative(path), one_line(reason) if isinstance(reason, Exception) else reason)
+
+    def runs_of(self, scenario: str, method: str) -> list[RunRecord]:
+        """All seeds of a method on a scenario."""
+        return [run for run in self.runs if run.scenario == scenario and run.method == method]
+
+    def first_runs(self, scenario: str) -> dict[str, RunRecord]:
+        """Shown method to its first run of a scenario, finished ones before failed ones."""
+        runs = {method: self.runs_of(scenario, method) for method in self.choice.shown}
+        return {method: min(own, key=lambda run: not run.ok) for method, own in runs.items() if own}
+
+
+def traces(results: Path, jobs: Sequence[JobRecord]) -> tuple[list[str], list[str], list[int]]:
+    """Scenarios, methods and seeds that have left a trace: a record of a stage, or of a job."""
+    paths = [path for name in METHOD_RECORDS for path in results.glob(f"*/*/*/{name}")]
+    paths += results.glob("*/search-*/*/search.json")
+    found = [path.relative_to(results).parts[:3] for path in paths]
+    found += [tuple(job.name.split("/")[1:]) for job in jobs if job.rule in METHOD_RULES]
+    found = [parts for parts in found if len(parts) == 3 and parts[2].isdigit()]
+    methods = {method for _, method, _ in found if not method.startswith("search-")}
+    return sorted({scenario for scenario, _, _ in found}), sorted(methods), sorted({int(seed) for _, _, seed in found})
+
+
+def damaged_files(results: Path, collected: Collected, transfers: Collected, messages: Sequence[str]) -> dict[str, str]:
+    """Records of runs, transfers and jobs that cannot be read, relative to the results folder, and why."""
+    # The messages on job records begin with the file.
+    parts = (message.partition(": ") for message in messages)
+    damaged = {Path(path).relative_to(results).as_posix(): reason for path, _, reason in parts}
+    for runs, name in ((collected.runs, RUN_RECORD), (transfers.runs, "transfer.json")):
+        rows: list[Any] = [row for row in runs.itertuples() if str(row.reason).startswith(DAMAGED)]
+        damaged |= {f"{row.scenario}/{row.method}/{row.seed}/{name}": row.reason.removeprefix(DAMAGED) for row in rows}
+    return damaged
+
+
+def job_records(results: Path) -> tuple[list[JobRecord], list[str]]:
+    """The job records that can be read, by name, and a message on each other one."""
+    messages: list[str] = []
+    return [job for job in read_jobs(results, messages) if job.attempts], messages
+
+
+def several(count: int, noun: str) -> str:
+    """`1 run`, `2 runs`."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Names for a sentence. Of more than `most`, the rest is counted."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def duration(seconds: float) -> str:
+    """A time for people."""
+    if not math.isfinite(seconds):
+        return DASH
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def hours(seconds: float) -> str:
+    """Hours, with fewer decimals for larger values."""
+    value = seconds / 3600
+    if value < 0.01:
+        return "< 0.01" if value else "0"
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+
+
+def memory(mebibytes: float | None) -> str:
+    """Mebibytes; gibibytes from 1024 MiB."""
+    if mebibytes is None or not math.isfinite(mebibytes):
+        return DASH
+    return f"{mebibytes / 1024:.1f} GiB" if mebibytes >= 1024 else f"{mebibytes:.0f} MiB"
