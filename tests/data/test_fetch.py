@@ -250,10 +250,21 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
     assert any(line.startswith("Space needed") for line in lines)
 
 
-def test_a_fetched_case_passes_check_data(server: StandIn, tmp_path: Path) -> None:
-    findings = fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint, check=check)
+def test_a_fetched_case_passes_check_data_and_is_not_fetched_again(server: StandIn, tmp_path: Path) -> None:
+    findings = fetch(tmp_path, [CASE], ["data", "images"], endpoint=server.endpoint, check=check)
     assert {d.level for d in findings} == {"note"}
     assert not [d for d in findings if "not one of the 22" in d.message]
+    first, record = server.served, (tmp_path / RECORD).read_text()
+    fetch(tmp_path, [CASE], ["data", "images"], endpoint=server.endpoint)
+    assert server.served - first < 0.2 * first
+    assert (tmp_path / RECORD).read_text() == record
+    image = tmp_path / "data" / "different_types" / CASE / "color" / "0" / "3.png"
+    right = image.read_bytes()
+    image.write_bytes(right[:-1] + bytes([right[-1] ^ 1]))
+    lines, say = said()
+    fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint, say=say)
+    assert image.read_bytes() == right
+    assert any("1 with other content on disk are replaced" in line for line in lines)
 
 
 def test_one_scenario_costs_neither_the_other_nor_the_other_archives(server: StandIn, tmp_path: Path) -> None:
@@ -274,14 +285,6 @@ def test_parts_keep_to_themselves(server: StandIn, tmp_path: Path) -> None:
     added = {f"gaussian_output/{CASE}/init=hybrid/point_cloud.ply", f"data/gaussian_data/{CASE}/0.png"}
     assert added < set(files(tmp_path))
     assert FINAL_DATA not in files(tmp_path)
-
-
-def test_a_second_time_nothing_is_fetched_or_recorded_again(server: StandIn, tmp_path: Path) -> None:
-    fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint)
-    first, record = server.served, (tmp_path / RECORD).read_text()
-    fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint)
-    assert server.served - first < 0.2 * first
-    assert (tmp_path / RECORD).read_text() == record
 
 
 def test_an_interrupted_fetch_continues_where_it_was(server: StandIn, tmp_path: Path) -> None:
@@ -307,17 +310,6 @@ def test_one_lost_connection_is_tried_again(server: StandIn, tmp_path: Path, mon
     assert f"data/different_types/{OTHER}/color/0/39.png" in files(tmp_path)
 
 
-def test_a_file_of_another_content_is_replaced_and_counted(server: StandIn, tmp_path: Path) -> None:
-    fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint)
-    image = tmp_path / "data" / "different_types" / CASE / "color" / "0" / "3.png"
-    right = image.read_bytes()
-    image.write_bytes(right[:-1] + bytes([right[-1] ^ 1]))
-    lines, say = said()
-    fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint, say=say)
-    assert image.read_bytes() == right
-    assert any("1 with other content on disk are replaced" in line for line in lines)
-
-
 def test_a_damaged_member_is_named_and_leaves_no_file(server: StandIn, tmp_path: Path) -> None:
     content = server.files["data.zip"]
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -331,44 +323,37 @@ def test_a_damaged_member_is_named_and_leaves_no_file(server: StandIn, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(b"no archive" * 500, "must be a zip archive"), (None, "data.zip is required")], ids=["other", "none"]
+    ("change", "message"),
+    [
+        (lambda server: server.files.update({"data.zip": b"no archive" * 500}), "must be a zip archive"),
+        (lambda server: server.files.pop("data.zip"), "data.zip is required"),
+        (lambda server: setattr(server, "extra", b"more"), "the hub declares"),
+        (lambda server: setattr(server, "ranges", False), "must serve parts of a file"),
+    ],
+    ids=["no zip", "no file", "another size", "no ranges"],
 )
-def test_an_archive_that_is_none_is_refused(server: StandIn, tmp_path: Path, content: bytes | None, message: str) -> None:
-    del server.files["data.zip"]
-    if content is not None:
-        server.files["data.zip"] = content
+def test_what_is_not_the_declared_archive_is_refused(
+    server: StandIn, tmp_path: Path, change: Callable[[StandIn], object], message: str
+) -> None:
+    change(server)
     with pytest.raises(InputError, match=message):
         fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint)
-
-
-def test_a_file_of_another_size_than_declared_is_refused(server: StandIn, tmp_path: Path) -> None:
-    server.extra = b"more"
-    with pytest.raises(InputError, match="the hub declares"):
-        fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint)
-
-
-def test_a_server_without_ranges_is_refused_before_it_sends_the_archive(server: StandIn, tmp_path: Path) -> None:
-    server.ranges = False
-    with pytest.raises(InputError, match="must serve parts of a file"):
-        fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint)
     assert not files(tmp_path)
 
 
-def test_the_space_is_said_and_too_little_is_refused(server: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 5000, 5000))
-    lines, say = said()
-    with pytest.raises(InputError, match=r"must be free; received 5\.0 kB"):
-        fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint, say=say)
-    assert lines[-1].endswith("free: 5.0 kB")
-    assert not files(tmp_path)
-
-
-def test_a_dry_run_says_the_same_and_writes_nothing(server: StandIn, tmp_path: Path) -> None:
+def test_a_dry_run_writes_nothing_and_too_little_space_is_refused(
+    server: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines, say = said()
     assert fetch(tmp_path / "new", [CASE], ["images"], dry_run=True, endpoint=server.endpoint, say=say) == []
     assert any(line.startswith("data.zip: 24 of ") for line in lines)
     assert not (tmp_path / "new").exists()
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 5000, 5000))
+    with pytest.raises(InputError, match=r"must be free; received 5\.0 kB"):
+        fetch(tmp_path, [CASE], ["images"], endpoint=server.endpoint, say=say)
+    assert lines[-1].endswith("free: 5.0 kB")
+    assert not files(tmp_path)
 
 
 def test_unknown_scenarios_and_parts_are_refused_with_what_was_meant(tmp_path: Path) -> None:
@@ -378,16 +363,12 @@ def test_unknown_scenarios_and_parts_are_refused_with_what_was_meant(tmp_path: P
         fetch(tmp_path, [CASE], ["pictures"])
 
 
+INSIDE = f"data/different_types/{CASE}/../../../../final_data.pkl"
+
+
 @pytest.mark.parametrize(
     "name",
-    [
-        f"/{FINAL_DATA}",
-        f"C:/{FINAL_DATA}",
-        f"../{FINAL_DATA}",
-        f"data/different_types/{CASE}/../../../../final_data.pkl",
-        FINAL_DATA.replace("/", "\\"),
-        None,
-    ],
+    [f"/{FINAL_DATA}", f"C:/{FINAL_DATA}", f"../{FINAL_DATA}", INSIDE, FINAL_DATA.replace("/", "\\"), None],
     ids=["absolute", "drive", "above", "inside", "backslash", "link"],
 )
 def test_an_archive_with_an_unsafe_member_is_refused_as_a_whole(server: StandIn, tmp_path: Path, name: str | None) -> None:
@@ -423,16 +404,11 @@ def test_what_an_archive_lacks_is_said(server: StandIn, tmp_path: Path) -> None:
         fetch(tmp_path, ["single_push_rope"], ["data"], endpoint=server.endpoint)
 
 
-def test_a_dead_server_is_named_with_the_next_move(server: StandIn, tmp_path: Path) -> None:
+def test_hub_and_revision_and_offline_mode_are_named(server: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(InputError, match=r"the hub must answer; received ConnectError.*HF_ENDPOINT"):
         fetch(tmp_path, [CASE], endpoint=f"http://127.0.0.1:{port}")
-
-
-def test_an_unknown_revision_and_the_offline_mode_are_named(
-    server: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     with pytest.raises(InputError, match=r"--revision: .*received v9"):
         fetch(tmp_path, [CASE], revision="v9", endpoint=server.endpoint)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
@@ -440,12 +416,9 @@ def test_an_unknown_revision_and_the_offline_mode_are_named(
         fetch(tmp_path, [CASE], endpoint=server.endpoint)
 
 
-def test_two_fetches_into_one_folder_are_refused(server: StandIn, tmp_path: Path) -> None:
+def test_a_folder_in_use_or_that_cannot_be_written_is_named(server: StandIn, tmp_path: Path) -> None:
     with FileLock(tmp_path / LOCK), pytest.raises(InputError, match="one fetch at a time"):
         fetch(tmp_path, [CASE], endpoint=server.endpoint)
-
-
-def test_a_folder_that_cannot_be_written_is_named(server: StandIn, tmp_path: Path) -> None:
     (tmp_path / "data").write_text("a file")
     with pytest.raises(InputError, match="must be readable and writable"):
         fetch(tmp_path, [CASE], ["data"], endpoint=server.endpoint)
