@@ -282,8 +282,7 @@ def has_images(case: Path) -> bool:
 def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
     """Write `case` as a capture folder. Raises InputError naming file and key."""
     case = Path(case)
-    metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    refuse(raw_findings(case, metadata, poses))
+    metadata, cameras = read_calibration(case)
     frames = int(metadata["frame_num"])
     has_masks = (case / "mask").is_dir()
     description = Description(
@@ -292,7 +291,7 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         category=row.category,
         frame_count=frames,
         frame_rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
-        cameras=tuple(camera.entry() for camera in cameras_of(metadata, poses)),
+        cameras=tuple(camera.entry() for camera in cameras),
         depth_format="npy",
         up="-z",
         train_end=train_end_of(case, frames),
@@ -379,11 +378,13 @@ def poses_findings(file: Path, poses: Any, cameras: int | None) -> list[Finding]
     return findings
 
 
-def cameras_of(metadata: dict[str, Any], poses: list[np.ndarray]) -> list[Camera]:
-    """The cameras in metadata.json and calibrate.pkl, named by their numbers. `raw_findings` must have no errors."""
+def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
+    """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
+    metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
+    refuse(raw_findings(case, metadata, poses))
     width, height = metadata["WH"]
     intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
-    return [
+    return metadata, [
         Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
         for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
     ]

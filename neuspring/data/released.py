@@ -16,11 +16,8 @@ import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, refuse, unusual
-from neuspring.data import phystwin
 from neuspring.data.capture import Camera, read_array, read_image
-from neuspring.data.phystwin import CALIBRATION, cameras_of, raw_findings
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
@@ -200,13 +197,6 @@ def read_prediction(path: Path, frames: int, nodes: int) -> np.ndarray:
     positions = load_pickle(path)
     refuse(prediction_findings(path, positions, frames, nodes))
     return np.asarray(positions, dtype=np.float32)
-
-
-def read_cameras(folder: Path) -> list[Camera]:
-    """The calibrated cameras of a case, from metadata.json and calibrate.pkl."""
-    metadata, poses = load_json(folder / phystwin.METADATA), load_pickle(folder / CALIBRATION)
-    refuse(raw_findings(folder, metadata, poses))
-    return cameras_of(metadata, poses)
 
 
 def visible_pixels(path: Path) -> np.ndarray:

@@ -247,19 +247,10 @@ MIDDLE = 1.0 / 3.0
 """Part of the image, in its center, that is the center of view."""
 
 
-@dataclass(frozen=True, eq=False)
-class FoundTable:
-    """The table that a camera sees."""
-
-    plane: Plane
-    remarks: tuple[str, ...] = ()
-    """What the user should know about the choice."""
-
-
 def find_table(
     where: object, points: np.ndarray, *, top_down: bool = False, at: np.ndarray | None = None, pose: np.ndarray | None = None
-) -> FoundTable:
-    """The table among the planes in points [n, 3], m, in the coordinates of a camera.
+) -> tuple[Plane, list[str]]:
+    """The table among the planes in points [n, 3], m, in the coordinates of a camera, and what the user should know of the choice.
 
     It is the largest plane whose normal points up in the image; with `at`, the one through this point [3]. With a `pose`, camera to
     world [4, 4] with z upright, up is that of the world. Raises InputError where there is none: the largest plane is a wall or a
@@ -270,11 +261,10 @@ def find_table(
         remedy = "Film more of the table, or give --poses."
         raise InputError(where, "the table must be seen: no plane was found in depth", remedy=remedy)
     if at is not None:
-        found = sorted(found, key=lambda plane: abs(plane.above(at)))[:1]
-        if abs(found[0].above(at)) > 0.02:
-            raise InputError(
-                "--table-at", "this pixel must lie on a plane", f"one {abs(found[0].above(at)):.3f} m from the nearest"
-            )
+        found = [min(found, key=lambda plane: abs(plane.above(at)))]
+        away = float(abs(found[0].above(at)))
+        if away > 0.02:
+            raise InputError("--table-at", "this pixel must lie on a plane", f"one {away:.3f} m from the nearest")
     reasons = [_objection(plane, top_down, pose) for plane in found]
     fitting = [plane for plane, reason in zip(found, reasons, strict=True) if not reason]
     if not fitting:
@@ -292,7 +282,7 @@ def find_table(
                 f"another level surface, {100 * abs(height):.0f} cm {side} it, has {other.share:.0%} of the pixels: if that is the "
                 "table, name a pixel of it by --table-at"
             )
-    return FoundTable(table, tuple(remarks))
+    return table, remarks
 
 
 def _objection(plane: Plane, top_down: bool, pose: np.ndarray | None) -> str:
@@ -315,28 +305,23 @@ def _objection(plane: Plane, top_down: bool, pose: np.ndarray | None) -> str:
     return ""
 
 
-def pose_on(table: Plane, points: np.ndarray, center: np.ndarray) -> np.ndarray:
+def pose_on(table: Plane, points: np.ndarray, size: tuple[int, int], intrinsics: np.ndarray) -> np.ndarray:
     """Camera to world [4, 4], m, of a camera that sees `table`: z along its normal, x to the right of the image.
 
-    The origin lies on the table below the center of view: the median of the points [n, 3] within a third of the image around its
-    center, in pixels over focal length [2].
+    The origin lies on the table below the center of view: the median of the points [n, 3] within a third of the image, of `size`
+    (width, height), around its center.
     """
     up = table.normal
     y = np.cross(up, [1.0, 0.0, 0.0])
     y /= np.linalg.norm(y)
     axes = np.stack([np.cross(y, up), y, up])
     rays = points[:, :2] / points[:, 2:]
-    middle = points[(np.abs(rays) < center).all(axis=1)]
+    middle = points[(np.abs(rays) < 0.5 * MIDDLE * np.array(size) / np.diag(intrinsics)[:2]).all(axis=1)]
     target = np.median(middle if len(middle) else table.points, axis=0)
     origin = target - table.above(target) * up
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, -axes @ origin
     return pose
-
-
-def center_of(size: tuple[int, int], intrinsics: np.ndarray) -> np.ndarray:
-    """Half the extent of the center of view, in pixels over focal length [2]."""
-    return np.asarray(0.5 * MIDDLE * np.array(size) / np.diag(intrinsics)[:2])
 
 
 def common_plane(tables: Mapping[str, Plane], poses: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:

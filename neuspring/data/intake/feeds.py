@@ -26,11 +26,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.core.files import load_json
-from neuspring.core.findings import refuse
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera
-from neuspring.data.unpickle import load_pickle
 
 if TYPE_CHECKING:
     import av
@@ -433,9 +430,8 @@ class Raw:
     @classmethod
     def open(cls, case: Path) -> Raw:
         """Read its calibration. Raises InputError."""
-        metadata, poses = load_json(case / phystwin.METADATA), load_pickle(case / phystwin.CALIBRATION)
-        refuse(phystwin.raw_findings(case, metadata, poses))
-        cameras = {camera.name: camera for camera in phystwin.cameras_of(metadata, poses)}
+        metadata, listed = phystwin.read_calibration(case)
+        cameras = {camera.name: camera for camera in listed}
         views = [
             Paired(
                 name,

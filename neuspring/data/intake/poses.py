@@ -19,7 +19,6 @@ from neuspring.data.capture import Camera
 from neuspring.data.intake.depth import (
     Plane,
     Unit,
-    center_of,
     cloud,
     common_plane,
     find_table,
@@ -218,13 +217,11 @@ class Placed:
 
 
 def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
-    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `world.find_table`."""
+    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
-    table = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
-    pose = pose_on(table.plane, points, center_of(seen.size, seen.lens.matrix))
-    text = table.plane.text()
-    lines = (f"table: {text}", *(f"warning: {remark}" for remark in table.remarks))
-    return Placed(poses={name: pose}, table=text, lines=lines)
+    table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
+    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks))
+    return Placed(poses={name: pose_on(table, points, seen.size, seen.lens.matrix)}, table=table.text(), lines=lines)
 
 
 def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -272,7 +269,7 @@ def stand(
         try:
             # A world that is to be moved may have any axes: up is then that of the image.
             upright = None if level else poses[name]
-            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down).plane
+            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down)[0]
             lines.append(f"table, camera {name}: {tables[name].text()}")
         except InputError as error:
             if level:

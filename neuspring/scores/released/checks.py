@@ -22,14 +22,13 @@ from neuspring.core.errors import InputError
 from neuspring.core.text import Progress
 from neuspring.data import phystwin
 from neuspring.data.capture import Camera
-from neuspring.data.phystwin import CALIBRATION, released_cases
+from neuspring.data.phystwin import CALIBRATION, read_calibration, released_cases
 from neuspring.data.released import (
     Released,
     ReleasedCheckpoint,
     depth_image,
     gated_lift,
     mirrored,
-    read_cameras,
     read_checkpoint,
     read_parameters,
     read_picture,
@@ -447,7 +446,7 @@ def deprojection(case: Released, observations: Observations, _: Tools) -> list[C
     processing drops lifted points.
     """
     require(case.root, case.folder / phystwin.METADATA, case.folder / CALIBRATION)
-    cameras = read_cameras(case.folder)
+    cameras = read_calibration(case.folder)[1]
     require(case.root, *(path for c in cameras for path in (case.pixel_tracks(c.name), case.first_depth(c.name))))
     raw = {c.name: (visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name), c)) for c in cameras}
     residuals = {}
@@ -485,7 +484,7 @@ def frame_scores(
     case: Released, observations: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED
 ) -> pd.DataFrame:
     """Columns frame, camera, metric, value of every frame but the first, seen by the first camera."""
-    cameras = read_cameras(case.folder)
+    cameras = read_calibration(case.folder)[1]
     if len(cameras) < 2:
         raise InputError(case.folder / phystwin.METADATA, "a second camera is required: pictures have its intrinsics", len(cameras))
     camera, borrowed = cameras[0], cameras[1] if "second_camera_intrinsics" in images.released_quirks else None

@@ -14,12 +14,11 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.data.phystwin import released_cases
+from neuspring.data.phystwin import read_calibration, released_cases
 from neuspring.data.released import (
     Released,
     depth_image,
     gated_lift,
-    read_cameras,
     read_checkpoint,
     read_parameters,
     visible_pixels,
@@ -239,7 +238,7 @@ def test_conventions_that_coincide_cannot_be_told_apart(case, published):
     path.write_text(text)
     lifted = [
         gated_lift(c, visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name), c))
-        for c in read_cameras(case.folder)
+        for c in read_calibration(case.folder)[1]
     ]
     data = stored(case.folder)
     data["object_points"][0] = np.unique(np.concatenate(lifted), axis=0)[: data["object_points"].shape[1]]
