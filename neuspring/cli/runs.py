@@ -78,7 +78,7 @@ def compare(
 
 def ui(results: Results = Path("results"), settings: Settings = "{}", host: str = "127.0.0.1", port: int = 5000) -> None:
     """Open the MLflow UI of a results folder."""
-    from neuspring.experiments.tracking.log import default_uri
+    from neuspring.experiments.tracking.store import default_uri
 
     uri = read_settings(settings).tracking.uri or default_uri(results)
     if uri.startswith("http"):

@@ -68,9 +68,8 @@ class Tune(Section):
     storage: Annotated[str, StringConstraints(pattern=r"^postgresql(\+\w+)?://\S+$")] | None = None
     """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
     in the sweep's folder, for workers of one machine."""
-    pruner: Literal["median", "hyperband", "none"] = "median"
-    """Which trials end early. median: those above the median of finished ones at the same epoch. hyperband: those that successive
-    halving drops."""
+    pruner: Literal["median", "none"] = "median"
+    """Which trials end early. median: those above the median of finished ones at the same epoch."""
     startup_trials: Whole = 10
     """Number of random trials, before the sampler (TPE) learns from earlier ones and before the median prunes any."""
     warmup_epochs: Whole = 5

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from neuspring import config
-from neuspring.config import Config, Method, SearchRow, parse
+from neuspring.config import Config, Method, parse
 from neuspring.config.search import HANDS
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
@@ -94,13 +94,6 @@ BAD_SEARCHES = {
 }
 
 
-@pytest.mark.parametrize("settings", [{"rollout": 3}, {"rollouts": "7"}, {"clusters": 3}, {"variables": {"drag": {"high": 0}}}])
-def test_bad_search_settings(settings: dict[str, Any]) -> None:
-    row = SearchRow(clusters=2, description="x", settings=settings)
-    with pytest.raises(InputError, match="search pieces, settings: "):
-        tables.with_search(load(""), row, "pieces")
-
-
 BAD_METHODS = {
     "search": ("a: {search: ../up, fit: null, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": ("a: {search: uniform, fit: network, description: x}", "method a.*fit.*'springs' or 'field', received 'network'"),
@@ -123,13 +116,6 @@ def test_bad_tables_of_searches_and_methods(read: Callable[[Path], Any], text: s
     with pytest.raises(InputError, match="(?s)" + message) as caught:
         read(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize("settings", [{"horizont": 0}, {"epochs": "7"}, {"fit": {}}])
-def test_bad_method_settings(settings: dict[str, Any]) -> None:
-    method = Method(search="uniform", fit=None, description="x", settings=settings)
-    with pytest.raises(InputError, match="method long, settings: "):
-        tables.with_method(load(""), method, "long")
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
@@ -252,27 +238,36 @@ def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tm
     assert planned("given").scenarios, "damaged data fail the jobs of their scenario"
 
 
-@pytest.mark.parametrize("settings", ["{horizont: 0}", "{betas: [2, 2]}"])
-def test_settings_of_chosen_methods_are_checked_too(settings: str, tmp_path: Path) -> None:
-    text = f"full: {{search: uniform, fit: springs, description: x, settings: {settings}}}\n"
-    write(tmp_path / "bad.yaml", text)
-    with pytest.raises(InputError, match="method full, settings"):
-        benchmark(tmp_path, method_table="bad.yaml")
-
-
-def test_the_search_of_a_chosen_method_must_be_known(tmp_path: Path) -> None:
-    write(tmp_path / "bad.yaml", "full: {search: unifrom, fit: springs, description: x}\n")
-    message = r"every entry must be a row of searches\.yaml; received 'unifrom' \(did you mean 'uniform'\?\)"
-    with pytest.raises(InputError, match=message):
-        benchmark(tmp_path, method_table="bad.yaml")
-
-
-def test_settings_of_chosen_searches_are_checked_too(tmp_path: Path) -> None:
-    text = "uniform: {clusters: 1, description: x, settings: {rollout: 3}}\npieces: {clusters: 5, description: x}\n"
-    write(tmp_path / "bad.yaml", text)
-    with pytest.raises(InputError, match="search uniform, settings"):
-        benchmark(tmp_path, search_table="bad.yaml")
-    assert benchmark(tmp_path, search_table="bad.yaml", methods=["ours"]).methods, "rows that nobody names are not"
+@pytest.mark.parametrize(
+    ("table", "row", "message"),
+    [
+        (
+            "method",
+            "full: {search: uniform, fit: springs, settings: {horizont: 0}, ",
+            "method full, settings:.*horizont",
+        ),
+        ("method", "full: {search: uniform, fit: springs, settings: {epochs: '7'}, ", "method full, settings:.*epochs"),
+        (
+            "method",
+            "full: {search: unifrom, fit: springs, ",
+            r"searches\.yaml; received 'unifrom' .did you mean 'uniform'",
+        ),
+        ("search", "uniform: {clusters: 1, settings: {rollout: 3}, ", "search uniform, settings:.*rollout: unknown key"),
+        ("search", "uniform: {clusters: 1, settings: {variables: {drag: {high: 0}}}, ", "search uniform, settings:.*drag"),
+        (
+            "search",
+            "uniform: {clusters: 1, released_quirks: {no_such: true}, ",
+            "released_quirks:.*no_such: unknown",
+        ),
+    ],
+)
+def test_settings_of_the_rows_that_are_named_are_checked_too(table: str, row: str, message: str, tmp_path: Path) -> None:
+    other = "pieces: {clusters: 5, description: x}" if table == "search" else ""
+    write(tmp_path / "bad.yaml", f"{row}description: x}}\n{other}\n")
+    with pytest.raises(InputError, match="(?s)" + message):
+        benchmark(tmp_path, **{f"{table}_table": "bad.yaml"})
+    if table == "search":
+        assert benchmark(tmp_path, search_table="bad.yaml", methods=["ours"]).methods, "rows that nobody names are not"
 
 
 def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
@@ -294,6 +289,12 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     ("row", "message"),
     [
         ("{description: x}", "either search or model is required, received search None and model None"),
+        ("{search: uniform, oracle: true, description: x}", "an oracle has a fit"),
+        ("{search: uniform, carry_over: state, description: x}", "removed"),
+        (
+            "{search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}",
+            "an oracle is fitted on all frames and holds none back",
+        ),
         ("{model: static, search: uniform, description: x}", "either search or model is required"),
         (
             "{model: gs_dynamics, fit: field, pool: all, description: x}",
@@ -311,7 +312,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],
 )
-def test_bad_rows_of_baselines(row: str, message: str, tmp_path: Path) -> None:
+def test_rows_that_cannot_be(row: str, message: str, tmp_path: Path) -> None:
     write(tmp_path / "bad.yaml", f"bad: {row}\n")
     with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
         benchmark(tmp_path, method_table="bad.yaml", methods=["bad"])
@@ -432,21 +433,6 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
         pooled(tmp_path, **changes)
 
 
-def test_the_tables_of_the_project_are_valid_together() -> None:
-    """Every row of the method table, with the search that it names."""
-    root = ROOT
-    methods = tuple(tables.read_methods(root / "config" / "methods.yaml"))
-    values = config.read_yaml(root / "config" / "data" / "demo.yaml")
-    made = Benchmark(values | {"methods": list(methods)}, root)
-    for name, method in made.methods.items():
-        if method.search:
-            tables.with_method(made.config, method, name)
-            tables.with_search(made.config, made.searches[method.searched], method.search)
-    for name in methods:
-        if name.startswith("clusters_"):
-            assert made.searches[made.methods[name].search].clusters == int(name.removeprefix("clusters_"))
-
-
 @pytest.mark.parametrize(
     "overlays",
     [
@@ -516,7 +502,10 @@ def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
     assert {name: whole[name] for name in paper} == paper
     assert list(read_studies(ROOT / "config" / "studies.yaml")) == paper["studies"]
     rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values()
-    assert {row.scenario for row in rows if row.source == "phystwin"} == set(whole["scenarios"])
+    released = [row for row in rows if row.source == "phystwin"]
+    assert {row.scenario for row in released} == set(whole["scenarios"])
+    assert (len(released), sum(row.self_collision for row in released)) == (22, 9)
+    assert {row.category for row in released} == {"cloth", "rope", "package", "zebra", "sloth", "dinosaur"}
 
 
 def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
@@ -538,9 +527,11 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
 def test_every_method_that_is_shipped_is_valid():
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
-    benchmark = Benchmark(values, ROOT)
+    made = Benchmark(values, ROOT)
     # No two rows are the same: each has a fit of its own, the oracle too.
-    assert {name for name, owner in benchmark.fit_of_method.items() if name != owner} == set()
+    assert {name for name, owner in made.fit_of_method.items() if name != owner} == set()
+    regions = {name: made.searches[row.searched].clusters for name, row in made.methods.items() if name.startswith("clusters_")}
+    assert regions == {name: int(name.removeprefix("clusters_")) for name in regions}
 
 
 def test_every_row_that_is_shipped_is_named_somewhere():
@@ -614,12 +605,6 @@ def test_the_released_rows_have_the_released_search() -> None:
     assert tables.with_search(made.config, made.searches["released_quirks"], "x").search.isolated_nodes == "allow"
 
 
-def test_unknown_quirks_of_a_search_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "odd.yaml", SEARCHES.replace("uniform: {", "uniform: {released_quirks: {no_such: true}, ", 1))
-    with pytest.raises(InputError, match=r"search uniform, released_quirks:(?s:.*)no_such: unknown key"):
-        benchmark(tmp_path, search_table="odd.yaml")
-
-
 # Own recordings -------------------------------------------------------------------------------------------------------
 
 
@@ -690,17 +675,11 @@ def test_a_part_that_is_not_there_is_explained(only, message):
     ("changes", "message"),
     [
         ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
-        ({"scenarios": ["toy_rope_lift_smoth"]}, "did you mean 'toy_rope_lift_smooth'?"),
-        ({"methods": ["neuspringg"]}, "every entry must be a row of config/methods.yaml"),
         ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
-        ({"scenarios": ["DLO1_train_48"]}, "mocap scenarios need data_root"),
-        ({"scenarios": ["DLO1_train_48"], "data_root": "/nowhere"}, "its data must exist; received /nowhere/DLO1/train/48.pkl"),
-        ({"seeds": []}, "seeds: at least one entry is required"),
         ({"seeds": [0, 0]}, "seeds: entries must differ"),
         ({"results": "a{b}"}, "results: string should match pattern"),
         ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
         ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
-        ({"search": {"variables": {"stiffness": {"high": 2e5}}}}, "must hold the search's range of 10.0 to 200000.0"),
     ],
 )
 def test_what_the_workflow_checks_first(changes, message):
@@ -709,9 +688,38 @@ def test_what_the_workflow_checks_first(changes, message):
     assert message in str(error.value)
 
 
-def test_the_benchmark_of_22_scenarios_is_known_to_the_table():
-    rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv")
-    released = [row for row in rows.values() if row.source == "phystwin"]
-    assert len(released) == 22
-    assert {row.category for row in released} == {"cloth", "rope", "package", "zebra", "sloth", "dinosaur"}
-    assert sum(row.self_collision for row in released) == 9
+# Oracles
+
+NAMES = ["baseline", "neuspring", "oracle_neuspring"]
+SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth"]
+
+
+def oracles(**changes: Any) -> Benchmark:
+    values = config.read_yaml(ROOT / "config" / "data" / "toy.yaml") | {"methods": NAMES, "scenarios": SCENES, "studies": []}
+    return Benchmark(values | changes, ROOT)
+
+
+def job(name: str) -> SimpleNamespace:
+    return SimpleNamespace(scenario=SCENES[0], method=name, seed=0)
+
+
+def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transferred() -> None:
+    made = oracles(seeds=[0, 1, 2], transfers={SCENES[0]: [SCENES[1]]})
+    graph, fit = Graph(made), STAGES["fit"]
+    assert made.fit_of_method["oracle_neuspring"] == "oracle_neuspring"
+    assert [graph.variant(job(name)).get("oracle") for name in NAMES] == [None, None, True]
+    plain = {"search": "uniform", "clusters": 1, "fit": "springs"}
+    assert graph.variant(job("baseline")) == plain | made.methods["baseline"].settings
+    # Settings and inputs are those of another row.
+    assert graph.settings(fit, job("oracle_neuspring")) == graph.settings(fit, job("neuspring"))
+    assert graph.inputs(fit)(job("oracle_neuspring")) == graph.inputs(fit)(job("neuspring"))
+    together = json.loads(graph.options(STAGES["fits"], SimpleNamespace(scenario=SCENES[0]))["rows"])
+    assert [bool(row.get("oracle")) for row in together] == [False, False, True]
+    assert {path.split("/")[-3] for path in graph.transfers()} == {"baseline", "neuspring"}
+
+
+def test_no_sweep_chooses_by_an_oracle():
+    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}, "seed": 0}
+    tune = parse(Tune, values, "x")
+    with pytest.raises(InputError, match="an oracle sees the future"):
+        Plan.of(config.Config(), tune, ROOT)

@@ -9,7 +9,7 @@ import pandas as pd
 from neuspring import config
 from neuspring.core.run_record import RunRecord
 from neuspring.experiments import benchmark
-from neuspring.experiments.tracking.payload import payload
+from neuspring.experiments.tracking.log import payload
 from neuspring.experiments.tuning.report import PICTURES
 from tests.support.sweeps import BASE, report, settings, slots, sweep, work
 

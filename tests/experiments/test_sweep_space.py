@@ -10,7 +10,7 @@ import pytest
 from neuspring import config
 from neuspring.core.errors import InputError
 from neuspring.experiments.tuning.space import Plan
-from neuspring.twin.field import SpringField, adaptive_resolution
+from neuspring.twin.field import SpringField
 from tests.support.sweeps import plan, report, settings, slots, sweep, work
 
 RANGE = {"low": 1, "high": 2}
@@ -108,9 +108,8 @@ def test_a_plan_is_made_without_heavy_imports():
 
 def test_a_factor_varies_the_adaptive_resolution():
     points = np.random.default_rng(0).random((400, 3))
-    assert SpringField(points, config.SpringField(), 1, 0).resolution == adaptive_resolution(400) == 17
-    assert SpringField(points, config.SpringField(adaptive_factor=1.7), 1, 0).resolution == 34
-    assert SpringField(points, config.SpringField(adaptive_factor=1.7, resolution=9), 1, 0).resolution == 9
+    chosen = [{}, {"adaptive_factor": 1.7}, {"adaptive_factor": 1.7, "resolution": 9}]
+    assert [SpringField(points, config.SpringField(**one), 1, 0).resolution for one in chosen] == [17, 34, 9]
 
 
 def test_what_a_sweep_cannot_be_begun_with_is_refused(folder):

@@ -19,7 +19,7 @@ from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import store as tracking_store
-from neuspring.experiments.tracking.payload import _system_metrics
+from neuspring.experiments.tracking.log import _system_metrics
 from tests.support.stores import STEPS, client_of, python, runs_of, write_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,7 +56,6 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     expected |= {"play": f"neuspring play {record.parent}"}
     assert expected.items() <= run.data.tags.items()
     assert f"\nneuspring play {record.parent}\n" in run.data.tags["mlflow.note.content"]
-    assert "superseded_by" not in run.data.tags
     assert len(run.data.params) == 122
     assert (run.data.params["fit.p7"], run.data.params["fit.betas"], len(run.data.params["long"])) == ("7", "[0.9, 0.99]", 500)
 
@@ -200,7 +199,7 @@ def test_log_run_closes_leftovers_of_its_record(results: Path, status: str) -> N
 
 
 def test_sync_leaves_runs_of_other_results_folders_alone(results: Path, tmp_path: Path) -> None:
-    shared = Tracking(uri=tracking.default_uri(results))
+    shared = Tracking(uri=tracking_store.default_uri(results))
     other = tmp_path / "other"
     tracking.init(results, shared)
     client = client_of(results)
@@ -240,27 +239,6 @@ def test_results_that_another_commit_made_again_are_one_run_of_both(results: Pat
         assert tracking.log_run(again, results, SETTINGS) == "already logged"
     (run,) = tracking_store.logged_runs(results, SETTINGS)
     assert run.commits == {"abc123": ENDED_MS, "def456-dirty": STARTED_MS + 2 * 3600_000}
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_the_newest_record_supersedes_whatever_the_order(results: Path, order: tuple[int, int]) -> None:
-    versions: list[dict[str, Any]] = [
-        {"run_key": "aa" * 32, "ended": "2026-11-21T11:00:00+00:00"},
-        {"run_key": "bb" * 32, "ended": "2026-11-21T12:00:00+00:00"},
-    ]
-    write_run(results, scenario="other")
-    tracking.sync(results, SETTINGS)
-    for i in order:
-        assert tracking.log_run(write_run(results, **versions[i]), results, SETTINGS) == "logged"
-    pointers = {run.data.tags["run_key"][:2]: run.data.tags.get("superseded_by") for run in runs_of(results)}
-    assert pointers.pop("aa") == "bb" * 32
-    assert list(pointers.values()) == [None, None], "neither the newest nor another scenario's run"
-
-    # The settings change back: the older content is on disk again, made anew, and already in MLflow.
-    record = write_run(results, **versions[0] | {"ended": "2026-11-21T13:00:00+00:00"})
-    assert tracking.log_run(record, results, SETTINGS) == "already logged"
-    pointers = {run.data.tags["run_key"][:2]: run.data.tags.get("superseded_by") for run in runs_of(results)}
-    assert (pointers["aa"], pointers["bb"]) == (None, "aa" * 32)
 
 
 def test_damaged_records_are_input_errors(results: Path) -> None:
@@ -313,7 +291,7 @@ def test_init_upgrades_an_older_database(tmp_path: Path) -> None:
     from mlflow.store.tracking.dbmodels.initial_models import Base
 
     utils: Any = importlib.import_module("mlflow.store.db.utils")
-    engine = utils.create_sqlalchemy_engine(tracking.default_uri(tmp_path))
+    engine = utils.create_sqlalchemy_engine(tracking_store.default_uri(tmp_path))
     Base.metadata.create_all(engine)
     settings = utils._get_alembic_config(str(engine.url))
     with engine.begin() as connection:

@@ -38,7 +38,7 @@ def cluster() -> Iterator[stores.Postgres]:
 def sqlite_server(template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[stores.Server]:
     folder = tmp_path_factory.mktemp("server")
     shutil.copy(template, folder / "mlflow.db")
-    with stores.server(folder, tracking.default_uri(folder)) as running:
+    with stores.server(folder, tracking_store.default_uri(folder)) as running:
         yield running
 
 
@@ -64,7 +64,7 @@ def finish(process: subprocess.Popen[str], out: Path) -> Counter[str]:
 def all_runs(results: Path, settings: Tracking) -> list[Any]:
     from mlflow import MlflowClient
 
-    client = MlflowClient(tracking_uri=settings.uri or tracking.default_uri(results))
+    client = MlflowClient(tracking_uri=settings.uri or tracking_store.default_uri(results))
     return tracking_store.search(client, client.get_experiment_by_name(settings.experiment).experiment_id)
 
 

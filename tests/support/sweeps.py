@@ -15,7 +15,7 @@ from neuspring.core.artifacts import Observations
 from neuspring.experiments.tuning import report as tuning_report
 from neuspring.experiments.tuning import worker
 from neuspring.experiments.tuning.space import Plan
-from neuspring.experiments.tuning.worker import Slot, Store
+from neuspring.experiments.tuning.worker import Slot, study_of
 from neuspring.experiments.tuning.worker import slots as slots_of
 from tests.support import small
 
@@ -94,7 +94,7 @@ def report(folder: Path, tune: Tune, base: config.Config | None = None) -> str:
 
 def slots(folder: Path, tune: Tune, base: config.Config | None = None) -> dict[int, Slot]:
     """The sweep's slots as its storage has them."""
-    return slots_of(Store(folder, tune.storage, tune.study).load(plan(folder, tune, base).facts()))
+    return slots_of(study_of(folder, tune, plan(folder, tune, base).facts()))
 
 
 def results_of(folder: Path, tune: Tune) -> list[tuple[Any, ...]]:

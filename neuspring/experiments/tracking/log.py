@@ -9,23 +9,28 @@ without that tag was left behind by a killed logger, if nobody holds the lock of
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.job_records import FOLDER as JOBS
+from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.core.text import masked
-from neuspring.experiments.tracking.payload import Payload, cut, milliseconds, payload
 from neuspring.experiments.tracking.store import (
     AGAIN,
     ARTIFACTS,
     connect,
-    default_uri,
     is_complete,
     lock,
     lock_path,
@@ -38,8 +43,11 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
-__all__ = ["RunRecord", "default_uri", "init", "log_run", "sync"]
-T = TypeVar("T")
+PARAM_LENGTH, TAG_LENGTH = 500, 5000
+"""These keep MLflow's tables readable. The full text stays in run.json."""
+METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
+SAMPLES = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
+"""Columns of a job record's samples, after the time."""
 OUTCOME = "mlflow.txt"
 """The outcome of logging a record, beside it; the workflow's rule writes it."""
 METRICS_PER_CALL, PARAMS_PER_CALL = 1000, 100
@@ -129,23 +137,25 @@ def sync(
     return outcomes
 
 
-# --- sending ------------------------------------------------------------------------------------------------------------------
+# --- sending ---
 
 
 def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path, results: Path) -> str:
     """Log a record whose lock the caller holds."""
     runs = search(client, experiment, run_key=record.run_key)
-    complete = next(filter(is_complete, runs), None)
     # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
     for run in runs:
         if not is_complete(run) and "superseded" not in run.data.tags:
             _close(client, run)
-    if complete:
-        _note_again(client, complete, record)
-    else:
-        _send(client, experiment, record, payload(record, run_json, results))
-    _mark_superseded(client, experiment, record)
-    return "already logged" if complete else "logged"
+    if complete := next(filter(is_complete, runs), None):
+        # Tag it with the commit and time at which its results were made again, if they were.
+        ended, tag = milliseconds(record.ended), f"{AGAIN}{record.commit}"
+        first = record.commit == complete.data.tags.get("commit") and ended == complete.info.end_time
+        if record.commit and not first and complete.data.tags.get(tag) != str(ended):
+            client.set_tag(complete.info.run_id, tag, str(ended))
+        return "already logged"
+    _send(client, experiment, record, payload(record, run_json, results))
+    return "logged"
 
 
 def _send(client: MlflowClient, experiment: str, record: RunRecord, content: Payload) -> None:
@@ -153,44 +163,16 @@ def _send(client: MlflowClient, experiment: str, record: RunRecord, content: Pay
 
     start, end = milliseconds(record.started), milliseconds(record.ended)
     run_id = client.create_run(experiment, start_time=start, tags=content.tags, run_name=record.name).info.run_id
-    for params in _chunks(content.params, PARAMS_PER_CALL):
-        client.log_batch(run_id, params=[Param(name, value) for name, value in params])
-    for points in _chunks(content.metrics, METRICS_PER_CALL):
-        client.log_batch(run_id, metrics=[Metric(p.name, p.value, p.time, p.step) for p in points])
+    params = [Param(name, value) for name, value in content.params]
+    metrics = [Metric(point.name, point.value, point.time, point.step) for point in content.metrics]
+    for first in range(0, len(params), PARAMS_PER_CALL):
+        client.log_batch(run_id, params=params[first : first + PARAMS_PER_CALL])
+    for first in range(0, len(metrics), METRICS_PER_CALL):
+        client.log_batch(run_id, metrics=metrics[first : first + METRICS_PER_CALL])
     for path, folder in content.files:
         client.log_artifact(run_id, str(path), folder)
     client.set_terminated(run_id, "FINISHED" if record.status == "ok" else "FAILED", end)
     client.set_tag(run_id, "logged", "complete")
-
-
-def _note_again(client: MlflowClient, run: Run, record: RunRecord) -> None:
-    """Tag a run with the commit and time at which its results were made again, if they were."""
-    ended = milliseconds(record.ended)
-    first = record.commit == run.data.tags.get("commit") and ended == run.info.end_time
-    if record.commit and not first and run.data.tags.get(f"{AGAIN}{record.commit}") != str(ended):
-        client.set_tag(run.info.run_id, f"{AGAIN}{record.commit}", str(ended))
-
-
-def _mark_superseded(client: MlflowClient, experiment: str, record: RunRecord) -> None:
-    """Point the older complete runs of this scenario, method and seed to the newest by `superseded_by`.
-
-    The order of logging does not matter. A record that returned (settings changed there and back) may be newer on disk than
-    its run in MLflow, hence its own end is taken from the record.
-    """
-    runs = search(client, experiment, scenario=record.scenario, method=record.method, seed=str(record.seed))
-    runs = [run for run in runs if is_complete(run)]
-
-    def end(run: Run) -> tuple[int, bool]:
-        own = run.data.tags["run_key"] == record.run_key
-        return (milliseconds(record.ended) if own else run.info.end_time or 0), own
-
-    newest = max(runs, key=end)
-    for run in runs:
-        pointer = run.data.tags.get("superseded_by")
-        if run is newest and pointer:
-            client.delete_tag(run.info.run_id, "superseded_by")
-        elif run is not newest and pointer != newest.data.tags["run_key"]:
-            client.set_tag(run.info.run_id, "superseded_by", newest.data.tags["run_key"])
 
 
 def _close(client: MlflowClient, run: Run) -> None:
@@ -199,11 +181,7 @@ def _close(client: MlflowClient, run: Run) -> None:
     client.set_tag(run.info.run_id, "superseded", "true")
 
 
-def _chunks(items: list[T], size: int) -> Iterator[list[T]]:
-    return (items[start : start + size] for start in range(0, len(items), size))
-
-
-# --- records, leftovers, messages ---------------------------------------------------------------------------------------------
+# --- leftovers, messages ---
 
 
 def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str], None]) -> str | None:
@@ -224,15 +202,12 @@ def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str
 def _close_if_free(client: MlflowClient, run: Run, path: Path) -> bool:
     from filelock import Timeout
 
-    try:
-        with lock(path, timeout=0):
-            # Its logger may have finished between the search and the lock.
-            if client.get_run(run.info.run_id).info.status != "RUNNING":
-                return False
+    with contextlib.suppress(Timeout), lock(path, timeout=0):  # locked: a logger is at work
+        # Its logger may have finished between the search and the lock.
+        if client.get_run(run.info.run_id).info.status == "RUNNING":
             _close(client, run)
             return True
-    except Timeout:
-        return False  # a logger is at work
+    return False
 
 
 def _unreachable(error: Exception, consequence: str) -> str:
@@ -245,3 +220,142 @@ def _unreachable(error: Exception, consequence: str) -> str:
 
 def _warn(message: str) -> None:
     print(f"warning: tracking: {message}", file=sys.stderr)
+
+
+# --- what is sent for a run: its record and the files that it names, read and checked before anything is sent ---
+
+
+class Point(NamedTuple):
+    """One value of a metric."""
+
+    name: str
+    value: float
+    step: int
+    time: int
+    """ms since 1970."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload:
+    """Everything of a record that goes to MLflow."""
+
+    tags: dict[str, str]
+    params: list[tuple[str, str]]
+    metrics: list[Point]
+    files: list[tuple[Path, str | None]]
+    """Local file, artifact folder (None: the root)."""
+
+
+def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
+    """Read what a record names, and the job records of its stages. Raises InputError."""
+    folder = run_json.parent
+    files: list[tuple[Path, str | None]] = [(run_json, None)]
+    for target, names in record.artifacts.items():
+        files += [(_named_file(run_json, folder / name), target) for name in names]
+    targets = [(target, path.name) for path, target in files]
+    if doubles := [target for target in targets if targets.count(target) > 1]:
+        raise InputError(run_json, "artifacts of one folder must have different file names", doubles[0])
+    metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
+    for name in [*record.params, *{point.name for point in metrics}]:
+        if not METRIC_NAME.fullmatch(name):
+            raise InputError(run_json, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
+    params = [(name, cut(str(value), PARAM_LENGTH)) for name, value in record.params.items()]
+    return Payload(tags=_tags(record, folder), params=params, metrics=metrics, files=files)
+
+
+def milliseconds(time: str) -> int:
+    """ms since 1970, as MLflow counts, of an ISO 8601 time with a zone."""
+    return round(datetime.fromisoformat(time).timestamp() * 1000)
+
+
+def cut(text: str, length: int) -> str:
+    """The text; one longer than `length` is cut short and ends in dots."""
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
+    names = ("scenario", "category", "source", "method", "seed", "attempt", "status", "reason", "commit", "data_digest", "device")
+    tags = {name: str(getattr(record, name)) for name in (*names, "run_key")}
+    tags |= {f"variant.{name}": str(value) for name, value in record.variant.items()}
+    if record.commit:
+        tags["mlflow.source.git.commit"] = record.commit  # MLflow's pages show this one as the version
+    # How to look at the run and pull its twin: as a tag, and in the description on MLflow's page.
+    tags["play"] = command = shlex.join(["neuspring", "play", str(folder)])
+    tags["mlflow.note.content"] = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
+    return {name: cut(value, TAG_LENGTH) for name, value in tags.items()}
+
+
+def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
+    """Scores as `{task}.{metric}`, timings as `seconds.{stage}`, histories as `{history}.{metric}` by step."""
+    end = milliseconds(record.ended)
+    for stage, seconds in record.timings.items():
+        yield Point(f"seconds.{stage}", seconds, 0, end)
+    if record.scores_file:
+        for task, metric, value in _table(run_json, record.scores_file, ("task", "metric", "value")):
+            yield Point(f"{task}.{metric}", value, 0, end)
+    for history, name in record.histories.items():
+        for step, metric, value in _table(run_json, name, ("step", "metric", "value")):
+            yield Point(f"{history}.{metric}", value, int(step), end)
+
+
+def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Point]:
+    """Use of processor, memory and GPU as `system/{stage}.{what}`, which MLflow shows as system metrics; steps are seconds.
+
+    They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
+    metrics.
+    """
+    for stage, path in _jobs(record, run_json, results).items():
+        attempts = JobRecord.load(path).attempts if path.is_file() else []
+        for attempt in attempts[-1:]:
+            start = milliseconds(attempt.started)
+            for seconds, *values in attempt.samples:
+                for what, value in zip(SAMPLES, values, strict=True):
+                    if seconds is not None and value is not None:
+                        yield Point(f"system/{stage}.{what}", value, round(seconds), start + round(1000 * seconds))
+            totals = {
+                "peak_memory_mb": attempt.peak_memory_mb,
+                "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
+                "mean_gpu_percent": attempt.gpu_utilization,
+            }
+            for what, value in totals.items():
+                if value is not None:
+                    yield Point(f"system/{stage}.{what}", value, 0, start)
+
+
+def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
+    """Stage -> path of its job record, which need not exist: jobs/<rule>/, then the path of the results."""
+    folders = {"score": run_json.parent}
+    folders |= {Path(name).stem: run_json.parent / Path(name).parent for name in record.artifacts.get("records", [])}
+    jobs = {}
+    for stage, folder in folders.items():
+        parts = Path(os.path.relpath(folder.resolve(), results.resolve())).parts
+        if len(parts) == 3 and ".." not in parts:
+            scenario, row, seed = parts
+            # A search's row is its folder without `search-`.
+            row = row.removeprefix("search-") if stage == "search" else row
+            # A trained baseline writes the same rollout.json as a twin, but its rule is called predict.
+            rule = "predict" if stage == "rollout" and record.model else stage
+            jobs[stage] = results / JOBS / rule / scenario / row / f"{seed}.json"
+    return jobs
+
+
+def _table(run_json: Path, name: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
+    """Rows of the named columns of a Parquet file beside a record. Raises InputError."""
+    import pandas
+
+    path = _named_file(run_json, run_json.parent / name)
+    try:
+        table = pandas.read_parquet(path, columns=list(columns))
+        types = {"step": "int64", "value": "float64"}
+        table = table.astype({column: types[column] for column in columns if column in types})
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        rule = f"must be a Parquet table with the columns {', '.join(columns)}"
+        reason = cut(f"{type(error).__name__}: {error}".partition("\n")[0], 300)
+        raise InputError(path, rule, reason, f"Delete {run_json} and run again.") from error
+    return list(table.itertuples(index=False, name=None))
+
+
+def _named_file(run_json: Path, path: Path) -> Path:
+    if not path.is_file():
+        raise InputError(path, f"named by {run_json}", "no such file", f"Delete {run_json} and run again.")
+    return path

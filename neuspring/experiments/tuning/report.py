@@ -7,7 +7,6 @@ where a trial was begun again.
 
 from __future__ import annotations
 
-import copy
 import functools
 import hashlib
 import json
@@ -26,15 +25,15 @@ import yaml
 from optuna.study import Study
 
 from neuspring import config
-from neuspring.config import Config, Method, SearchRow
+from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_atomically, write_table, write_text
 from neuspring.core.records import canonical
 from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
 from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
-from neuspring.experiments.tuning.space import CLUSTERS, SECTIONS, Plan, labels
-from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, Store, slots
+from neuspring.experiments.tuning.space import CLUSTERS, Plan, labels
+from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, slots, study_of
 from neuspring.report.draw.sheet import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
@@ -89,7 +88,7 @@ class Findings:
 def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> None:
     """Sum up a sweep, finished or not. It lies in `output`'s folder. Raises InputError if there is none."""
     plan, folder = Plan.of(settings, tune, root), output.parent
-    study = Store(folder, tune.storage, tune.study).load(plan.facts())
+    study = study_of(folder, tune, plan.facts())
     definition = study.user_attrs[DEFINITION]
     # Trials beyond a `tune.trials` that was lowered count as well.
     begun = tuple(slots(study).values())
@@ -145,34 +144,27 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
     """
     if findings.best is None:
         return
-    plan, values = findings.plan, findings.best.trials[-1].user_attrs[VALUES]
+    plan, values = findings.plan, dict(findings.best.trials[-1].user_attrs[VALUES])
     name, method = tuned_name(plan.tune), plan.tune.method
-    sections: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    description = f"{method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"
+    clusters = values.pop(CLUSTERS, None)
+    sections: dict[str, dict[str, Any]] = {}
     for path, value in values.items():
-        if path != CLUSTERS:
-            *above, key = path.split(".")
-            functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
-
-    def tuned(row: Method | SearchRow, section: str, **changes: Any) -> Any:
-        merged = copy.deepcopy(dict(row.settings))
-        config.merge(merged, sections[section])
-        text = f"{method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"  # type: ignore[union-attr]
-        return replace(row, settings=merged, description=text, **changes)
-
-    methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
-    search = plan.method.search
-    if sections["search"] or CLUSTERS in values:
-        search = name
-        searches[name] = tuned(plan.row, "search", clusters=values.get(CLUSTERS, plan.row.clusters))
-    methods[name] = tuned(plan.method, "fit", search=search)
+        *above, key = path.split(".")
+        functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
+    methods = {key: config.plain(row) for key, row in read_methods(root / settings.method_table).items()}
+    searches = {key: config.plain(row) for key, row in read_searches(root / settings.search_table).items()}
+    tuned = config.plain(plan.method) | {"description": description}
+    config.merge(tuned["settings"], sections.get("fit", {}))
+    if "search" in sections or clusters is not None:
+        row = config.plain(plan.row) | {"description": description, "clusters": clusters or plan.row.clusters}
+        config.merge(row["settings"], sections.get("search", {}))
+        searches[name], tuned["search"] = row, name
     overlay: dict[str, Any] = {"methods": [method, name], "compare_with": method, "tables": f"tables-{name}"}
     # Absolute: relative ones would start from the Snakefile.
     overlay |= {f"{table}_table": str((folder / file).resolve()) for table, file in TABLES_OF_ROWS.items()}
-    overlay |= {section: sections[section] for section in SHARED if sections[section]}
-    contents = {"best.yaml": overlay}
-    contents["methods.yaml"] = {key: config.plain(value) for key, value in methods.items()}
-    contents["searches.yaml"] = {key: config.plain(value) for key, value in searches.items()}
-    for file, content in contents.items():
+    overlay |= {section: sections[section] for section in SHARED if section in sections}
+    for file, content in {"best.yaml": overlay, "methods.yaml": methods | {name: tuned}, "searches.yaml": searches}.items():
         write_text(folder / file, yaml.safe_dump(content, sort_keys=False, width=120))
 
 
@@ -302,67 +294,66 @@ def _draw(study: Study, folder: Path, *, importances: bool) -> None:
 def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any], folder: Path) -> None:
     """Write trials/<slot>/run.json and the files that it names, unless they are there."""
     plan, trial = findings.plan, slot.trials[-1]
-    facts, values = trial.user_attrs.get(FACTS, {}), trial.user_attrs.get(VALUES, {})
+    values, steps = trial.user_attrs.get(VALUES, {}), sorted(trial.intermediate_values.items())
+    times = {"started": _utc(trial.datetime_start), "ended": _utc(trial.datetime_complete or trial.datetime_start)}
+    facts = times | {"seconds": {}} | trial.user_attrs.get(FACTS, {})
     scores = {"loss": trial.value} if slot.state == "complete" else {}
     scores |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
-    steps = sorted(trial.intermediate_values.items())
-    history = pd.DataFrame([(step, "tail_loss", value) for step, value in steps], columns=["step", "metric", "value"])
-    fields = {
-        "scenario": f"trial-{slot.number}",
-        "variant": {"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(values)},
-        "status": "failed" if slot.state == "failed" else "ok",
-        "reason": slot.reason,
-        "params": labels(plan.flat(values)),
-        "attempt": len(slot.trials),
-        "commit": facts.get("commit", ""),
-        "device": facts.get("device", ""),
-        "started": facts.get("started", _utc(trial.datetime_start)),
-        "ended": facts.get("ended", _utc(trial.datetime_complete or trial.datetime_start)),
-        "timings": facts.get("seconds", {}),
-        "histories": {"steps": "history.parquet"},
-    }
-    place = folder / "trials" / str(slot.number)
-    _write_record(plan.tune, definition, fields, scores, steps, place, {"history.parquet": history})
+    _write_record(
+        plan.tune,
+        definition,
+        folder / "trials" / str(slot.number),
+        facts,
+        scores,
+        steps,
+        scenario=f"trial-{slot.number}",
+        variant={"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(values)},
+        status="failed" if slot.state == "failed" else "ok",
+        reason=slot.reason,
+        params=labels(plan.flat(values)),
+        attempt=len(slot.trials),
+        histories={"steps": "history.parquet"},
+    )
 
 
 def _record_sweep(findings: Findings, definition: Mapping[str, Any], files: Sequence[Path], folder: Path) -> None:
     """Write the run.json of the sweep. `files`, its tables and pictures, lie in `folder`."""
     tune, best = findings.plan.tune, findings.best
-    facts = [slot.trials[-1].user_attrs[FACTS] for slot in findings.slots if slot.trials[-1].user_attrs.get(FACTS)]
-    facts = facts or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
-    losses = {"best": best.trials[-1].value if best else None, "baseline": findings.baseline}
-    fields = {
-        "scenario": "study",
-        "variant": {"study": tune.study, "method": tune.method, "pruner": tune.pruner},
-        "status": "ok" if best else "failed",
-        "reason": "" if best else "no trial has finished",
-        "params": {"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
-        "attempt": 1,
-        "commit": facts[-1].get("commit", ""),
-        "device": facts[-1].get("device", ""),
-        "started": min(fact["started"] for fact in facts),
-        "ended": max(fact["ended"] for fact in facts),
-        "timings": {name: sum(fact["seconds"].get(name, 0.0) for fact in facts) for name in ("search", "fit")},
-        "artifacts": {
+    made = [slot.trials[-1].user_attrs[FACTS] for slot in findings.slots if slot.trials[-1].user_attrs.get(FACTS)]
+    made = made or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
+    facts = made[-1] | {"started": min(fact["started"] for fact in made), "ended": max(fact["ended"] for fact in made)}
+    facts |= {"seconds": {name: sum(fact["seconds"].get(name, 0.0) for fact in made) for name in ("search", "fit")}}
+    scores = {"best": best.trials[-1].value if best else None, "baseline": findings.baseline}
+    _write_record(
+        tune,
+        definition,
+        folder,
+        facts,
+        {name: value for name, value in scores.items() if value is not None},
+        [[slot.number, slot.state, slot.trials[-1].value] for slot in findings.slots],
+        scenario="study",
+        variant={"study": tune.study, "method": tune.method, "pruner": tune.pruner},
+        status="ok" if best else "failed",
+        reason="" if best else "no trial has finished",
+        params={"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
+        attempt=1,
+        artifacts={
             "tables": [path.name for path in files if path.suffix != ".png"],
             "plots": [path.name for path in files if path.suffix == ".png"],
         },
-    }
-    scores = {name: value for name, value in losses.items() if value is not None}
-    states = [[slot.number, slot.state, slot.trials[-1].value] for slot in findings.slots]
-    _write_record(tune, definition, fields, scores, states, folder, {})
+    )
 
 
 def _write_record(
     tune: Tune,
     definition: Mapping[str, Any],
-    fields: Mapping[str, Any],
-    scores: Mapping[str, Any],
-    results: Any,
     folder: Path,
-    tables: Mapping[str, pd.DataFrame],
+    facts: Mapping[str, Any],
+    scores: Mapping[str, Any],
+    results: Sequence[Any],
+    **fields: Any,
 ) -> None:
-    """Write a run record under its key, with its scores and tables, unless a record of that key is there."""
+    """Write a run record under its key, with its scores and history, unless a record of that key is there."""
     record = RunRecord(
         run_key="0" * 8,  # until the record is complete
         source="tune",
@@ -370,6 +361,11 @@ def _write_record(
         method=f"tune-{tune.study}",
         seed=tune.seed,
         data_digest=hashlib.sha256(canonical(definition.get("frames", {})).encode()).hexdigest(),
+        commit=facts.get("commit", ""),
+        device=facts.get("device", ""),
+        started=facts["started"],
+        ended=facts["ended"],
+        timings=facts["seconds"],
         scores_file="scores.parquet",
         **fields,
     )
@@ -378,9 +374,11 @@ def _write_record(
     key = key_of({name: getattr(record, name) for name in KEYED}, scores, results)
     if path.is_file() and RunRecord.load(path).run_key == key:
         return
-    table = pd.DataFrame([("tail", name, value) for name, value in scores.items()], columns=["task", "metric", "value"])
-    for name, values in {"scores.parquet": table, **tables}.items():
-        write_table(values.astype({"value": "float64"}), folder / name)
+    tables = {"scores.parquet": [("task", "metric", "value"), *(("tail", *score) for score in scores.items())]}
+    if record.histories:
+        tables["history.parquet"] = [("step", "metric", "value"), *((step, "tail_loss", value) for step, value in results)]
+    for name, (header, *rows) in tables.items():
+        write_table(pd.DataFrame(rows, columns=list(header)).astype({"value": "float64"}), folder / name)
     replace(record, run_key=key).save(path)
 
 

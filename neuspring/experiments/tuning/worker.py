@@ -29,7 +29,7 @@ from typing import Any, Literal
 import optuna
 import sqlalchemy
 from filelock import FileLock, Timeout
-from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from optuna.pruners import BasePruner, MedianPruner, NopPruner
 from optuna.samplers import BaseSampler, TPESampler
 from optuna.storages import RDBStorage
 from optuna.study import Study
@@ -58,60 +58,46 @@ PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
 
-@dataclass(frozen=True)
-class Store:
-    """Where a sweep is kept: its folder, and a PostgreSQL URI or None for a SQLite file in the folder."""
+def lock_of(folder: Path) -> FileLock:
+    """Holds the sweep in `folder` against its other workers; the death of the holder frees it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / ".lock")
 
-    folder: Path
-    uri: str | None
-    study: str
 
-    def lock(self) -> FileLock:
-        """Holds the sweep against its other workers; the death of the holder frees it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        return FileLock(self.folder / ".lock")
+def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePruner | None = None) -> Study:
+    """A sweep, which is made if there is none and it is given a `pruner`; it is kept in SQLite in its folder, or in PostgreSQL.
 
-    def open(self, facts: Mapping[str, Any], pruner: BasePruner) -> Study:
-        """The sweep, made if there is none. Raises InputError if it was begun with other `facts`."""
-        # Several processes must not create the tables at once.
-        with self.lock():
-            study = optuna.create_study(
-                storage=self._storage(), study_name=self.study, pruner=pruner, load_if_exists=True, direction="minimize"
-            )
-            if DEFINITION not in study.user_attrs:
-                study.set_user_attr(DEFINITION, dict(facts))
-        return self._checked(study, facts)
-
-    def load(self, facts: Mapping[str, Any]) -> Study:
-        """The sweep for reading. Raises InputError if there is none, or if it was begun with other `facts`."""
-        if self.uri or (self.folder / DATABASE).is_file():
-            with contextlib.suppress(KeyError), self.lock():
-                study = optuna.load_study(storage=self._storage(), study_name=self.study)
-                if DEFINITION in study.user_attrs:
-                    return self._checked(study, facts)
-        raise InputError(f"sweep {self.study}", "must have been begun", None, "Run neuspring tune first.")
-
-    def _checked(self, study: Study, facts: Mapping[str, Any]) -> Study:
-        definition = {name: study.user_attrs[DEFINITION].get(name) for name in facts}
-        if canonical(definition) != canonical(facts):
-            before, after = flat(definition), flat(facts)
-            changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
-            rule, where = "must go on with what it was begun with", "" if self.uri else f" ({self.folder})"
-            remedy = f"Name a new sweep (tune.study), or delete this one{where}."
-            raise InputError(f"sweep {self.study}", rule, f"another {', '.join(changed)}", remedy)
-        return study
-
-    def _storage(self) -> RDBStorage:
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        if self.uri is None:
-            path = str((self.folder / DATABASE).resolve())
-            uri = sqlalchemy.URL.create("sqlite", database=path).render_as_string()
-            return RDBStorage(uri, engine_kwargs={"connect_args": {"timeout": PATIENCE}})
-        try:
-            # A server may close connections that are idle during a long fit.
-            return RDBStorage(self.uri, engine_kwargs={"pool_pre_ping": True})
-        except ImportError as error:
-            raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
+    Raises InputError if there is none, or if it was begun with other `facts`.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    path, begun = folder / DATABASE, None
+    uri = tune.storage or sqlalchemy.URL.create("sqlite", database=str(path.resolve())).render_as_string()
+    # A server may close connections that are idle during a long fit.
+    engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": PATIENCE}}
+    # Several processes must not create the tables at once.
+    with lock_of(folder):
+        if pruner or tune.storage or path.is_file():
+            try:
+                storage = RDBStorage(uri, engine_kwargs=engine)
+            except ImportError as error:
+                raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
+            if pruner:
+                study = optuna.create_study(storage=storage, study_name=tune.study, pruner=pruner, load_if_exists=True)
+                if DEFINITION not in study.user_attrs:
+                    study.set_user_attr(DEFINITION, dict(facts))
+            with contextlib.suppress(KeyError):
+                study = optuna.load_study(storage=storage, study_name=tune.study, pruner=pruner)
+                begun = study.user_attrs[DEFINITION]
+    if begun is None:
+        raise InputError(f"sweep {tune.study}", "must have been begun", None, "Run neuspring tune first.")
+    definition = {name: begun.get(name) for name in facts}
+    if canonical(definition) != canonical(facts):
+        before, after = flat(definition), flat(facts)
+        changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
+        remedy = f"Name a new sweep (tune.study), or delete this one{'' if tune.storage else f' ({folder})'}."
+        rule = "must go on with what it was begun with"
+        raise InputError(f"sweep {tune.study}", rule, f"another {', '.join(changed)}", remedy)
+    return study
 
 
 @dataclass(frozen=True)
@@ -202,8 +188,6 @@ def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
     # The loss of one scenario says little about the mean.
     unpruned = math.ceil(scenarios / 3) if scenarios > 1 else 0
     warmup = unpruned * epochs + tune.warmup_epochs
-    if tune.pruner == "hyperband":
-        return HyperbandPruner(min_resource=max(warmup, 1), max_resource=max(scenarios * epochs, warmup, 1))
     return MedianOfStep(tune, warmup) if tune.pruner == "median" else NopPruner()
 
 
@@ -247,13 +231,12 @@ def work(
     first = labels({name: value for name, value in plan.baseline.items() if holds(tune.space[name], value)})
     sampler = functools.partial(sampler_of, tune, grouped=len(first) < len(tune.space))
     facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
-    store = Store(folder, tune.storage, tune.study)
-    study = store.open(facts, pruner_of(tune, len(scenes), plan.epochs))
+    study = study_of(folder, tune, facts, pruner_of(tune, len(scenes), plan.epochs))
     finished: list[int] = []
     try:
         with FileLock(folder / f".worker-{worker}.lock", timeout=0):
             while True:
-                with store.lock():
+                with lock_of(folder):
                     trial = claim(study, worker, tune, first, sampler)
                 if trial is None:
                     break
