@@ -15,6 +15,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
+from neuspring.baselines.spring_gaus import find_vgg16
 from neuspring.config import Config
 
 if TYPE_CHECKING:
@@ -105,9 +106,7 @@ def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
 
 
 def _vgg16(section: Any) -> str:
-    from neuspring.baselines.spring_gaus.vgg import find_weights
-
-    return "absent" if isinstance(find_weights(section.vgg16), str) else "found"
+    return "absent" if isinstance(find_vgg16(section.vgg16), str) else "found"
 
 
 REFERENCES = ("static", "controller_lbs")
@@ -115,7 +114,7 @@ REFERENCES = ("static", "controller_lbs")
 BASELINES = {
     "spring_gaus": Baseline(
         training="neuspring.baselines.spring_gaus.train:train",
-        prediction="neuspring.baselines.spring_gaus.predict:predict",
+        prediction="neuspring.baselines.spring_gaus.model:predict",
         model="neuspring.baselines.spring_gaus.model:SpringGausModel",
         section="spring_gaus",
         takes_pictures=lambda section: bool(section.supervision == "masks"),
@@ -125,7 +124,7 @@ BASELINES = {
     ),
     "gs_dynamics": Baseline(
         training="neuspring.baselines.gs_dynamics.train:train",
-        prediction="neuspring.baselines.gs_dynamics.predict:predict",
+        prediction="neuspring.baselines.gs_dynamics.model:predict",
         model="neuspring.baselines.gs_dynamics.model:GsDynamicsModel",
         section="gs_dynamics",
         transfers=True,

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus import vgg
+from neuspring.baselines.spring_gaus import VGG16, find_vgg16
 from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
@@ -176,8 +176,8 @@ def _weights(settings: Config) -> Iterator[Finding]:
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
         "VGG16 (Spring-Gaus' features)": (
-            lambda: vgg.find_weights(settings.baselines.spring_gaus.vgg16),
-            f"{DOWNLOAD} {hub / vgg.FILE} https://download.pytorch.org/models/{vgg.FILE}",
+            lambda: find_vgg16(settings.baselines.spring_gaus.vgg16),
+            f"{DOWNLOAD} {hub / VGG16} https://download.pytorch.org/models/{VGG16}",
         ),
     }
     for subject, (find, remedy) in checked.items():

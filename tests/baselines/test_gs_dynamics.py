@@ -20,8 +20,19 @@ from neuspring.baselines.gs_dynamics.model import (
     sample,
     weight_count,
 )
-from neuspring.baselines.gs_dynamics.train import draw, length_loss, pick, position_loss
-from neuspring.baselines.gs_dynamics.windows import Tracks, Windows, ahead, ordinary, past, smoothed, window_frames
+from neuspring.baselines.gs_dynamics.train import (
+    Tracks,
+    Windows,
+    ahead,
+    draw,
+    length_loss,
+    ordinary,
+    past,
+    pick,
+    position_loss,
+    smoothed,
+    window_frames,
+)
 from neuspring.config.baselines import GsDynamics
 from neuspring.core.errors import InputError
 
@@ -185,7 +196,7 @@ def test_unseen_tracks_are_no_particles_and_no_targets(monkeypatch):
     batch = draw(windows, rules, recipe, torch.Generator().manual_seed(0))
     assert batch.history.abs().max() < 1 and batch.targets.abs().max() < 1 and batch.known.all()
     # Too few are seen throughout: those seen in the history take part, and what is not seen is no target.
-    monkeypatch.setattr("neuspring.baselines.gs_dynamics.windows.MIN_VISIBLE", 28)
+    monkeypatch.setattr("neuspring.baselines.gs_dynamics.train.MIN_VISIBLE", 28)
     windows = Windows.of(hidden, settings, "cpu")
     in_history = (windows.frames[:, :3] == 6).any(dim=1)
     assert not windows.usable[in_history, :5].any() and windows.usable[~in_history].all()

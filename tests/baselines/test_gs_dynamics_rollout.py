@@ -10,9 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.baselines import TrainingRequest
 from neuspring.baselines.gs_dynamics import train as training
-from neuspring.baselines.gs_dynamics.model import Dynamics, GsDynamicsModel, connect, resolve, weight_count
-from neuspring.baselines.gs_dynamics.predict import carry, predict, turns
-from neuspring.baselines.gs_dynamics.windows import upright
+from neuspring.baselines.gs_dynamics.model import (
+    Dynamics,
+    GsDynamicsModel,
+    carry,
+    connect,
+    predict,
+    resolve,
+    turns,
+    upright,
+    weight_count,
+)
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.config import Config
 from neuspring.config.baselines import Baselines, GsDynamics
@@ -28,7 +36,7 @@ RULES = resolve(PLAIN, "sloth")[0]
 @pytest.fixture(autouse=True)
 def plain(monkeypatch):
     """Tracks are taken as they are, and a checkpoint is written after each epoch."""
-    monkeypatch.setattr("neuspring.baselines.gs_dynamics.windows.SMOOTHING_PASSES", 0)
+    monkeypatch.setattr("neuspring.baselines.gs_dynamics.train.SMOOTHING_PASSES", 0)
     monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
 
 

@@ -14,10 +14,11 @@ from neuspring.baselines.spring_gaus.model import (
     Follower,
     SpringGausModel,
     choose_anchors,
+    contraction,
+    roll_out,
     soft_vector,
 )
 from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
-from neuspring.baselines.spring_gaus.predict import contraction, roll_out
 from neuspring.baselines.spring_gaus.train import Problem, Training, run
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.errors import NumericalFailure

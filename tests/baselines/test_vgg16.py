@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from neuspring.baselines.spring_gaus import vgg
-from neuspring.baselines.spring_gaus.losses import FEATURES, silhouette_loss
+from neuspring.baselines import spring_gaus
+from neuspring.baselines.spring_gaus.train import FEATURES, load_features, silhouette_loss
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 
@@ -26,7 +26,7 @@ def stored(network: torch.nn.Module, folder):
 
 
 def test_features_are_those_of_the_network(network, tmp_path):
-    features = vgg.load_features(stored(network, tmp_path), "cpu")
+    features = load_features(stored(network, tmp_path), "cpu")
     pictures = torch.rand(2, 3, 20, 28, generator=torch.Generator().manual_seed(1))
     shift, scale = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     wanted = network((pictures - shift[:, None, None]) / scale[:, None, None])
@@ -35,7 +35,7 @@ def test_features_are_those_of_the_network(network, tmp_path):
 
 
 def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
-    features = vgg.load_features(stored(network, tmp_path), "cpu")
+    features = load_features(stored(network, tmp_path), "cpu")
     drawn = torch.rand(16, 24, generator=torch.Generator().manual_seed(2), requires_grad=True)
     mask = (drawn.detach() > 0.5).float()
     term = silhouette_loss(drawn, mask, features) - silhouette_loss(drawn, mask, None)
@@ -48,11 +48,11 @@ def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
 def test_a_file_is_known_by_its_digest_and_a_damaged_one_is_named(network, tmp_path, monkeypatch):
     path = stored(network, tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
-    assert "vgg16-397923af.pth is not there" in vgg.find_weights(None)
+    assert "vgg16-397923af.pth is not there" in spring_gaus.find_vgg16(None)
     with pytest.raises(InputError, match="must be the file of VGG16 weights; received has SHA-256"):
-        vgg.find_weights(str(path))
-    monkeypatch.setattr(vgg, "DIGEST", digest_file(path)[:8])
-    assert vgg.find_weights(str(path)) == path
+        spring_gaus.find_vgg16(str(path))
+    monkeypatch.setattr(spring_gaus, "DIGEST", digest_file(path)[:8])
+    assert spring_gaus.find_vgg16(str(path)) == path
     damaged = stored(network[:-2], tmp_path)
     with pytest.raises(InputError, match=r"`features\.7\.weight` must be a float tensor \[128, 128, 3, 3\]; received NoneType"):
-        vgg.load_features(damaged, "cpu")
+        load_features(damaged, "cpu")

@@ -11,8 +11,8 @@ import time
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
-from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
+from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.baselines.spring_gaus.model import AnchorGraph, SpringGausModel
-from neuspring.baselines.spring_gaus.physics import AnchorSolver
-from neuspring.baselines.spring_gaus.predict import roll_out as roll_out_anchors
+from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.model import roll_out as roll_out_anchors
+from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 from neuspring.physics.parameters import pack, twin_tensors

@@ -10,7 +10,7 @@ import pytest
 from neuspring import config
 from neuspring.baselines import BASELINES
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
-from neuspring.baselines.gs_dynamics.predict import predict as predicted
+from neuspring.baselines.gs_dynamics.model import predict as predicted
 from neuspring.baselines.spring_gaus.model import SpringGausModel
 from neuspring.config.baselines import Baselines, GsDynamics, SpringGaus
 from neuspring.config.images import Appearance, Images

@@ -1,4 +1,4 @@
-"""The model of GS-Dynamics: presets per kind of object, how points become a graph, the network, and what is saved.
+"""The model of GS-Dynamics: presets per kind of object, how points become a graph, the network, what is saved, and the rollout.
 
 With receiver r and sender s of edge e, h the state of a node, c codes, R = ReLU:
 
@@ -6,22 +6,34 @@ With receiver r and sender s of edge e, h the state of a node, c codes, R = ReLU
 
 a number of rounds with the same weights, from h = c_n. A head turns h of particles into displacements, m. Each block of W_r is
 multiplied with nodes, and the products are gathered at edges: the same sums as products of gathered states, in fewer operations.
+
+In an open-loop rollout structure points make a step whenever the tools have moved by one.
+In a step, each particle b has the rotation R_b that best maps the offsets to its neighbors in the graph (Kabsch). Where these lie
+on a line, it is the smallest rotation; where there are none, there is none. A point at x follows the particles b, which move by
+u_b, with weights w_b ~ 1 / max(|x - b|, 0.1 mm):
+
+    x' = x + sum_b w_b [(R_b - 1) (x - b) + u_b].
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
+import warp as wp
 from torch.nn.functional import linear, relu
 from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
+from neuspring.baselines.results import LIMIT, Prediction
 from neuspring.config.baselines import GsDynamics
-from neuspring.core.artifacts import Artifact, array
+from neuspring.core.artifacts import Artifact, Observations, Trajectory, Up, array
+from neuspring.core.device import load, start_warp
 from neuspring.core.errors import InputError
+from neuspring.splats.skinning import turn_nodes
 
 HISTORY = 3
 """Steps H that the network sees, the present one included."""
@@ -38,6 +50,10 @@ PRESETS: dict[PresetName, tuple[Any, ...]] = {
 }
 """The public configurations. Meanings as in `Rules` and `config.GsDynamics`."""
 CLOTHS = ("cloth", "package")
+CLOSE = 1e-4
+"""Distances are floored here before a weight is computed from them, m."""
+HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
+"""Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
 # Without weights: they are drawn by `initial` or set by `of`.
 Linear = partial(skip_init, torch.nn.Linear)
 
@@ -256,3 +272,130 @@ class GsDynamicsModel(Artifact):
     def dynamics(self, device: str) -> Dynamics:
         """The network on a device."""
         return Dynamics.of(self.rules, torch.tensor(self.weights, device=device))
+
+
+def predict(model: GsDynamicsModel, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
+    """Structure points in all frames, from those of frame 0 and the controllers; nothing else of the object is read.
+
+    For a transfer, the observations are the target's and the model is the source's. The published transfers started from the
+    source's points, registered to the target. The model has no splats of its own.
+    """
+    up = observations.scenario.up
+    tools = upright(observations.controller_points, up)
+    frames, positions, counts, touched, reason, diverged = [0], [], [], [], "", None
+    with torch.no_grad():
+        dynamics = model.dynamics(device)
+        start, hands = torch.tensor(upright(observations.nodes, up), device=device), torch.tensor(tools, device=device)
+        positions.append(start)
+        history, last = start.expand(HISTORY, -1, -1), [0] * HISTORY
+        for frame in executed(tools, model.rules.step):
+            after, particles, contacts = make_step(dynamics, history, hands[[*last, frame]])
+            counts.append(particles)
+            touched.append(contacts)
+            # NaN compares false, so this catches it together with infinity and absurd distances.
+            near = (after.abs() < LIMIT).all(dim=1)
+            if not bool(near.all()):
+                reason, diverged = f"node {int((~near).nonzero()[0])} left the scene in frame {frame}", frame
+                break
+            frames.append(frame)
+            positions.append(after)
+            history, last = torch.cat([history[1:], after[None]]), [*last[1:], frame]
+    end = len(tools) if diverged is None else diverged
+    shown = upright(in_every_frame(frames, torch.stack(positions).cpu().numpy(), end), up)
+    facts = {
+        "executed_steps": len(frames) - 1,
+        "tools": tools.shape[1],
+        "particles": float(np.mean(counts)) if counts else 0.0,
+        "tool_contacts": float(np.mean(touched)) if touched else 0.0,
+    }
+    return Prediction(Trajectory(positions=shown, frame_count=len(tools), diverged_frame=diverged, reason=reason), facts)
+
+
+def make_step(dynamics: Dynamics, history: torch.Tensor, tools: torch.Tensor) -> tuple[torch.Tensor, int, int]:
+    """Structure points [N, 3], m, after one step, from history [H, N, 3] and tools [H + 1, C, 3], m, of which the last is ahead.
+
+    Returns the number of particles and of edges between them and tools, too.
+    """
+    rules, now = dynamics.rules, history[-1]
+    first = torch.zeros(1, dtype=torch.long, device=now.device)
+    usable = torch.ones(1, len(now), dtype=torch.bool, device=now.device)
+    indices = sample(now[None], usable, rules.particles, rules.coverage, first)[0][0]
+    particles = history[:, indices]
+    used = torch.ones(1, len(indices), dtype=torch.bool, device=now.device)
+    graph = connect(particles[-1:], used, tools[-2:-1], rules)
+    moves = dynamics(graph, torch.cat([particles, tools[:-1]], dim=1), tools[-1] - tools[-2])
+    contacts = int((~graph.among_particles).sum()) // 2
+    if not bool(torch.isfinite(moves).all()):
+        return torch.full_like(now, torch.nan), len(indices), contacts
+    after = carry(now, particles[-1], turns(graph, particles[-1], particles[-1] + moves), moves)
+    return after, len(indices), contacts
+
+
+def in_every_frame(steps: list[int], positions: np.ndarray, frames: int) -> np.ndarray:
+    """Positions [frames, N, 3], m, of which those [S, N, 3] in the frames `steps` are given.
+
+    Between two steps points move on straight lines, which needs the next step and so works offline only; after the last they stay.
+    """
+    given_frames, frame = np.array(steps), np.arange(frames)
+    before = np.searchsorted(given_frames, frame, side="right") - 1
+    after = np.minimum(before + 1, len(given_frames) - 1)
+    span = np.maximum(given_frames[after] - given_frames[before], 1)
+    part = ((frame - given_frames[before]) / span).astype(positions.dtype)[:, None, None]
+    # Exact where the two are the same.
+    return np.asarray(positions[before] + part * (positions[after] - positions[before]))
+
+
+def turns(graph: Graph, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """Rotations [P, 3, 3] of particles that moved from `before` to `after` [P, 3], m."""
+    start_warp()
+    count, among = graph.particles, graph.among_particles
+    receivers, senders = (ends[among].cpu().numpy() for ends in (graph.receivers, graph.senders))
+    order = np.argsort(receivers, kind="stable")
+    receivers, senders = receivers[order], senders[order]
+    slot = np.arange(len(receivers)) - np.searchsorted(receivers, receivers)
+    # Neighbors [P, k] of each particle. Empty places hold the particle itself, which adds no offset.
+    neighbors = np.repeat(np.arange(count, dtype=np.int32)[:, None], int(slot.max(initial=0)) + 1, axis=1)
+    neighbors[receivers, slot] = senders
+    # With a hundred particles the CPU is as fast as any device.
+    positions: list[Any] = [
+        wp.array(points.cpu().numpy().astype(np.float32), dtype=wp.vec3, device="cpu") for points in (before, after)
+    ]
+    table: Any = wp.array(neighbors, dtype=int, device="cpu")
+    rotations, ranks = wp.zeros(count, dtype=wp.mat33, device="cpu"), wp.zeros(count, dtype=int, device="cpu")
+    wp.launch(load(turn_nodes, "cpu"), count, [*positions, table, rotations, ranks], device="cpu")
+    return torch.tensor(rotations.numpy(), dtype=before.dtype, device=before.device)
+
+
+def carry(points: torch.Tensor, particles: torch.Tensor, rotations: torch.Tensor, displacements: torch.Tensor) -> torch.Tensor:
+    """Points [N, 3] m after particles [P, 3] m with rotations [P, 3, 3] moved by displacements [P, 3], m."""
+    weights = 1 / torch.cdist(points, particles, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=CLOSE)
+    weights = weights / weights.sum(dim=1, keepdim=True)
+    bend = rotations - torch.eye(3, dtype=points.dtype, device=points.device)
+    # sum_b w_b [B_b (x - b) + u_b] = (sum_b w_b B_b) x + sum_b w_b (u_b - B_b b), relative to a center to keep digits.
+    center = particles.mean(dim=0)
+    shift = displacements - torch.einsum("bij,bj->bi", bend, particles - center)
+    turned = torch.einsum("nij,nj->ni", (weights @ bend.flatten(1)).view(-1, 3, 3), points - center)
+    return points + turned + weights @ shift
+
+
+def upright(points: np.ndarray, up: Up) -> np.ndarray:
+    """Points [..., 3], m, of a world with this `up` in one with +z up. Applied twice, it changes nothing."""
+    return points.astype(np.float32) if up == "+z" else points.astype(np.float32) * HALF_TURN
+
+
+def steps(tools: np.ndarray, frames: Iterable[int], step: float, last_accepted: float = 1.0) -> Iterator[int]:
+    """The first of `frames`, then each in which any tool of [T, C, 3] has moved `step`, m, since the one before.
+
+    The last frame of the recording needs only `last_accepted` of a step.
+    """
+    latest = None
+    for frame in frames:
+        least = step * (last_accepted if frame == len(tools) - 1 else 1.0)
+        if latest is None or float(np.linalg.norm(tools[frame] - tools[latest], axis=1).max()) >= least:
+            latest = frame
+            yield frame
+
+
+def executed(tools: np.ndarray, step: float) -> list[int]:
+    """Frames in which a rollout makes a step: those in which tools [T, C, 3] have moved `step`, m, since the one before."""
+    return list(steps(tools, range(len(tools)), step))[1:]

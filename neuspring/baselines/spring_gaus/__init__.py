@@ -1,6 +1,20 @@
 """Spring-Gaus: anchors with directed springs move splats; their parameters are trained on silhouettes, or on points.
 
-model: anchors in frame 0, what is trained and saved. physics: their motion. losses: silhouettes, points. train: the problem and
-its epochs. predict: the rollout. vgg: features for a loss.
+physics: anchors and their motion. model: what is learned, and the rollout. train: the problem, its losses and epochs.
 What differs from the public code, and what was measured: `neuspring/baselines/README.md`.
 """
+
+from pathlib import Path
+
+from neuspring.core.weights import find_file, hub_folder
+
+VGG16, DIGEST = "vgg16-397923af.pth", "397923af"
+"""Weights for a term of the loss, and the first digits of their SHA-256, which by torch hub's convention are in the file's name."""
+
+
+def find_vgg16(path: str | None) -> Path | str:
+    """The weight file that the configuration names or that is in torch hub's cache, else one line that says why there is none.
+
+    Raises InputError only for a named file that is missing or has another content.
+    """
+    return find_file("VGG16 weights", Path(path) if path else None, [hub_folder() / VGG16], DIGEST, False)

@@ -1,4 +1,4 @@
-"""A Spring-Gaus model: anchors in frame 0, their directed neighbors, the controllers' links, and what is learned."""
+"""A Spring-Gaus model: what is learned of anchors and saved, and its rollout: structure points, and the centers of its splats."""
 
 from __future__ import annotations
 
@@ -10,103 +10,19 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from neuspring.baselines.results import LIMIT, Prediction
+from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorParameters, AnchorPhysics, AnchorSolver
 from neuspring.config.baselines import SpringGaus
-from neuspring.core.artifacts import Artifact, array
-from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.artifacts import Observations, Trajectory, array
 
 CELLS = (0.01, 0.001)
 """Cell sizes of the grids that anchors are drawn from, m."""
-LINK_COUNT, LINK_REACH = 50, 0.04
-"""A controller is linked to at most so many anchors, as far from it in frame 0, m."""
-SHORTEST_LINK = 1e-4
-"""Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
-NEAREST = 1e-12
-"""Distances to anchors are floored here before a weight is computed from them, m."""
 BOUND_ANCHORS = 16
 """Nearest anchors that a splat or a structure point follows."""
+NEAREST = 1e-12
+"""Distances to anchors are floored here before a weight is computed from them, m."""
 GROUND_LOGIT = -1.0
 """rho at the start."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnchorGraph(Artifact):
-    """Which anchors and controllers each anchor feels. Springs are directed: row i is what anchor i feels."""
-
-    kind: ClassVar[str] = "anchor_graph"
-    anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
-    neighbors: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
-    lengths: np.ndarray = array("N,K", np.float32, "m", "their distances in frame 0, the rest lengths")
-    link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
-    links: np.ndarray = array("M", np.int32, "1", "controller of each link")
-    link_lengths: np.ndarray = array("M", np.float32, "m", "rest lengths of links")
-
-    def check(self) -> None:
-        anchors = len(self.anchors)
-        if len(self.link_starts) != anchors + 1:
-            raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
-        if self.neighbors.size and not 0 <= self.neighbors.min() <= self.neighbors.max() < anchors:
-            raise InputError("spring_gaus.neighbors", f"indices must lie in [0, {anchors})", int(self.neighbors.max()))
-        if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
-            raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
-
-    @classmethod
-    def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbors: int) -> AnchorGraph:
-        """The graph of anchors [N, 3] and controllers [C, 3] of frame 0, m.
-
-        Raises NumericalFailure if there are too few anchors, or two at one place.
-        """
-        if len(anchors) <= neighbors:
-            raise NumericalFailure(f"more anchors than neighbors ({neighbors}) are required, and there are {len(anchors)}")
-        tree = cKDTree(anchors)
-        distance, index = tree.query(anchors, k=neighbors + 1)
-        if distance[:, 1].min() <= 0:
-            raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
-        link_distance, near = tree.query(controllers, k=min(LINK_COUNT, len(anchors)), distance_upper_bound=LINK_REACH)
-        link_distance, near = link_distance.reshape(len(controllers), -1), near.reshape(len(controllers), -1)
-        controller, slot = np.nonzero(np.isfinite(link_distance))
-        anchor, length = near[controller, slot], np.maximum(link_distance[controller, slot], SHORTEST_LINK)
-        order = np.lexsort((controller, anchor))
-        return AnchorGraph(
-            anchors=anchors,
-            # The nearest is the anchor itself: distances of others are positive.
-            neighbors=index[:, 1:],
-            lengths=distance[:, 1:],
-            link_starts=np.searchsorted(anchor[order], np.arange(len(anchors) + 1)),
-            links=controller[order],
-            link_lengths=length[order],
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnchorPhysics:
-    """Constants of the motion: they are not trained."""
-
-    frame_time: float
-    """s."""
-    exponent: float = 0.5
-    """p in (1 + |e|)^p."""
-    link_stiffness: float = 3e4
-    """N per unit strain of the controllers' links, at 1 kg."""
-    gravity: float = 9.8
-    """m/s^2, against up."""
-    up_sign: float = 1.0
-    """+1 where +z is up, -1 where -z is."""
-    ground: bool = True
-    """A plane at z = 0."""
-
-
-@dataclass(frozen=True)
-class AnchorParameters:
-    """What is trained, in the form that the forces use, at 1 kg per anchor."""
-
-    stiffness: torch.Tensor
-    """[N] s_i, N: 10^kappa."""
-    soft: torch.Tensor
-    """[K] eta, by rank."""
-    damping: torch.Tensor
-    """zeta, N s: divided by a spring's rest length it is the constant of its dashpot."""
-    friction: torch.Tensor
-    """phi: the fraction of the velocity along the ground that remains after each substep on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,3 +111,50 @@ class Follower:
         # The gradient of a bag of rows needs no [P, k, 3] in memory.
         weights = self.weights.to(anchors.dtype)
         return torch.nn.functional.embedding_bag(self.indices, anchors, per_sample_weights=weights, mode="sum")
+
+
+def predict(model: SpringGausModel, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
+    """Both outputs in all frames. `splats` [G, 3], m, are the centers of the splats in frame 0 (None: the model has none)."""
+    anchors, reason = roll_out(model, observations.controller_points, device)
+    nodes = torch.tensor(observations.nodes, device=device)
+    follow = Follower(observations.nodes, model.anchors, model.bound_anchors, device)
+    positions = np.stack([(nodes + follow(frame - anchors[0])).cpu().numpy() for frame in anchors])
+    frames = len(observations.controller_points)
+    diverged = len(anchors) if reason else None
+    trajectory = Trajectory(positions=positions, frame_count=frames, diverged_frame=diverged, reason=reason)
+    facts = {"anchors": len(model.anchors), "substeps": model.substeps}
+    if splats is None:
+        return Prediction(trajectory, facts)
+    follow = Follower(splats, model.anchors, model.bound_anchors, device)
+    # Frame by frame, because all frames of hundreds of thousands of splats may not fit on the device.
+    centers = np.stack([follow(frame).cpu().numpy() for frame in anchors])
+    return Prediction(trajectory, facts | contraction(splats, centers[0]), centers)
+
+
+@torch.no_grad()
+def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tuple[torch.Tensor, str]:
+    """Anchors [F, N, 3], m, under controllers [T, C, 3], m, from frame 0, and why F < T (empty where F = T)."""
+    solver = AnchorSolver(model, model, model.substeps, device)
+    parameters = model.parameters(model.tensors(device))
+    start, hands = torch.tensor(model.velocity, device=device), torch.tensor(controllers, dtype=torch.float32, device=device)
+    x = torch.tensor(model.anchors, device=device)
+    v, states = torch.zeros_like(x), [x]
+    for frame in range(1, len(hands)):
+        # As in training: v0 is added on entering a frame and removed on leaving it.
+        x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
+        v = v - start
+        near = (x.abs() < LIMIT).all(dim=1)
+        if not bool(near.all()):
+            return torch.stack(states), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
+        states.append(x)
+    return torch.stack(states), ""
+
+
+def contraction(centers: np.ndarray, bound: np.ndarray) -> dict[str, float]:
+    """How binding by absolute positions changes centers [G, 3], m, in frame 0: mean shift, m, and ratio of sizes.
+
+    The size is the root mean square distance from the mean.
+    """
+    before, after = (float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) for points in (centers, bound))
+    shift = float(np.linalg.norm(bound - centers, axis=1).mean())
+    return {"frame0_shift": shift, "frame0_size_ratio": after / before if before else 1.0}

@@ -1,4 +1,4 @@
-"""The motion of anchors: one substep and its adjoint as kernels, frames of them, and the same in torch as specification.
+"""Anchors, what each feels, and their motion: one substep and its adjoint as kernels, frames of them, and the same in torch.
 
 With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbor j by distance in frame 0, anchor i feels
 
@@ -14,23 +14,111 @@ phi.
 # No postponed annotations here: Warp needs the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 
-from neuspring.baselines.spring_gaus.model import AnchorGraph, AnchorParameters, AnchorPhysics
+from neuspring.core.artifacts import Artifact, array
 from neuspring.core.device import start_warp
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics.arrays import Graphs
 from neuspring.physics.solver import simulate_frame
 
+LINK_COUNT, LINK_REACH = 50, 0.04
+"""A controller is linked to at most so many anchors, as far from it in frame 0, m."""
+SHORTEST_LINK = 1e-4
+"""Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
 SLACK = 1e-6
 """Elongations below this exert no force, m."""
 MIN_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them; scalars are damping and friction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorGraph(Artifact):
+    """Which anchors and controllers each anchor feels. Springs are directed: row i is what anchor i feels."""
+
+    kind: ClassVar[str] = "anchor_graph"
+    anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
+    neighbors: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
+    lengths: np.ndarray = array("N,K", np.float32, "m", "their distances in frame 0, the rest lengths")
+    link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
+    links: np.ndarray = array("M", np.int32, "1", "controller of each link")
+    link_lengths: np.ndarray = array("M", np.float32, "m", "rest lengths of links")
+
+    def check(self) -> None:
+        anchors = len(self.anchors)
+        if len(self.link_starts) != anchors + 1:
+            raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
+        if self.neighbors.size and not 0 <= self.neighbors.min() <= self.neighbors.max() < anchors:
+            raise InputError("spring_gaus.neighbors", f"indices must lie in [0, {anchors})", int(self.neighbors.max()))
+        if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
+            raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
+
+    @classmethod
+    def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbors: int) -> "AnchorGraph":
+        """The graph of anchors [N, 3] and controllers [C, 3] of frame 0, m.
+
+        Raises NumericalFailure if there are too few anchors, or two at one place.
+        """
+        if len(anchors) <= neighbors:
+            raise NumericalFailure(f"more anchors than neighbors ({neighbors}) are required, and there are {len(anchors)}")
+        tree = cKDTree(anchors)
+        distance, index = tree.query(anchors, k=neighbors + 1)
+        if distance[:, 1].min() <= 0:
+            raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
+        link_distance, near = tree.query(controllers, k=min(LINK_COUNT, len(anchors)), distance_upper_bound=LINK_REACH)
+        link_distance, near = link_distance.reshape(len(controllers), -1), near.reshape(len(controllers), -1)
+        controller, slot = np.nonzero(np.isfinite(link_distance))
+        anchor, length = near[controller, slot], np.maximum(link_distance[controller, slot], SHORTEST_LINK)
+        order = np.lexsort((controller, anchor))
+        return AnchorGraph(
+            anchors=anchors,
+            # The nearest is the anchor itself: distances of others are positive.
+            neighbors=index[:, 1:],
+            lengths=distance[:, 1:],
+            link_starts=np.searchsorted(anchor[order], np.arange(len(anchors) + 1)),
+            links=controller[order],
+            link_lengths=length[order],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorPhysics:
+    """Constants of the motion: they are not trained."""
+
+    frame_time: float
+    """s."""
+    exponent: float = 0.5
+    """p in (1 + |e|)^p."""
+    link_stiffness: float = 3e4
+    """N per unit strain of the controllers' links, at 1 kg."""
+    gravity: float = 9.8
+    """m/s^2, against up."""
+    up_sign: float = 1.0
+    """+1 where +z is up, -1 where -z is."""
+    ground: bool = True
+    """A plane at z = 0."""
+
+
+@dataclass(frozen=True)
+class AnchorParameters:
+    """What is trained, in the form that the forces use, at 1 kg per anchor."""
+
+    stiffness: torch.Tensor
+    """[N] s_i, N: 10^kappa."""
+    soft: torch.Tensor
+    """[K] eta, by rank."""
+    damping: torch.Tensor
+    """zeta, N s: divided by a spring's rest length it is the constant of its dashpot."""
+    friction: torch.Tensor
+    """phi: the fraction of the velocity along the ground that remains after each substep on it."""
 
 
 class Kernels(NamedTuple):

@@ -4,6 +4,12 @@ The gradient goes through one frame only. One initial velocity v0 is added on en
 the public code, so a step of the optimizer changes the velocity in the middle of a trajectory. A frame that leaves the scene, or
 whose loss or gradient is not finite, is simulated again with more substeps. Where no more are allowed, training ends as a named
 failure with the parameters of the last complete epoch. The last epoch is the result. The published name of an epoch is iteration.
+
+Silhouettes are white splats on black against the object's mask, in one camera:
+
+    L = 0.2 |A - M| + 0.8 (1 - SSIM(A, M)) + |c(A) - c(M)| / W + 0.1 MSE(VGG16(A), VGG16(M)) + 2 TV(A)
+
+A the drawn coverage, M the mask, c the centroid in pixels, W the picture's width, TV the mean squared difference of neighbors.
 """
 
 from __future__ import annotations
@@ -18,23 +24,32 @@ import torch
 
 from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import LIMIT, Trained, TrainingStopped, run_epochs
-from neuspring.baselines.spring_gaus import vgg
-from neuspring.baselines.spring_gaus.losses import Points, Silhouettes
+from neuspring.baselines.spring_gaus import find_vgg16
 from neuspring.baselines.spring_gaus.model import AnchorGraph, Follower, SpringGausModel, choose_anchors
 from neuspring.baselines.spring_gaus.physics import AnchorSolver
 from neuspring.config import Config
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
+from neuspring.core.weights import read_tensors
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.perception.results import masks_of_cameras
 from neuspring.splats.draw import view_of
+from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.rasterize import choose_backend
+from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.twin.losses import FrameLoss
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(epoch, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""
+Features = Callable[[torch.Tensor], torch.Tensor]
+"""Pictures [B, 3, H, W] in 0..1 -> features."""
+L1, DSSIM, FEATURES, VARIATION = 0.2, 0.8, 0.1, 2.0
+"""Weights of the terms, as published."""
+LEAST_COVER = 1e-6
+"""Floor of a silhouette's area, px, where a centroid is divided by it."""
+MEANS, DEVIATIONS = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""ImageNet's, of R, G, B in 0..1."""
 SOFT_RATE = GROUND_RATE = 1e-3
 """Adam's learning rates of s, the parameter of the soft weights, and of rho."""
 CLIP = 1.0
@@ -78,14 +93,18 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     start = SpringGausModel.start(graph, chosen, ground=scenario.ground, **world)
     follower = Follower(cloud, start.anchors, start.bound_anchors, device)
     facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
-    objective: Objective
     if pictures and splats:
-        weights = vgg.find_weights(chosen.vgg16)
+        weights = find_vgg16(chosen.vgg16)
         facts |= {"vgg16": weights if isinstance(weights, str) else "computed", "splats": len(splats.means)}
         objective = silhouettes(pictures, splats, follower, weights, settings, request.seed, device)
     else:
         nodes, rest = (torch.tensor(points, device=device) for points in (observations.nodes, start.anchors))
-        objective = Points(nodes, rest, follower, FrameLoss.of(observations, settings.losses, device))
+        loss = FrameLoss.of(observations, settings.losses, device)
+
+        def objective(epoch: int, frame: int, anchors: torch.Tensor) -> torch.Tensor:
+            """Chamfer and track loss of structure points in displacement form: s_t = s_0 + sum w (a_t - a_0)."""
+            return loss(frame, nodes + follower(anchors - rest))
+
     problem = Problem(start, hands, objective, chosen, device)
     result = run(problem, request.partial, request.key(vgg16=facts.get("vgg16") == "computed"))
     result.facts.update(facts)
@@ -94,8 +113,11 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
 
 def silhouettes(
     pictures: Pictures, splats: Splats, follower: Follower, weights: Path | str, settings: Config, seed: int, device: str
-) -> Silhouettes:
-    """The loss on the masks of a capture's training frames; masks of future frames are not used."""
+) -> Objective:
+    """The loss of the splats, white on black, on the object's mask in one random camera per frame and epoch.
+
+    Masks of future frames are not used.
+    """
     capture, images = Capture.load(pictures.folder), settings.images
     masks = {
         (name, frame): torch.tensor(perceived.labels[frame], device=device) == OBJECT
@@ -104,9 +126,21 @@ def silhouettes(
         if capture.has(name, frame)
     }
     views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
-    features = None if isinstance(weights, str) else vgg.load_features(weights, device)
-    backend = choose_backend(images.backend, device)
-    return Silhouettes(Gaussians.of(splats, device), follower, views, masks, features, backend, seed)
+    features = None if isinstance(weights, str) else load_features(weights, device)
+    backend, shape = choose_backend(images.backend, device), Gaussians.of(splats, device)
+
+    def objective(epoch: int, frame: int, anchors: torch.Tensor) -> torch.Tensor | None:
+        cameras = [name for name in views if (name, frame) in masks]
+        if not cameras:
+            return None
+        # Stateless, so that a continued training draws the same cameras.
+        name = cameras[int(np.random.default_rng([seed, epoch, frame]).integers(len(cameras)))]
+        means = follower(anchors)
+        white = torch.ones_like(means)
+        drawn = rasterize(means, shape.quaternions, shape.scales, shape.opacities, white, views[name], backend=backend).alpha
+        return silhouette_loss(drawn, masks[name, frame].float(), features)
+
+    return objective
 
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
@@ -142,12 +176,11 @@ class Training:
 
     def add_substeps(self) -> bool:
         """Take more substeps per frame; False if no more are allowed."""
-        settings = self.problem.settings
-        more = min(self.substeps + SUBSTEPS_ADDED, settings.max_substeps)
-        raised = more > self.substeps
-        if raised:
-            self.use_substeps(more)
-        return raised
+        more = min(self.substeps + SUBSTEPS_ADDED, self.problem.settings.max_substeps)
+        if more == self.substeps:
+            return False
+        self.use_substeps(more)
+        return True
 
     def epoch(self, number: int) -> dict[str, float]:
         """One pass over the frames. Raises TrainingStopped where a frame fails with the most substeps."""
@@ -157,24 +190,20 @@ class Training:
         losses, largest = [], 0.0
         # The loop of the public code ends one frame before the last training frame.
         for frame in range(1, max(len(self.hands) - 1, 2)):
-            x, v, loss, norm = self.stable_frame(number, frame, x, v)
+            after = None
+            while after is None:
+                try:
+                    after = self.frame(number, frame, x, v)
+                except UnusableFrame as fault:
+                    if not self.add_substeps():
+                        raise TrainingStopped(f"{fault} (iteration {number}, frame {frame}, {self.substeps} substeps)") from fault
+                    print(f"iteration {number}, frame {frame}: {fault}; {self.substeps} substeps from here on", flush=True)
+            x, v, loss, norm = after
             if loss is not None:
                 losses.append(loss)
                 largest = max(largest, norm)
         self.keep()
         return {"loss": float(np.mean(losses)) if losses else 0.0, "gradient_norm": largest, "substeps": float(self.substeps)}
-
-    def stable_frame(
-        self, epoch: int, number: int, x: torch.Tensor, v: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, float | None, float]:
-        """As `frame`, with more substeps until it succeeds."""
-        while True:
-            try:
-                return self.frame(epoch, number, x, v)
-            except UnusableFrame as fault:
-                if not self.add_substeps():
-                    raise TrainingStopped(f"{fault} (iteration {epoch}, frame {number}, {self.substeps} substeps)") from fault
-                print(f"iteration {epoch}, frame {number}: {fault}; {self.substeps} substeps from here on", flush=True)
 
     def frame(
         self, epoch: int, frame: int, x: torch.Tensor, v: torch.Tensor
@@ -233,3 +262,51 @@ class Training:
             tensor.copy_(torch.tensor(checkpoint.arrays["values"][name]))
         restore_adam(self.optimizer, checkpoint.arrays["adam"])
         self.keep()
+
+
+def silhouette_loss(drawn: torch.Tensor, mask: torch.Tensor, features: Features | None) -> torch.Tensor:
+    """Loss of a drawn coverage [H, W] against a mask [H, W], both in 0..1; without features their term is left out."""
+    total = L1 * (drawn - mask).abs().mean()
+    total = total + DSSIM * (1 - ssim(drawn[None], mask[None]))
+    if bool(mask.any()):
+        total = total + (centroid(drawn) - centroid(mask)).norm() / drawn.shape[1]
+    if features is not None:
+        found, wanted = (features(picture.expand(1, 3, -1, -1)) for picture in (drawn, mask))
+        total = total + FEATURES * (found - wanted.detach()).square().mean()
+    return total + VARIATION * total_variation(drawn)
+
+
+def centroid(silhouette: torch.Tensor) -> torch.Tensor:
+    """Mean (column, row) [2] of a silhouette [H, W], px."""
+    rows = torch.arange(silhouette.shape[0], device=silhouette.device, dtype=silhouette.dtype)
+    columns = torch.arange(silhouette.shape[1], device=silhouette.device, dtype=silhouette.dtype)
+    total = silhouette.sum().clamp(min=LEAST_COVER)
+    return torch.stack([(silhouette.sum(dim=0) * columns).sum(), (silhouette.sum(dim=1) * rows).sum()]) / total
+
+
+def total_variation(picture: torch.Tensor) -> torch.Tensor:
+    """Mean squared difference of vertical neighbors plus that of horizontal ones, of a picture [H, W]."""
+    return (picture[1:] - picture[:-1]).square().mean() + (picture[:, 1:] - picture[:, :-1]).square().mean()
+
+
+def load_features(path: Path, device: str) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Pictures [B, 3, H, W] in 0..1 -> features [B, 128, H / 2, W / 2], differentiably. Raises InputError for a damaged file."""
+    import torch
+    from torch.nn import Conv2d, MaxPool2d, ReLU, Sequential
+
+    # Layers without memory: the tensors of the file become their parameters.
+    with torch.device("meta"):
+        layers = Sequential(
+            *(Conv2d(3, 64, 3, padding=1), ReLU(), Conv2d(64, 64, 3, padding=1), ReLU(), MaxPool2d(2)),
+            *(Conv2d(64, 128, 3, padding=1), ReLU(), Conv2d(128, 128, 3, padding=1), ReLU()),
+        ).requires_grad_(False)
+    shapes = {f"features.{name}": tuple(parameter.shape) for name, parameter in layers.named_parameters()}
+    tensors = read_tensors(path, shapes, device)
+    layers.load_state_dict(dict(zip(layers.state_dict(), tensors, strict=True)), assign=True)
+
+    def features(pictures: torch.Tensor) -> torch.Tensor:
+        mean, deviation = (pictures.new_tensor(values)[:, None, None] for values in (MEANS, DEVIATIONS))
+        found: torch.Tensor = layers((pictures - mean) / deviation)
+        return found
+
+    return features
