@@ -76,8 +76,6 @@ class GsDynamics(Section):
     """Steps that training predicts in a row."""
     step: Positive = 0.01
     """Motion of the tools that makes a step, m."""
-    coverage: NonNegative = 0.03
-    """Distance, m: no more particles are added once every point lies within it of a particle."""
     outlier_deviations: NonNegative = 3.0
     """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
     drops none."""

@@ -60,7 +60,7 @@ _LEFT = {
         appearance.l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
     """,
     "a constant beside its user in neuspring/baselines now": """
-        min_visible bound_anchors link_stiffness substeps_added substeps_raised spring_gaus.checkpoint_every
+        coverage min_visible bound_anchors link_stiffness substeps_added substeps_raised spring_gaus.checkpoint_every
         dense_points smoothing_passes gs_dynamics.checkpoint_every
     """,
     "a constant beside its user in neuspring/perception now": """
@@ -68,7 +68,7 @@ _LEFT = {
         opencv.window opencv.levels opencv.forward_backward opencv.reacquire likeness lift.least_neighbors agreement release_after
         shape.margin shape.tolerance shape.smoothing shape.bend_reach shape.thin shape.bend back_fraction
         sample.surface sample.interior color.beneath color.hands_apart color.hand_radius color.samples color.band color.cell
-        color.grip_reach grip_length
+        color.grip_reach grip_length color.hand_tilt
     """,
 }
 RENAMED = {key: sentence for sentence, keys in _LEFT.items() for key in keys.split()}

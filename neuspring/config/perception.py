@@ -156,8 +156,6 @@ class ColorSettings(Section):
     """Thickness of a sheet, m."""
     body_thickness: Positive = 0.8
     """Height of a body above the table in local widths of its silhouette, of all categories that are neither flat nor round."""
-    hand_tilt: Finite = 0.0
-    """Tilt of the plane in which hands move, degrees, as a guess for methods that search nothing (search.variables.hand_tilt)."""
 
 
 @dataclass(frozen=True, kw_only=True)

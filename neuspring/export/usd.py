@@ -13,7 +13,7 @@ from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
 from neuspring.export import ply
 from neuspring.export.source import Source
-from neuspring.splats.harmonics import C0
+from neuspring.splats.view import C0
 
 SUFFIXES = (".usdc", ".usda", ".usd")
 ROOT = "/Twin"

@@ -206,7 +206,7 @@ def lift_color(
         marked=capture.points(name),
     )
     grip_points = np.concatenate([first.fingers(grip) for grip in chosen])
-    guess = depths_of(image, {"hand_tilt": settings.hand_tilt, "hand_size": 0.0}, capture.train_end, first.up)
+    guess = depths_of(image, {"hand_tilt": 0.0, "hand_size": 0.0}, capture.train_end, first.up)
     y, x = np.nonzero(first.filled)
     cloud_pixels = np.stack([x, y], axis=1)
     colors = capture.color(name, 0) / 255.0

@@ -187,7 +187,7 @@ def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None 
 
 def pulled_run(found: Scene, controls: Controls, path: Path) -> Run:
     """The run whose twin was pulled, told by its digest. Raises InputError where it is not there."""
-    candidates = sorted((run for run in found.runs if run.twin_path), key=lambda run: run.name != controls.name)
+    candidates = sorted((run for run in found.runs if "twin" in run.paths), key=lambda run: run.name != controls.name)
     for run in candidates:
         if run.twin_digest == controls.twin_digest:
             return run
@@ -203,7 +203,7 @@ def comparison(found: Scene, controls: Controls, own: Run) -> Iterator[str]:
     yield f"{'run':32} {'mean':>8} {'last':>8} {'worst':>8}"
     seen = replay(own.twin, controls)
     for run in found.runs:
-        if run is own or run.twin_path is None:
+        if run is own or "twin" not in run.paths:
             continue
         try:
             assert run.twin is not None

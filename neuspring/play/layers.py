@@ -17,9 +17,9 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.play.colors import OVER, Scale, Springs, linear, node_colors
 from neuspring.report.draw.sheet import sample
-from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
+from neuspring.splats.view import C0
 
 if TYPE_CHECKING:
     import viser

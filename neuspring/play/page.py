@@ -16,7 +16,7 @@ from neuspring.play.colors import QUANTITIES
 from neuspring.play.controls import Controls
 from neuspring.play.live import TOO_MUCH, Live
 from neuspring.play.player import MOST_SHOWN, SPEEDS, Player
-from neuspring.play.results import Run, Scene
+from neuspring.play.results import Scene
 from neuspring.play.simulator import StartState, start_state
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Page:
             absent["cameras"] = absent["images"] = "no capture in the scenario's folder"
         if not found.observations.tracks.size:
             absent["tracks"] = "no tracks were annotated"
-        if not any(run.splats_path for run in found.runs):
+        if not any("splats" in run.paths for run in found.runs):
             absent["splats"] = "no run here has splats"
         for name, title in PARTS.items():
             hint, wanted = absent.get(name), getattr(self.player.display, name)
@@ -228,7 +228,7 @@ class LivePanel:
         self.live: Live | None = None
         self._server, self._player, self._save_to, self._changed = server, player, save_to, changed
         self._lock = threading.RLock()
-        names = [run.name for run in player.found.runs if run.twin_path is not None]
+        names = [run.name for run in player.found.runs if "twin" in run.paths]
         gui = server.gui
         if not names:
             gui.add_markdown("No run here has a twin, so there is nothing to pull.")
@@ -257,7 +257,8 @@ class LivePanel:
             self.stop()
             try:
                 run = self._player.run(name)
-                begin = StartState(played.start_frame, played.start) if played else self._start_state(run)
+                seen, frame = self._player.found.observations, int(self.frame.value)
+                begin = StartState(played.start_frame, played.start) if played else start_state(run, seen, frame, self.repeat.value)
                 self._player.hide(True, float(self.most.value))
                 self.live = Live(self._server, self._player, run, begin, played)
             except InputError as error:
@@ -282,9 +283,6 @@ class LivePanel:
         """Show the state; called a few times per second."""
         if live := self.live:
             self.text.content = live.status()
-
-    def _start_state(self, run: Run) -> StartState:
-        return start_state(run, self._player.found.observations, int(self.frame.value), bool(self.repeat.value))
 
     def _reset(self) -> None:
         if self.live is not None:

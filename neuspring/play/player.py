@@ -135,7 +135,7 @@ class Player:
 
     def add_splats(self, body: BodyLayer, run: Run) -> None:
         """Give a body the run's splats when they are first wanted; what it lacks is a note."""
-        if not self.display.splats or body.splats is not None or run.splats_path is None:
+        if not self.display.splats or body.splats is not None or "splats" not in run.paths:
             return
         try:
             if run.splats is not None and run.trajectory is not None:

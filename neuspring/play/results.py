@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 import zipfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
-from neuspring.core.artifacts import Observations, SplatCenters, Trajectory, Twin
+from neuspring.core.artifacts import Artifact, Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import META, DamagedFile, read_head
 from neuspring.core.records import digest_file
@@ -23,6 +24,7 @@ from neuspring.data.capture import CAPTURE, Capture
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.model import Splats
 
+Kind = TypeVar("Kind", bound=Artifact)
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
 FIRST = ("neuspring_plus", "neuspring", "baseline")
@@ -40,14 +42,20 @@ class Run:
     """One run: a method with a seed. Its arrays are read when they are asked for."""
 
     folder: Path
-    method: str
-    seed: str
     notes: tuple[str, ...] = ()
     """What a viewer must know."""
-    twin_path: Path | None = None
-    trajectory_path: Path | None = None
-    splats_path: Path | None = None
-    centers_path: Path | None = None
+    paths: Mapping[str, Path] = field(default_factory=dict)
+    """Files that it has: twin, trajectory, splats, and centers, where the method's own model puts its splats."""
+
+    @property
+    def method(self) -> str:
+        """Its row of the method table."""
+        return self.folder.parent.name
+
+    @property
+    def seed(self) -> str:
+        """Its seed."""
+        return self.folder.name
 
     @property
     def name(self) -> str:
@@ -57,41 +65,39 @@ class Run:
     @cached_property
     def twin(self) -> Twin | None:
         """The twin, where the method has one. Raises InputError."""
-        if self.twin_path is None:
-            return None
-        require_modest(self.twin_path)
-        return Twin.load(self.twin_path)
+        return self._read("twin", Twin)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
         """The prediction, where there is one. Raises InputError."""
-        if self.trajectory_path is None:
-            return None
-        require_modest(self.trajectory_path)
-        return Trajectory.load(self.trajectory_path)
+        return self._read("trajectory", Trajectory)
 
     @cached_property
     def splats(self) -> Splats | None:
         """The splats that pictures of this run show, in frame 0, if it has any. Raises InputError."""
-        if self.splats_path is None:
-            return None
-        require_small(self.splats_path, MOST_BYTES)
-        splats = Splats.load(self.splats_path)
+        splats = self._read("splats", Splats)
         # As pictures (stages/render.py): where a method's own model moves them, all of them are drawn.
-        return splats if self.centers_path else prune_by_opacity(splats)
+        return splats if splats is None or "centers" in self.paths else prune_by_opacity(splats)
 
     @cached_property
     def centers(self) -> SplatCenters | None:
         """Where the method's own model puts its splats, if it does. Raises InputError."""
-        if self.centers_path is None:
-            return None
-        require_modest(self.centers_path)
-        return SplatCenters.load(self.centers_path)
+        return self._read("centers", SplatCenters)
 
     @cached_property
     def twin_digest(self) -> str:
         """SHA-256 of the twin's file."""
-        return "" if self.twin_path is None else digest_file(self.twin_path)
+        return digest_file(self.paths["twin"]) if "twin" in self.paths else ""
+
+    def _read(self, role: str, kind: type[Kind]) -> Kind | None:
+        path = self.paths.get(role)
+        if path is None:
+            return None
+        if kind is Splats:
+            require_small(path, MOST_BYTES)
+        else:
+            require_modest(path)
+        return kind.load(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +155,8 @@ def _rank(path: Path) -> tuple[int, str, int]:
 
 def _first(runs: Sequence[Run]) -> tuple[str, ...]:
     """The first run, and the first one of another method."""
-    usable = [run for run in runs if run.trajectory_path] or list(runs)
-    other = next((run for run in usable if run.method != usable[0].method and run.twin_path), None)
+    usable = [run for run in runs if "trajectory" in run.paths] or list(runs)
+    other = next((run for run in usable if run.method != usable[0].method and "twin" in run.paths), None)
     return tuple(run.name for run in (usable[0], other) if run is not None)
 
 
@@ -159,22 +165,24 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     notes: list[str] = []
     run = RunFolder.of(folder, notes)
 
-    def path(stage: str, role: str) -> Path | None:
+    places = {
+        "twin": "fit" if "fit" in run.stages else "search",
+        "trajectory": "rollout",
+        "centers": "rollout",
+        "splats": "appearance",
+    }
+    paths: dict[str, Path] = {}
+    for role, stage in places.items():
         try:
-            found = run.file(stage, role)
-            return None if found is None else inside(scenario_folder, found)
+            if (found := run.file(stage, role)) is not None:
+                paths[role] = inside(scenario_folder, found)
         except (InputError, TypeError, ValueError, IndexError) as error:
             notes.append(f"no {'prediction' if role == 'trajectory' else role}: {error}")
-            return None
-
     if "rollout" in run.stages and run.records["rollout"].status == "failed":
         notes.append(f"failed: {run.records['rollout'].reason}")
-    roles = {"trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
-    paths = {f"{role}_path": path(stage, role) for role, stage in roles.items()}
-    twin = path("fit" if "fit" in run.stages else "search", "twin")
-    if paths["trajectory_path"] is None and not notes:
+    if "trajectory" not in paths and not notes:
         notes.append("no prediction in its record")
-    return Run(folder, folder.parent.name, folder.name, tuple(notes), twin, **paths)
+    return Run(folder, tuple(notes), paths)
 
 
 def _capture(folder: Path, notes: list[str]) -> Capture | None:

@@ -51,7 +51,7 @@ def write_video(found: Scene, run: Run, controls: Controls, path: Path, camera: 
     motion = replay(run.twin, controls)
     reason, splats = motion.reason, None
     try:
-        splats = None if run.centers_path else run.splats
+        splats = None if "centers" in run.paths else run.splats
     except (InputError, NumericalFailure) as error:
         reason = f"no splats: {error}"
     x = motion.positions

@@ -2,8 +2,9 @@
 
 | what | modules |
 |---|---|
-| the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors); `harmonics`: colors by direction |
-| drawing | `rasterize`: the entry, the choice of backend, gsplat, the float64 specification; `view`, `blend`: our backend |
+| the noun | `model`: `Splats` (a PLY file) and `Gaussians` (tensors) |
+| drawing | `rasterize`: the entry, the choice of backend, gsplat, the float64 specification |
+| our backend | `view` (ellipses, colors by direction), `blend` |
 | training | `train`, `losses` |
 | motion | `skinning`: nodes carry splats |
 | pictures of a twin | `draw` |

@@ -32,7 +32,7 @@ class Splats(Artifact):
     quaternions: np.ndarray = array("N,4", np.float32, "1", "orientations, w first, of any length but zero")
     log_scales: np.ndarray = array("N,A", np.float32, "log m", "standard deviations: A = 1 isotropic, 3 one per axis")
     opacity_logits: np.ndarray = array("N", np.float32, "1", "opacity = 1 / (1 + exp(-.))")
-    harmonics: np.ndarray = array("N,K,3", np.float32, "1", "color, see `neuspring.splats.harmonics`; K = 1, 4, 9 or 16")
+    harmonics: np.ndarray = array("N,K,3", np.float32, "1", "color, see `neuspring.splats.view`; K = 1, 4, 9 or 16")
 
     def check(self) -> None:
         if self.log_scales.shape[1] not in (1, 3):

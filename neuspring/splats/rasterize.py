@@ -14,9 +14,8 @@ from typing import Literal
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.splats import harmonics
 from neuspring.splats.blend import blend, tiles
-from neuspring.splats.view import LIMITS, Limits, View, boxes, project, radii
+from neuspring.splats.view import LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 
 Backend = Literal["warp", "gsplat"]
 LEAST_ALPHA = 1e-10
@@ -62,9 +61,10 @@ def rasterize(
     InputError for wrong shapes and for entries that are not finite.
     """
     view.require_valid()
-    _require_splats(means, quaternions, scales, opacities, colors, degree)
+    splats = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
+    _require_splats(splats, degree)
     if backend == "gsplat":
-        return _by_gsplat(means, quaternions, scales, opacities, colors, view, degree, background, limits)
+        return _by_gsplat(splats, view, degree, background, limits)
     ellipses = project(means, quaternions, scales, view, limits)
     touching, rectangles = boxes(ellipses, opacities.detach()[ellipses.index], view, limits)
     visible = torch.nonzero(touching).squeeze(1)
@@ -74,7 +74,7 @@ def rasterize(
         flat.retain_grad()
     shade = colors[index]
     if degree is not None:
-        shade = harmonics.colors(shade, means[index] - view.position.to(means), degree)
+        shade = harmonic_colors(shade, means[index] - view.position.to(means), degree)
     lists = tiles(depths.detach(), rectangles[visible], view)
     features = torch.cat([shade, depths[:, None]], dim=1)
     total, left = blend(lists, view, limits, flat, ellipses.conics[visible], opacities[index], features)
@@ -85,15 +85,7 @@ def rasterize(
 
 
 def _by_gsplat(
-    means: torch.Tensor,
-    quaternions: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    colors: torch.Tensor,
-    view: View,
-    degree: int | None,
-    background: tuple[float, float, float],
-    limits: Limits,
+    splats: dict[str, torch.Tensor], view: View, degree: int | None, background: tuple[float, float, float], limits: Limits
 ) -> Rendered:
     """As `rasterize`. Thresholds of coverage cannot be set: since gsplat 1.5 no splat covers more than 0.99, ours 0.999."""
     from gsplat import rasterization
@@ -102,13 +94,10 @@ def _by_gsplat(
     if own != (LIMITS.alpha_min, LIMITS.alpha_max, LIMITS.transmittance_min):
         raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
     picture, alpha, facts = rasterization(
-        means,
-        torch.nn.functional.normalize(quaternions, dim=-1),
-        scales,
-        opacities,
-        colors,
-        view.world_to_camera[None].to(means),
-        view.intrinsics[None].to(means),
+        splats["means"],
+        torch.nn.functional.normalize(splats["quaternions"], dim=-1),
+        *(splats[name] for name in ("scales", "opacities", "colors")),
+        *(matrix[None].to(splats["means"]) for matrix in (view.world_to_camera, view.intrinsics)),
         view.width,
         view.height,
         near_plane=limits.near,
@@ -151,7 +140,7 @@ def reference(
     index, flat, conics, depths = ellipses.index[order], ellipses.means[order], ellipses.conics[order], ellipses.depths[order]
     shade = colors[index]
     if degree is not None:
-        shade = harmonics.colors(shade, means[index] - view.position.to(means), degree)
+        shade = harmonic_colors(shade, means[index] - view.position.to(means), degree)
     rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).reshape(-1, 1, 2).to(means) + 0.5
     offset = pixels - flat
@@ -203,24 +192,11 @@ def _gsplat_fault(device: str) -> str:
     return "" if float(picture.alpha.max()) > 0.4 else "it drew nothing"
 
 
-def _require_splats(
-    means: torch.Tensor,
-    quaternions: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    colors: torch.Tensor,
-    degree: int | None,
-) -> None:
-    count = len(means)
-    coefficients = colors.shape[1] if degree is not None and colors.ndim == 3 else None
-    expected = {
-        "means": (means, [count, 3]),
-        "quaternions": (quaternions, [count, 4]),
-        "scales": (scales, [count, 3]),
-        "opacities": (opacities, [count]),
-        "colors": (colors, [count, 3] if degree is None else [count, coefficients, 3]),
-    }
-    for name, (tensor, shape) in expected.items():
+def _require_splats(splats: dict[str, torch.Tensor], degree: int | None) -> None:
+    count, colors = len(splats["means"]), splats["colors"]
+    coefficients = colors.shape[1] if colors.ndim == 3 else None
+    shapes = ([count, 3], [count, 4], [count, 3], [count], [count, 3] if degree is None else [count, coefficients, 3])
+    for (name, tensor), shape in zip(splats.items(), shapes, strict=True):
         if list(tensor.shape) != shape:
             raise InputError(f"splats, {name}", f"the shape must be {shape}", tuple(tensor.shape))
         finite = torch.isfinite(tensor.detach())

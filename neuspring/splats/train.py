@@ -17,11 +17,10 @@ from scipy.spatial import cKDTree
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.text import Progress
-from neuspring.splats import harmonics
 from neuspring.splats.losses import REFERENCE_WIDTH, Shot, loss
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import Backend, Rendered
-from neuspring.splats.view import rotations
+from neuspring.splats.view import C0, rotations
 
 NEAREST = 3
 """The first scale of a splat is its mean distance to this many neighbors."""
@@ -81,7 +80,7 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
         scale = np.full(len(points), settings.fixed_radius)
     count = len(points)
     shades = np.zeros((count, (settings.degree + 1) ** 2, 3))
-    shades[:, 0] = (colors - 0.5) / harmonics.C0
+    shades[:, 0] = (colors - 0.5) / C0
     return Splats(
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),

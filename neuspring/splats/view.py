@@ -1,13 +1,18 @@
-"""From splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, and the projection.
+"""From splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, the projection, and colors.
 
 With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
 (fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
 slopes px/pz, py/pz clamped to a margin around the picture (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
 Plain torch on any device and precision: gradients come by differentiation, through those limits too.
+
+Colors depend on direction by real spherical harmonics up to degree 3, in the order of Gaussian splats (l = 0.., m = -l..l):
+color(d) = max(0, 1/2 + sum_k Y_k(d) c_k), d the unit direction from the camera to the splat in the world, c_k [3] RGB.
+The signs are those of the Condon-Shortley phase (Y_1 = -y, z, -x), as splat files have them.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +24,17 @@ MARGIN = 0.3
 """Slopes in the Jacobian may leave the picture by this part of its half width or height."""
 SAFETY = 1e-3
 """Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
+C0 = 0.5 / math.sqrt(math.pi)
+"""Y_0."""
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2 = (0.5 * math.sqrt(15 / math.pi), 0.25 * math.sqrt(5 / math.pi), 0.25 * math.sqrt(15 / math.pi))
+_C3 = (
+    0.25 * math.sqrt(35 / (2 * math.pi)),
+    0.5 * math.sqrt(105 / math.pi),
+    0.25 * math.sqrt(21 / (2 * math.pi)),
+    0.25 * math.sqrt(7 / math.pi),
+    0.25 * math.sqrt(105 / math.pi),
+)
 
 
 @dataclass(frozen=True)
@@ -156,3 +172,33 @@ def radii(projected: Projected) -> torch.Tensor:
     xx, xy, yy = projected.covariances.detach().unbind(-1)
     largest = 0.5 * (xx + yy) + torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp_min(0.0))
     return 3 * torch.sqrt(largest)
+
+
+def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
+    """Y_k [N, (degree + 1)^2] in unit directions [N, 3]."""
+    x, y, z = directions.unbind(-1)
+    rows = [torch.full_like(x, C0)]
+    if degree > 0:
+        rows += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree > 1:
+        a, b, c = _C2
+        rows += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
+    if degree > 2:
+        a, b, c, d, e = _C3
+        rows += [
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (5 * z * z - 1),
+            d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1),
+            e * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(rows, dim=-1)
+
+
+def harmonic_colors(coefficients: torch.Tensor, offsets: torch.Tensor, degree: int) -> torch.Tensor:
+    """RGB [N, 3] of coefficients [N, K, 3] seen along `offsets` [N, 3] (any length); bands above `degree` are not used."""
+    used = (degree + 1) ** 2
+    values = basis(torch.nn.functional.normalize(offsets, dim=-1), degree)
+    return torch.clamp_min(torch.einsum("nk,nkc->nc", values, coefficients[:, :used]) + 0.5, 0.0)

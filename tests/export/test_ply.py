@@ -12,15 +12,9 @@ from tests.support import exported
 plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (extra `dev`)")
 
 
-@pytest.fixture
-def out(tmp_path):
-    folder = exported.run_folder(tmp_path)
-    assert main(["export", str(folder), "--to", "ply", "--frames", "0:4:3", "--output", str(tmp_path / "out")]) == 0
-    return folder, tmp_path / "out"
-
-
-def test_plyfile_reads_the_graph_as_it_is(out):
-    folder, written = out
+def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_show(tmp_path):
+    folder, written = exported.run_folder(tmp_path), tmp_path / "out"
+    assert main(["export", str(folder), "--to", "ply", "--frames", "0:4:3", "--output", str(written)]) == 0
     assert sorted(path.name for path in written.iterdir()) == [
         *("splats_00000.ply", "splats_00003.ply", "springs_00000.ply", "springs_00003.ply")
     ]
@@ -38,11 +32,6 @@ def test_plyfile_reads_the_graph_as_it_is(out):
     ends = placed[twin.topology.springs]
     strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / twin.topology.rest_lengths - 1
     assert np.abs(np.ravel(edge["strain"]) - strain).max() < 1e-6 and np.abs(strain).max() > 0.01
-
-
-def test_splats_are_those_that_pictures_show(out):
-    folder, written = out
-    splats = Splats.load(written / "splats_00003.ply")
-    expected = dict(read_source(folder).moved_splats([3]))[3]
+    splats, expected = Splats.load(written / "splats_00003.ply"), dict(source.moved_splats([3]))[3]
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "harmonics"):
         assert np.array_equal(getattr(splats, name), getattr(expected, name))

@@ -46,6 +46,8 @@ def test_a_twin_alone_is_known_in_frame_0(folder, tmp_path):
     for path in (folder, folder / "twin.npz"):
         source = read_source(path)
         assert source.positions.shape[0] == 1 and source.splats is None
+        with pytest.raises(InputError, match=r"splats are required.*appearance/<seed>/splats.ply"):
+            source.require_splats()
 
 
 @pytest.mark.parametrize(
@@ -123,21 +125,12 @@ def test_what_cannot_be_exported(folder, kind):
         read_source(folder)
 
 
-def test_the_command_says_so_and_writes_nothing(folder, tmp_path, capsys):
+def test_the_command_says_what_is_wrong_and_writes_nothing(folder, tmp_path, capsys):
+    assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
+    assert "--rate: is for usd" in capsys.readouterr().err
     (folder / "trajectory.npz").unlink()
     assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 2
     assert "run again" in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-def test_missing_splats_are_named(tmp_path):
-    source = read_source(exported.run_folder(tmp_path, with_splats=False))
-    with pytest.raises(InputError, match=r"splats are required.*appearance/<seed>/splats.ply"):
-        source.require_splats()
-
-
-def test_a_rate_is_for_usd(folder, capsys):
-    assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
-    assert "--rate: is for usd" in capsys.readouterr().err
 
 
 def test_without_output_no_format_writes_over_another(folder, tmp_path, monkeypatch):

@@ -52,26 +52,16 @@ def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
     assert UsdGeom.Imageable(splats).GetPurposeAttr().Get() == "render" and len(splats.GetOpacitiesAttr().Get()) == len(ours)
 
 
-def test_a_rate_changes_codes_and_no_seconds(tmp_path):
-    folder = exported.run_folder(tmp_path, with_splats=False)
-    usd.write(read_source(folder), [0, 2], tmp_path / "twin.usda", rate=24.0)
+def test_a_rate_changes_codes_and_no_seconds_up_is_up_and_bad_names_and_rates_are_refused(tmp_path):
+    from pxr import Gf, UsdGeom
+
+    source = read_source(exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False))
+    usd.write(source, [0, 2], tmp_path / "twin.usda", rate=24.0)
     stage = opened(tmp_path / "twin.usda")
     assert stage.GetTimeCodesPerSecond() == 24 and stage.GetEndTimeCode() == pytest.approx(2 / 30 * 24)
     assert not stage.GetPrimAtPath("/Twin/Splats")
-
-
-def test_up_is_up(tmp_path):
-    from pxr import Gf, UsdGeom
-
-    folder = exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False)
-    usd.write(read_source(folder), [0], tmp_path / "twin.usda")
-    stage = opened(tmp_path / "twin.usda")
     matrix = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
     assert Gf.IsClose(matrix.TransformDir(Gf.Vec3d(0, 0, -1)), Gf.Vec3d(0, 0, 1), 1e-6)
-
-
-@pytest.mark.parametrize(("name", "rate"), [("twin.fbx", None), ("twin.usda", 0.0), ("twin.usda", float("nan"))])
-def test_bad_names_and_rates(tmp_path, name, rate):
-    source = read_source(exported.run_folder(tmp_path, with_splats=False))
-    with pytest.raises(InputError, match=r"--output: must end|--rate: must be a positive"):
-        usd.write(source, [0], tmp_path / name, rate)
+    for name, rate in (("twin.fbx", None), ("twin.usda", 0.0), ("twin.usda", float("nan"))):
+        with pytest.raises(InputError, match=r"--output: must end|--rate: must be a positive"):
+            usd.write(source, [0], tmp_path / name, rate)

@@ -46,13 +46,7 @@ def test_a_grabbed_node_follows_and_a_released_one_swings_back(twin):
     # The grab is as stiff as the node's own springs together: half of the way at least.
     assert 0.5 * 30 * STEP < moved[30] < 30 * STEP
     assert moved[60] < 0.5 * moved[30]
-
-
-def test_the_grab_leaves_the_twin_within_its_stability_bound(twin):
-    simulator = Simulator(twin)
-    stability.check(simulator._with_grab(NODE))
-    k, c = simulator.grab_stiffness(NODE)
-    assert k > 0 and c > 0
+    stability.check(Simulator(twin)._with_grab(NODE))
 
 
 def test_a_saved_recording_gives_the_same_motion_bit_for_bit(twin, tmp_path):
@@ -97,6 +91,9 @@ def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
     assert one.node == 2
     one.release(1)
     assert one.node == -1 and one.take(2, "node", 3, (0, 0, 0))
+    # The node nearest to the mouse's ray is the one that is taken.
+    points = np.array([[0.0, 0, 1], [0.1, 0, 5], [0.3, 0, 1]])
+    assert nearest_to_ray(points, (0, 0, 0), (0.021, 0, 1)) == 1
 
 
 def test_a_hand_moves_as_one_and_no_faster_than_allowed():
@@ -117,8 +114,3 @@ def test_places_and_nodes_that_are_none_are_ignored():
     for place in places:
         one.pull(1, place)
     assert np.array_equal(one.next(1.0, np.zeros((3, 3)), np.zeros(3))[2], np.zeros(3))
-
-
-def test_the_node_nearest_to_the_mouse_is_taken():
-    points = np.array([[0.0, 0, 1], [0.1, 0, 5], [0.3, 0, 1]])
-    assert nearest_to_ray(points, (0, 0, 0), (0.021, 0, 1)) == 1

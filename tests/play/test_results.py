@@ -1,7 +1,6 @@
 """What a results folder has to show, and what of a damaged or hostile one is refused."""
 
 import io
-import json
 import zipfile
 
 import numpy as np
@@ -24,16 +23,25 @@ def test_named_runs_are_the_ones_that_are_there(scenario):
     assert find([scenario / "baseline" / "0", scenario / "neuspring" / "0"]).shown == ("neuspring/0", "baseline/0")
 
 
-def test_runs_of_two_scenarios_are_refused(scenario, tmp_path):
-    other = results(tmp_path / "more")
-    with pytest.raises(InputError, match="all runs must be of one scenario"):
-        find([scenario, other])
-
-
-def test_another_folder_is_refused_with_the_next_move(tmp_path):
+def test_folders_that_cannot_be_shown_are_refused_with_the_next_move(scenario, tmp_path):
     for name in ("nothing_there", "."):
         with pytest.raises(InputError, match="Give results/<scenario>"):
             find([tmp_path / name])
+    with pytest.raises(InputError, match="all runs must be of one scenario"):
+        find([scenario, results(tmp_path / "more")])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "note"),
+    [
+        ('"format": 2', '"format": 1', "reads records of format 2"),
+        ('"trajectory.npz"', '"../../../secret.npz"', "must lie beside"),
+    ],
+)
+def test_a_record_of_another_format_or_of_a_file_elsewhere_is_not_followed(scenario, tmp_path, old, new, note):
+    (tmp_path / "secret.npz").write_bytes(b"secret")
+    spoil(scenario / "baseline" / "0" / "rollout.json", old, new)
+    assert note in find([scenario]).runs[1].notes[0]
 
 
 def test_an_incomplete_run_says_what_it_lacks(scenario):
@@ -42,28 +50,16 @@ def test_an_incomplete_run_says_what_it_lacks(scenario):
     assert run.trajectory is None and "no such file" in run.notes[0] and run.twin is not None
 
 
-def test_a_record_of_an_older_format_is_a_note(scenario):
-    spoil(scenario / "baseline" / "0" / "rollout.json", '"format": 2', '"format": 1')
-    assert "reads records of format 2" in find([scenario]).runs[1].notes[0]
-
-
-def test_a_record_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
-    secret = tmp_path / "secret.npz"
-    secret.write_bytes(b"secret")
-    spoil(scenario / "baseline" / "0" / "rollout.json", '"trajectory.npz"', json.dumps("../../../secret.npz"))
-    assert "must lie beside" in find([scenario]).runs[1].notes[0]
-
-
 def test_a_link_out_of_the_folder_is_not_followed(scenario, tmp_path):
     outside = tmp_path / "outside.npz"
     twin = scenario / "baseline" / "0" / "twin.npz"
     twin.rename(outside)
     twin.symlink_to(outside)
     run = find([scenario]).runs[1]
-    assert run.twin_path is None and "must lie inside" in run.notes[0]
+    assert "twin" not in run.paths and "must lie inside" in run.notes[0]
 
 
-def test_a_header_that_promises_more_than_the_file_is_refused_before_memory_is_taken(scenario):
+def test_a_header_that_promises_more_than_the_file_and_a_pickle_are_refused_before_memory_is_taken(scenario):
     path = scenario / "neuspring" / "0" / "twin.npz"
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -75,10 +71,6 @@ def test_a_header_that_promises_more_than_the_file_is_refused_before_memory_is_t
     record(path.parent)
     with pytest.raises(InputError, match=r"header of material\.stiffness must agree"):
         _ = find([scenario]).runs[0].twin
-
-
-def test_a_pickle_is_refused(scenario):
-    path = scenario / "neuspring" / "0" / "twin.npz"
     np.savez(path, meta=np.array([{"kind": "twin"}], dtype=object))
     record(path.parent)
     with pytest.raises(InputError, match="must be readable"):

@@ -44,6 +44,7 @@ def test_the_page_is_served_and_kept_by_no_browser_whose_connection_would_go_on(
     connection.close()
     found = (answer.status, answer.getheader("Cache-Control"), answer.getheader("X-Frame-Options"))
     assert found == (200, "no-store", "DENY")
+    assert server.request_share_url() is None, "nobody can publish the server"
 
 
 def test_no_path_leads_to_a_file_of_this_machine(server):
@@ -57,21 +58,14 @@ def test_pages_of_other_sites_are_refused(server, headers, upgrade):
     assert status(server, **(upgrade | headers)) == 403
 
 
-def test_a_page_cannot_publish_the_server(server):
-    assert server.request_share_url() is None
-
-
-def test_a_port_in_use_is_an_error_with_the_next_move(tmp_path, capsys):
+def test_a_port_in_use_and_a_place_that_is_none_are_refused(tmp_path, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["play", str(results(tmp_path)), "--port", str(port)]) == 2
     assert "--port 0 takes any that is free" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("host", "port"), [("no.such.host.invalid", 0), ("127.0.0.1", 70000)])
-def test_a_place_that_is_none_is_refused(host, port):
-    with pytest.raises(InputError, match=r"--host|--port"):
-        start(host, port)
+    for host, port in (("no.such.host.invalid", 0), ("127.0.0.1", 70000)):
+        with pytest.raises(InputError, match=r"--host|--port"):
+            start(host, port)
 
 
 @pytest.fixture(scope="module")

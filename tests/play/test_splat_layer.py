@@ -11,27 +11,19 @@ from neuspring.core.artifacts import SplatCenters
 from neuspring.play.layers import UNIT, SplatLayer, covariances
 from neuspring.play.player import Player
 from neuspring.play.results import find
-from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Gaussians
-from tests.support.played import dressed, spoil
+from neuspring.splats.view import C0
+from tests.support.played import dressed
 
 ROUNDING = 2e-3
 """Relative error of 16-bit floats, with a margin."""
-
-
-def test_a_record_of_splats_that_names_a_file_elsewhere_is_not_followed(scenario, tmp_path):
-    dressed(scenario)
-    (tmp_path / "secret.ply").write_bytes(b"secret")
-    spoil(scenario / "appearance" / "0" / "appearance.json", '"splats.ply"', '"../../../secret.ply"')
-    run = find([scenario]).runs[0]
-    assert run.splats_path is None and any("must lie beside" in note for note in run.notes)
 
 
 def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
     dressed(scenario)
     (scenario / "appearance" / "0" / "splats.ply").write_bytes(b"ply\n")
     run = find([scenario]).runs[0]
-    assert run.splats_path is None and any("no splats" in note for note in run.notes)
+    assert "splats" not in run.paths and any("no splats" in note for note in run.notes)
     player = Player(server.scene, find([scenario]))
     player.display.splats = True
     player.apply()
@@ -64,7 +56,7 @@ def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
     assert handle.rgbs / 255 == pytest.approx(np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1), abs=1 / 255)
 
 
-def test_frames_may_be_shown_in_any_order_and_hidden_splats_cost_nothing(scenario, server):
+def test_frames_are_shown_in_any_order_hidden_splats_cost_nothing_and_many_are_sampled(scenario, server, monkeypatch):
     splats, run = dressed(scenario), find([scenario]).runs[0]
     x = run.trajectory.positions
     layer = SplatLayer(server.scene, "order", splats, x[0])
@@ -79,6 +71,8 @@ def test_frames_may_be_shown_in_any_order_and_hidden_splats_cost_nothing(scenari
     again.move(x[5])
     assert np.array_equal(layer.handle.centers, again.handle.centers)
     assert (layer.handle.centers != before).any()
+    monkeypatch.setattr("neuspring.play.layers.MOST_SPLATS", 100)
+    assert len(SplatLayer(server.scene, "many", splats, x[0]).handle.centers) == 100
 
 
 def test_a_model_with_splats_of_its_own_moves_them_itself(scenario, server):
@@ -86,10 +80,3 @@ def test_a_model_with_splats_of_its_own_moves_them_itself(scenario, server):
     positions = splats.means[None] + np.arange(8)[:, None, None] * np.array([0.01, 0, 0])
     layer = SplatLayer(server.scene, "own", splats, run.trajectory.positions[0], SplatCenters(positions=positions))
     assert np.array_equal(layer.carried(run.trajectory.positions[3], 3)[0], positions[3].astype(np.float32))
-
-
-def test_of_too_many_a_sample_is_drawn(scenario, server, monkeypatch):
-    monkeypatch.setattr("neuspring.play.layers.MOST_SPLATS", 100)
-    splats, run = dressed(scenario), find([scenario]).runs[0]
-    layer = SplatLayer(server.scene, "many", splats, run.trajectory.positions[0])
-    assert len(layer.handle.centers) == 100

@@ -55,12 +55,6 @@ def test_it_begins_at_any_frame_in_the_state_of_the_prediction(found):
     assert apart.max() < 0.25 * travel
 
 
-def test_a_frame_without_prediction_is_refused(found):
-    for frame in (-1, 8):
-        with pytest.raises(InputError, match="its prediction has 8 frames"):
-            start_state(found.runs[-1], found.observations, frame, repeat=False)
-
-
 def letting_go(frames: int, count: int) -> np.ndarray:
     """All hands hold, let go in frame 2, and the first one takes hold again in frame 4."""
     valid = np.ones((frames, count), bool)
@@ -81,7 +75,7 @@ def test_a_start_after_grips_knows_their_lengths(found, frame):
         expected.append((simulator.positions.copy(), simulator._v.numpy().copy()))
     positions = np.stack([run.twin.topology.nodes, *(x for x, _ in expected)])
     assert np.array_equal(positions, rolled) and not np.array_equal(positions, run.trajectory.positions)
-    known = replace(run, trajectory_path=None)
+    known = replace(run, paths={})
     object.__setattr__(known, "trajectory", replace(run.trajectory, positions=positions))
     begin = start_state(known, seen, frame, repeat=True)
     exact = replace(begin.start, velocity=expected[frame - 1][1])
@@ -106,8 +100,11 @@ def test_a_recording_from_a_frame_gives_the_same_motion_bit_for_bit(found, tmp_p
     assert recording.motion_digest() == saved.motion_digest
 
 
-def test_a_start_of_another_twin_is_refused(found):
+def test_a_frame_without_prediction_and_a_start_of_another_twin_are_refused(found):
     run = found.runs[-1]
+    for frame in (-1, 8):
+        with pytest.raises(InputError, match="its prediction has 8 frames"):
+            start_state(run, found.observations, frame, repeat=False)
     recording, simulator = Recording(), Simulator(run.twin)
     recording.begin(simulator.positions)
     hands = run.twin.topology.controllers

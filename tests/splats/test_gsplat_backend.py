@@ -9,11 +9,10 @@ import torch
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
-from neuspring.splats import harmonics
 from neuspring.splats.blend import blend, tiles
 from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize
 from neuspring.splats.train import Statistics, densify
-from neuspring.splats.view import LIMITS, Limits, View, boxes, project, radii
+from neuspring.splats.view import LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 from tests.support.random_splats import random_splats, small_view
 
 
@@ -31,7 +30,7 @@ def rasterization(
     visible = touching.nonzero().squeeze(1)
     index = ellipses.index[visible]
     flat = means.new_zeros(len(means), 2).index_put((ellipses.index,), ellipses.means)[None]
-    shade = colors[index] if sh_degree is None else harmonics.colors(colors[index], means[index] - view.position, sh_degree)
+    shade = colors[index] if sh_degree is None else harmonic_colors(colors[index], means[index] - view.position, sh_degree)
     features = torch.cat([shade, ellipses.depths[visible, None]], dim=1)
     lists = tiles(ellipses.depths[visible].detach(), rectangles[visible], view)
     total, left = blend(lists, view, limits, flat[0, index], ellipses.conics[visible], opacities[index], features)

@@ -10,12 +10,11 @@ from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.synthetic.make import looking
 from neuspring.scores.pictures import psnr
-from neuspring.splats import harmonics
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.train import Statistics, densify, extent_of, first_splats, train
-from neuspring.splats.view import View
+from neuspring.splats.view import C0, View, harmonic_colors
 from tests.support.filmed import EYES, intrinsics
 
 SIZE = (96, 64)
@@ -42,7 +41,7 @@ def known_splats(count: int = 200) -> Splats:
     rng = np.random.default_rng(0)
     towards = rng.normal(size=(count, 3))
     means = 0.06 * towards / np.linalg.norm(towards, axis=1, keepdims=True) * [1.3, 1, 0.8] + [0, 0, 0.06]
-    shades = (rng.uniform(0.1, 0.9, (count, 1, 3)) - 0.5) / harmonics.C0
+    shades = (rng.uniform(0.1, 0.9, (count, 1, 3)) - 0.5) / C0
     return Splats(
         means=means,
         quaternions=np.tile([1.0, 0, 0, 0], (count, 1)),
@@ -143,23 +142,18 @@ def test_densify_clones_small_splits_large_and_removes_faint_and_huge():
     assert torch.exp(added["log_scales"]).max() < 0.1
 
 
-def test_hands_hide_and_are_not_compared():
+def test_hands_hide_pixels_around_them_which_are_not_compared_and_wrong_sizes_are_named():
     truth = known_splats()
-    view = view_from(EYES[0])
-    hands = np.zeros((SIZE[1], SIZE[0]), bool)
-    hands[:, : SIZE[0] // 2] = True
-    shot = shot_of(truth, view, hands=hands)
-    moved = dataclasses.replace(truth, harmonics=-truth.harmonics)
+    covered = np.zeros((SIZE[1], SIZE[0]), bool)
+    covered[:, : SIZE[0] // 2] = True
     with torch.no_grad():
-        right, wrong = (Gaussians.of(splats).draw(view) for splats in (truth, moved))
+        shot, settings = shot_of(truth, view_from(EYES[0]), hands=covered), Appearance()
+        moved = dataclasses.replace(truth, harmonics=-truth.harmonics)
+        right, wrong = (Gaussians.of(splats).draw(shot.view) for splats in (truth, moved))
         # Wrong colors behind the hand alone cost nothing.
-        patched = dataclasses.replace(right, rgb=torch.where(torch.tensor(hands)[..., None], wrong.rgb, right.rgb))
-        settings = Appearance()
+        patched = dataclasses.replace(right, rgb=torch.where(torch.tensor(covered)[..., None], wrong.rgb, right.rgb))
         assert float(loss(patched, shot, settings)) == float(loss(right, shot, settings))
         assert float(loss(wrong, shot, settings)) > float(loss(right, shot, settings)) + 0.001
-
-
-def test_hands_hide_pixels_around_them_and_wrong_sizes_are_named():
     size, view = (SIZE[1], SIZE[0]), view_from(EYES[0])
     color, mask, hands, depth = np.zeros((*size, 3), np.uint8), np.ones(size, bool), np.zeros(size, bool), np.ones(size)
     hands[30, 40] = True
@@ -184,12 +178,19 @@ def test_training_that_breaks_is_a_numerical_failure(dense):
         train(start, shots, FAST, 0, "warp")
 
 
-def test_the_first_splats_follow_the_points():
+def test_the_first_splats_follow_the_points_the_extent_the_cameras_and_faint_ones_are_left_out():
+    shots, eyes, splats = [shot_of(known_splats(), view_from(eye)) for eye in EYES], np.array(EYES), known_splats(10)
+    assert extent_of(shots) == pytest.approx(1.1 * np.linalg.norm(eyes - eyes.mean(0), axis=1).max(), rel=1e-4)
+    assert extent_of(shots[:1]) == pytest.approx(np.linalg.norm(eyes[0] - [0, 0, 0.06]), rel=0.2)
+    logits = np.where(np.arange(10) < 4, -5, splats.opacity_logits)
+    assert len(prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits)).means) == 6
+    with pytest.raises(NumericalFailure, match="no splat"):
+        prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits - 10))
     rng = np.random.default_rng(0)
     points, colors = rng.uniform(0, 0.1, (500, 3)), rng.uniform(0, 1, (500, 3))
     every = first_splats(points, colors, Appearance(), 0.002)
     assert np.allclose(every.means, points)
-    shown_colors = harmonics.colors(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
+    shown_colors = harmonic_colors(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
     assert np.allclose(shown_colors, colors, atol=1e-5)
     fewer = first_splats(points, colors, Appearance(spacing=10), 0.002)
     assert 60 < len(fewer.means) <= 216
@@ -208,19 +209,3 @@ def test_a_fixed_radius_stays_whatever_is_trained(dense):
     np.testing.assert_allclose(np.exp(result.splats.log_scales), 0.004, rtol=1e-6)
     with pytest.raises(ValueError, match="splats of one radius are isotropic"):
         Appearance(fixed_radius=0.003, isotropic=False)
-
-
-def test_the_extent_is_that_of_the_cameras():
-    shots = [shot_of(known_splats(), view_from(eye)) for eye in EYES]
-    eyes = np.array(EYES)
-    assert extent_of(shots) == pytest.approx(1.1 * np.linalg.norm(eyes - eyes.mean(0), axis=1).max(), rel=1e-4)
-    assert extent_of(shots[:1]) == pytest.approx(np.linalg.norm(eyes[0] - [0, 0, 0.06]), rel=0.2)
-
-
-def test_faint_splats_are_left_out():
-    splats = known_splats(10)
-    logits = splats.opacity_logits.copy()
-    logits[:4] = -5
-    assert len(prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits)).means) == 6
-    with pytest.raises(NumericalFailure, match="no splat"):
-        prune_by_opacity(dataclasses.replace(splats, opacity_logits=logits - 10))

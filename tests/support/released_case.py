@@ -20,11 +20,10 @@ from neuspring.data.unpickle import load_pickle
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
 from neuspring.scores.released.checks import Published
-from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin
-from neuspring.splats.view import View
+from neuspring.splats.view import C0, View
 from neuspring.twin.topology import uniform_topology
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 

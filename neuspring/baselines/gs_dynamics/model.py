@@ -50,6 +50,8 @@ PRESETS: dict[PresetName, tuple[Any, ...]] = {
 }
 """The public configurations. Meanings as in `Rules` and `config.GsDynamics`."""
 CLOTHS = ("cloth", "package")
+COVERAGE = 0.03
+"""m: no more particles are added once every point lies within it of a particle."""
 CLOSE = 1e-4
 """Distances are floored here before a weight is computed from them, m."""
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
@@ -105,7 +107,7 @@ def preset_name(settings: GsDynamics, category: str) -> PresetName:
 def resolve(settings: GsDynamics, category: str) -> tuple[Rules, Recipe]:
     """The settings of a model and of its training, with every null replaced by the value of the preset."""
     values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(settings, category)], strict=True))
-    values |= {name: value for name, value in vars(settings).items() if value is not None}
+    values |= {"coverage": COVERAGE} | {name: value for name, value in vars(settings).items() if value is not None}
     rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))
     return Rules(**rules), Recipe(**recipe)
 

@@ -26,9 +26,9 @@ from neuspring.report.draw.painter import empty, hands
 from neuspring.report.draw.scene import Prediction, Scene, faded, finer, over_white
 from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
 from neuspring.splats.draw import picture, view_of
-from neuspring.splats.harmonics import C0
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import choose_backend
+from neuspring.splats.view import C0
 
 Quantity = Literal["stiffness", "region"]
 COLORS = "viridis"
