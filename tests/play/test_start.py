@@ -75,7 +75,7 @@ def test_a_start_after_grips_knows_their_lengths(found, frame):
         expected.append((simulator.positions.copy(), simulator._v.numpy().copy()))
     positions = np.stack([run.twin.topology.nodes, *(x for x, _ in expected)])
     assert np.array_equal(positions, rolled) and not np.array_equal(positions, run.trajectory.positions)
-    known = replace(run, paths={})
+    known = replace(run, paths={"twin": run.paths["twin"]})
     object.__setattr__(known, "trajectory", replace(run.trajectory, positions=positions))
     begin = start_state(known, seen, frame, repeat=True)
     exact = replace(begin.start, velocity=expected[frame - 1][1])
