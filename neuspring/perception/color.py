@@ -92,30 +92,21 @@ class FirstFrame:
             heights = np.minimum(heights, ROPE_WIDEST * np.median(heights[filled]))
         return cls(camera, capture.description.up_sign, kind, filled, heights, size)
 
-    @property
-    def front(self) -> np.ndarray:
-        """Depth [H, W], m, of the upper side; 0 outside."""
-        return self._depths(1.0)
-
-    @property
-    def back(self) -> np.ndarray:
-        """Depth [H, W], m, of the lower side: the table."""
-        return self._depths(0.0)
-
     def points(self, pixels: np.ndarray) -> np.ndarray:
         """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
 
         Pixels outside of the silhouette have the height of its nearest pixel.
         """
-        share = 0.5 if self.kind == "flat" else 1.0
-        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
+        return self._lifted(pixels, 0.5 if self.kind == "flat" else 1.0)
 
     def fingers(self, pixels: np.ndarray) -> np.ndarray:
         """World points [n, 3], m, where fingers hold the object: a sheet by its upper side, others at half their height.
 
         There is no point of the object there (`points`): a spring between the two would have no length.
         """
-        share = 1.0 if self.kind == "flat" else 0.5
+        return self._lifted(pixels, 1.0 if self.kind == "flat" else 0.5)
+
+    def _lifted(self, pixels: np.ndarray, share: float) -> np.ndarray:
         return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
 
     def _up(self, pixels: np.ndarray) -> np.ndarray:
@@ -127,7 +118,8 @@ class FirstFrame:
         rows, columns = np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)
         return np.asarray(self.up * height_of[labels[rows, columns]])
 
-    def _depths(self, share: float) -> np.ndarray:
+    def depths(self, share: float) -> np.ndarray:
+        """Depth [H, W], m, of the upper side (share 1) or of the lower one, the table (0); 0 outside."""
         y, x = np.nonzero(self.filled)
         depth = np.zeros(self.filled.shape)
         depth[y, x] = camera_depth(self.camera, np.stack([x, y], axis=1), share * self.up * self.heights[y, x])
@@ -286,13 +278,13 @@ def from_color(
     labels = masks[name].labels
     first = FirstFrame.of(capture, labels[0], settings.color)
     lifted, image = lift_color(capture, labels, tracks[name], first, settings.color, settings.lift.controllers)
-    supposed = Supposed(capture.folder, capture.description, first.front)
+    supposed = Supposed(capture.folder, capture.description, first.depths(1.0))
     whole = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
     shape = settings.shape
     if first.kind == "flat" and shape.backend == "auto":
         return lifted, no_prior(), image
     y, x = np.nonzero(first.filled)
-    lower = first.camera.lift(np.stack([x, y], axis=1).astype(float), first.back[y, x])
+    lower = first.camera.lift(np.stack([x, y], axis=1).astype(float), first.depths(0.0)[y, x])
     cloud = lifted.cloud if shape.backend == "mesh" else np.concatenate([lifted.cloud, lower])
     # Behind the upper side all belongs to the object, down to the table.
     prior = shape_prior(supposed, {name: whole}, cloud, replace(shape, back="none"))

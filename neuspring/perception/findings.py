@@ -269,7 +269,7 @@ def _hands(controllers: np.ndarray, observations: Observations) -> list[Finding]
         value = f"the hand is never nearer to the object than {100 * nearest.min():.0f} cm"
         rule = f"it must come within {100 * APART:g} cm to move it"
         return [finding("hand far from the object", "error", where, value, rule, remedy)]
-    holding, count = int((apart[0] <= GRIP).sum()), apart.shape[1]
+    holding, count = int((apart[0] <= GRIP).sum()), len(apart[0])
     if not holding:
         near = f"{100 * GRIP:g} cm; the nearest is {100 * nearest[0]:.0f} cm away"
         value = f"in frame 0 none of {count} has a point of the object within {near}"

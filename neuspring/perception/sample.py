@@ -89,7 +89,12 @@ def structure(
     _, unique = np.unique(start, axis=0, return_index=True)
     if rank is not None:
         unique = unique[np.argsort(-rank[unique], kind="stable")]
-    surface, interior = (on_table(points, up) for points in _samples(prior, seed))
+    surface, interior = np.zeros((0, 3)), np.zeros((0, 3))
+    if len(prior.faces):
+        rng = np.random.default_rng(seed)
+        surface = on_table(on_surface(prior.vertices, prior.faces, SURFACE, rng), up)
+        box = rng.uniform(prior.vertices.min(axis=0), prior.vertices.max(axis=0), (INTERIOR, 3))
+        interior = on_table(box[inside(prior, box)], up)
     everything = np.concatenate([start[unique], surface, interior])
     voxel = settings.voxel if settings.nodes is None else voxel_for(everything, settings.nodes, settings.voxel)
     first_of_cell = np.zeros(len(everything), dtype=bool)
@@ -150,13 +155,3 @@ def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
     reach = float(np.ptp(prior.vertices, axis=0).max()) * 2.0
     wp.launch(winding, len(points), [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach, result], device="cpu")
     return np.asarray(result.numpy())
-
-
-def _samples(prior: ShapePrior, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the surface, and those of uniform points of its bounding box that lie inside."""
-    if not len(prior.faces):
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    rng = np.random.default_rng(seed)
-    surface = on_surface(prior.vertices, prior.faces, SURFACE, rng)
-    box = rng.uniform(prior.vertices.min(axis=0), prior.vertices.max(axis=0), (INTERIOR, 3))
-    return surface, box[inside(prior, box)]

@@ -83,7 +83,10 @@ def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     if not len(prior.faces):
         return prior
     was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * settings.voxel, prior.faces)
-    share = invented_share(prior.vertices, prior.faces, was_seen)
+    # A face counts by the share of its corners.
+    corners = prior.vertices[prior.faces].astype(float)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    share = float((area * (~was_seen[prior.faces]).mean(axis=1)).sum() / area.sum())
     return replace(prior, seen=was_seen, facts={**prior.facts, "invented_share": share})
 
 
@@ -266,27 +269,14 @@ def seen(
     result = np.zeros(len(vertices), dtype=bool)
     normals = None if faces is None else trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     for name, camera in capture.cameras.items():
-        shown = visible(vertices, camera, masks[name].labels[0] == OBJECT, capture.depth(name, 0), reach)
+        pixels, distance = camera.project(vertices)
+        shown = camera.sees(pixels) & (distance > 0)
+        x, y = np.round(pixels[shown]).astype(int).T
+        shown[shown] = (masks[name].labels[0, y, x] == OBJECT) & (np.abs(capture.depth(name, 0)[y, x] - distance[shown]) < reach)
         if normals is not None:
             shown &= ((camera.camera_to_world[:3, 3] - vertices) * normals).sum(axis=1) > 0
         result |= shown
     return result
-
-
-def visible(vertices: np.ndarray, camera: Camera, mask: np.ndarray, depth: np.ndarray, reach: float) -> np.ndarray:
-    """Whether the camera shows the object within `reach`, m, of each vertex [V]."""
-    pixels, distance = camera.project(vertices)
-    result = camera.sees(pixels) & (distance > 0)
-    x, y = np.round(pixels[result]).astype(int).T
-    result[result] = mask[y, x] & (np.abs(depth[y, x] - distance[result]) < reach)
-    return np.asarray(result)
-
-
-def invented_share(vertices: np.ndarray, faces: np.ndarray, was_seen: np.ndarray) -> float:
-    """Share of the area of a mesh whose corners [F, 3] no camera saw; a face counts by the share of its corners."""
-    corners = vertices[faces].astype(float)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return float((area * (~was_seen[faces]).mean(axis=1)).sum() / area.sum())
 
 
 def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
@@ -295,7 +285,7 @@ def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, setti
         raise InputError("perception.shape.mesh", "backend: mesh needs a file", "null", "Name a GLB, PLY or OBJ file.")
     vertices, faces = read_mesh(Path(settings.mesh))
     vertices, rms = place(vertices, faces, cloud)
-    vertices = bend(vertices, faces, capture, masks, cloud, settings)
+    vertices = bend(vertices, faces, capture, masks, cloud)
     return ShapePrior(vertices=vertices, faces=faces, backend="mesh", facts={"alignment_rms": rms})
 
 
@@ -333,14 +323,7 @@ def _icp(source: np.ndarray, target: np.ndarray, rotation: Rotation, scale: floa
     return rms, rotation, scale, shift
 
 
-def bend(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    capture: Capture,
-    masks: Mapping[str, Masks],
-    cloud: np.ndarray,
-    settings: ShapePriorSettings,
-) -> np.ndarray:
+def bend(vertices: np.ndarray, faces: np.ndarray, capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray) -> np.ndarray:
     """Vertices moved by displacements d [V, 3], m, with the least |S (d - t)|^2 + k |L d|^2.
 
     S selects the visible vertices: those whose pixel shows the object at about their depth in some camera. t points to the nearest

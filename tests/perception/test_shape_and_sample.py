@@ -67,7 +67,7 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place_wherever_the_object_lies(tm
 def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3)
     bent = truth.vertices + np.array([0, 0, 0.008]) * np.sin(np.pi * (truth.vertices[:, :1] / 0.1))
-    result = shape.bend(bent.astype(float), truth.faces, capture, masks, cloud, ShapePriorSettings())
+    result = shape.bend(bent.astype(float), truth.faces, capture, masks, cloud)
     before, after = (np.median(cKDTree(v).query(cloud)[0]) for v in (bent, result))
     assert after < 0.75 * before
 

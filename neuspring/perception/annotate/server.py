@@ -31,6 +31,7 @@ from starlette.staticfiles import StaticFiles
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.annotate.clicks import Annotations
 from neuspring.perception.annotate.guard import Refused, check_host, check_origin
 from neuspring.perception.annotate.masks import MasksMode
 from neuspring.perception.annotate.shared import Busy, Stale
@@ -74,15 +75,10 @@ class Server:
         self.capture, self.host, self.token = capture, host, token or secrets.token_urlsafe(16)
         self.masks = MasksMode(capture, settings or MarksSegmentation())
         self.masks.document.read()
+        Annotations.load(capture)
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
         self.tracks = TracksMode(capture)
-        try:
-            self.tracks.document.read()
-        except InputError:
-            self._socket.close()
-            self.tracks.close()
-            raise
         app = Starlette(
             routes=[
                 Route("/api/state", self._state),
@@ -92,12 +88,12 @@ class Server:
                 Route("/api/tracks/{since:int}", lambda asked: JSONResponse(self.tracks.results(asked.path_params["since"]))),
                 Route("/api/color/{camera}/{frame:int}", self._color),
                 Route("/api/overlay/{source}/{camera}/{frame:int}", self._overlay),
-                Route("/api/marks", self._write_marks, methods=["POST"]),
+                Route("/api/marks", lambda asked: self._write(asked, self.masks, "marks"), methods=["POST"]),
                 Route("/api/preview", self._preview, methods=["POST"]),
                 Route("/api/carry", self._carry, methods=["POST"]),
                 Route("/api/stop", self._stop, methods=["POST"]),
                 Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
-                Route("/api/clicks", self._write_clicks, methods=["POST"]),
+                Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
                 Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
                 Mount("/", StaticFiles(directory=STATIC, html=True)),
             ],
@@ -199,13 +195,9 @@ class Server:
         labels = self.masks.preview(*self._frame(values.get("camera"), values.get("frame")))
         return Response(overlay_png(labels), media_type="image/png")
 
-    def _write_marks(self, request: Request) -> Response:
+    def _write(self, request: Request, mode: MasksMode | TracksMode, key: str) -> Response:
         values = request.state.values
-        return JSONResponse({"revision": self.masks.write(values.get("revision"), values.get("marks"))})
-
-    def _write_clicks(self, request: Request) -> Response:
-        values = request.state.values
-        return JSONResponse({"revision": self.tracks.write(values.get("revision"), values.get("annotations"))})
+        return JSONResponse({"revision": mode.write(values.get("revision"), values.get(key))})
 
     def _carry(self, request: Request) -> Response:
         """Begin to carry the marks of the named cameras."""

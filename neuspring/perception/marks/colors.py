@@ -55,21 +55,11 @@ def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
     return np.asarray((first * bins[1] + second) * bins[2] + third)
 
 
-@dataclass(frozen=True, eq=False)
-class Colors:
-    """Counts of colors, and their log density per unit of (L, a, b)."""
-
-    counts: np.ndarray
-    """[bins]."""
-    logs: np.ndarray
-    """[bins]."""
-
-    @classmethod
-    def of(cls, counts: np.ndarray) -> Colors:
-        """From counts [bins]."""
-        blurred = gaussian_filter(counts.reshape(BINS), BLUR, mode="nearest", truncate=2.5).ravel()
-        share = blurred / max(float(blurred.sum()), 1e-9)
-        return cls(counts, np.log((1 - UNSEEN) * share / VOLUME + UNSEEN / SPREAD).astype(np.float32))
+def log_density(counts: np.ndarray) -> np.ndarray:
+    """Log density of colors per unit of (L, a, b) [bins], from counts [bins]."""
+    blurred = gaussian_filter(counts.reshape(BINS), BLUR, mode="nearest", truncate=2.5).ravel()
+    share = blurred / max(float(blurred.sum()), 1e-9)
+    return np.asarray(np.log((1 - UNSEEN) * share / VOLUME + UNSEEN / SPREAD), dtype=np.float32)
 
 
 def count(seen: np.ndarray, where: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
@@ -125,7 +115,7 @@ class Background:
             self.depth[measured] += 0.2 * (depth[measured] - self.depth[measured])
             self.depth[new] = depth[new]
 
-    def log_density(self, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    def usual_density(self, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Log density [H, W] per unit of (L, a, b) of a frame's colors, if the pixel shows the background or a shadow on it.
 
         `gain` [3] is what the whole image has become lighter by. Meaningless where `seen` is 0.
@@ -135,7 +125,7 @@ class Background:
     def explain(self, logs: np.ndarray, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Log densities [H, W] of the background: from `logs`, those of its colors anywhere, and the usual color of each pixel."""
         known = np.clip(self.seen / SURE_AFTER, 0, 1) * USUAL
-        mixture = np.logaddexp(np.log(known + 1e-9) + self.log_density(lab, gain), np.log(1 - known) + logs)
+        mixture = np.logaddexp(np.log(known + 1e-9) + self.usual_density(lab, gain), np.log(1 - known) + logs)
         return np.asarray(np.where(known > 0, mixture, logs), dtype=np.float32)
 
     def gain(self, lab: np.ndarray, where: np.ndarray) -> np.ndarray:

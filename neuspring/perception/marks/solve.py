@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT
-from neuspring.perception.marks.colors import Background, Colors, apart, bins_of, count, mixed, shaded_density
+from neuspring.perception.marks.colors import Background, apart, bins_of, count, log_density, mixed, shaded_density
 from neuspring.perception.marks.marks import FAR, UNKNOWN, Seeds
 
 SMOOTHNESS = 1.5
@@ -162,7 +162,7 @@ def start(
         place[NOTHING] -= np.where(np.nan_to_num(height) > RISEN, RISEN_LOGS, 0.0)
     for _ in range(TURNS):
         counts = counts_of(lab, bins, labels, seeds.certain)
-        logs = np.stack([Colors.of(own).logs[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
+        logs = np.stack([log_density(own)[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
         near = np.log(LOCAL) + _local_density(lab, labels == NOTHING)
         logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL) + logs[NOTHING])
         if background is not None:
@@ -221,7 +221,7 @@ def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
     outside = ~seeds.possible[OBJECT] & ~seeds.possible[HANDS]
     if not outside.any():
         outside = free
-    rest = Colors.of(count(bins, outside)).logs[bins]
+    rest = log_density(count(bins, outside))[bins]
     for label, other in ((OBJECT, HANDS), (HANDS, OBJECT)):
         known = (seeds.certain == label) | (seeds.prior[label] > 0)
         labels[known & free] = label
@@ -231,7 +231,7 @@ def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
         alone = inside & ~seeds.possible[other]
         own = alone if alone.sum() > 0.2 * inside.sum() else inside
         if own.any():
-            ratio = Colors.of(count(bins, own)).logs[bins] - rest
+            ratio = log_density(count(bins, own))[bins] - rest
             labels[inside & (ratio > 1.0) & (labels == 0)] = label
     return np.where(free, labels, seeds.certain).astype(np.uint8)
 
@@ -282,7 +282,8 @@ class Pass:
     """Whether the background is learned on the way."""
     reach: float
     running: list[np.ndarray] = field(init=False)
-    colors: list[Colors] = field(init=False)
+    colors: list[np.ndarray] = field(init=False)
+    """Log densities [bins] of nothing, object and hands."""
     explained: np.ndarray = field(init=False)
     """[H, W] bool: where the background explains the last frame's colors best."""
     steps: int = 0
@@ -300,7 +301,10 @@ class Pass:
         part = None if seeds is None else seeds.part(window)
         if part is not None:
             self._show(near, part)
-            place = self._appear(place, part)
+            for label in self._new(part):
+                away = cv2.distanceTransform((part.certain != label).astype(np.uint8), cv2.DIST_L2, 5)
+                place[label] += np.exp(-away / (FAR * max(self.lab.shape)))
+            place = place / place.sum(axis=0)
         color = self.color_logs(near, before, window, None if depth is None else depth[window])
         logs = np.log(place) + color
         if part is not None:
@@ -364,21 +368,14 @@ class Pass:
         for label in LABELS:
             shown = count(bins, seeds.certain == label)
             if shown.any():
-                self.colors[label] = Colors.of(mixed([(1.0, self.first[label]), (SHOWN, shown)]))
-
-    def _appear(self, place: np.ndarray, seeds: Seeds) -> np.ndarray:
-        """Probabilities by place [3, h, w], with new labels around their marks."""
-        for label in self._new(seeds):
-            away = cv2.distanceTransform((seeds.certain != label).astype(np.uint8), cv2.DIST_L2, 5)
-            place[label] += np.exp(-away / (FAR * max(self.lab.shape)))
-        return np.asarray(place / place.sum(axis=0))
+                self.colors[label] = log_density(mixed([(1.0, self.first[label]), (SHOWN, shown)]))
 
     def color_logs(
         self, lab: np.ndarray, probability: np.ndarray, window: tuple[slice, slice], depth: np.ndarray | None
     ) -> np.ndarray:
         """Weighted log densities [3, h, w] of a frame's colors, and of its depth against the background's."""
         bins = bins_of(lab)
-        logs = np.stack([own.logs[bins] for own in self.colors])
+        logs = np.stack([own[bins] for own in self.colors])
         nearer = np.zeros(lab.shape[:2], np.float32)
         if self.background is not None:
             background = self.background.part(window)
@@ -430,7 +427,7 @@ class Pass:
             if seen.sum():
                 self.running[label] = (1 - LEARN) * self.running[label] + LEARN * seen / seen.sum()
         parts = [mixed([(TRUST_START, a), (1 - TRUST_START, b)]) for a, b in zip(self.first, self.running, strict=True)]
-        self.colors = [Colors.of(part) for part in parts]
+        self.colors = [log_density(part) for part in parts]
 
 
 def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:

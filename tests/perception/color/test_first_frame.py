@@ -68,7 +68,7 @@ def test_a_body_rests_on_the_table_and_its_silhouette_is_that_of_the_mask():
     first = FirstFrame.of(capture_of("zebra"), labels, settings)
     y, x = np.nonzero(labels == OBJECT)
     pixels = np.stack([x, y], axis=1)
-    upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.back[y, x])
+    upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.depths(0.0)[y, x])
     np.testing.assert_allclose(lower[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(first.camera.project(upper)[0], pixels, atol=1e-6)
     np.testing.assert_allclose(first.fingers(pixels)[:, 2], 0.5 * upper[:, 2], atol=1e-9)
